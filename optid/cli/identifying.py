@@ -107,8 +107,8 @@ def search(
         if model is not None:
             found.model.save(model)
         if report is not None:
-            from optid.show.report import write
+            from optid.show.report import write_search
 
             waiting.step("writing the report")
-            write(found.fit, report, held_out, command=command_line())
+            write_search(found, report, held_out, command=command_line())
     conclude(text, heard, model=model, report=report)

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.models.functions import static_functions
-from optid.show.wording import Table, number, percent
+from optid.show.wording import Table, number, percent, seconds
 
 if TYPE_CHECKING:
+    from optid.identify.search import Identification
+    from optid.identify.search.trial import Trial
     from optid.identify.validation import Comparison, HorizonCurve, Validation
 
 
@@ -41,16 +43,16 @@ def validation_tables(checked: "Validation") -> list[Table]:
 
 def _test_table(checked: "Validation") -> Table:
     tests = [(f"{t.output}: {_verdict(t)}", t) for t in checked.tests]
-    rows = [(text, "yes" if t.passed else "no", number(t.p_value, 2), _outside(t)) for text, t in tests]
+    rows = [(text, _outcome(t), number(t.p_value, 2), _outside(t)) for text, t in tests]
     structure, note = checked.structure, ""
     if structure is not None:
-        passed = "yes" if structure.passed else "no"
-        rows.append((f"structure: {structure.finding}", passed, number(structure.p_value, 2), "-"))
+        outcome = "PASS" if structure.passed else "FAIL"
+        rows.append((f"structure: {structure.finding}", outcome, number(structure.p_value, 2), "-"))
         ratios = ", ".join(f"{name} {ratio:.3g}" for name, ratio in structure.ratios.items())
         saved = 100 * max(structure.saving, 0)
-        note = f"Another structure saves {saved:.2g} % of the residual variance; second over first singular value of "
-        note += f"lags by functions: {ratios}."
-    return Table("Tests", ("residual of", "passed", "p value", "lags outside 99 %"), rows, note)
+        note = f"A less restrictive structure would reduce the residual variance by {saved:.2g} %; second over first "
+        note += f"singular value of lags by functions: {ratios}."
+    return Table("Tests", ("residual of", "outcome", "p value", "lags outside 99 %"), rows, note)
 
 
 def _verdict(test: Any) -> str:
@@ -60,6 +62,10 @@ def _verdict(test: Any) -> str:
     if test.input is None:
         return "white" if test.passed else "not white"
     return f"independent of {test.input}" if test.passed else f"depends on {test.input}"
+
+
+def _outcome(test: Any) -> str:
+    return "-" if np.isnan(test.p_value) else "PASS" if test.passed else "FAIL"
 
 
 def _outside(test: Any) -> str:
@@ -104,3 +110,24 @@ def facts_table(found: "Comparison") -> Table:
         for name, model in zip(found.names, found.models)
     ]
     return Table("Models", ("model", "kind", "numbers", "largest pole"), rows)
+
+
+def search_table(found: "Identification") -> Table:
+    """Return the best structure of every class, and the one behind it."""
+    rows = []
+    for kind in found.best:
+        several = sorted((t for t in found.trials if t.candidate.kind == kind and np.isfinite(t.score)),
+                         key=lambda t: t.score, reverse=True)
+        best = found.best[kind]
+        others = [t for t in several if t is not best][:1]
+        rows += [_row(kind, best, best is found.chosen), *(_row("  runner-up", t, False) for t in others)]
+    what = "free run" if found.horizon is None else f"{found.horizon} samples ahead"
+    spent = sum(t.seconds for t in found.trials)
+    return Table(f"Search over {len(found.trials)} structures ({what}, {found.blocks} blocks left out, "
+                 f"{seconds(spent)} of computing)", ("structure", "fit %", "worst block", "parameters"), rows)
+
+
+def _row(word: str, trial: "Trial", chosen: bool) -> tuple[str, ...]:
+    structure = f"{trial.candidate.formulation} {trial.candidate.words}"
+    return (f"{'* ' * chosen}{word}: {structure}", f"{trial.score:.1f}", f"{trial.by_block.min():.1f}",
+            str(trial.parameters))

@@ -1,18 +1,116 @@
 """Parts that every HTML page has: the template, figures that stand inside it, and what it was made with."""
 
+import base64
+import hashlib
+import json
 import platform
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from optid import __version__
+from optid.show.sections import Chart, Document, Series
 from optid.show.svg import inline
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+SCRIPTS = ("plot.js", "charts.js")
+
+MOST = 20_000
+"""Samples of a curve that a page carries; of a longer one the extremes of half as many stretches."""
+
+
+def write(document: Document, path: str | Path) -> Path:
+    """Write a document as an HTML page that opens offline and makes no request; an existing file is replaced."""
+    path = Path(path)
+    path.write_text(render(document), encoding="utf-8")
+    return path
+
+
+def render(document: Document) -> str:
+    """Return the page that `write` writes."""
+    shown: list[dict[str, Any]] = []
+
+    def place(chart: Chart) -> int:
+        shown.append(_coded(chart))
+        return len(shown) - 1
+
+    script = "\n".join((files("optid") / "show" / "templates" / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    sections = [(s, list(s.parts() if callable(s.parts) else s.parts)) for s in document.sections]
+    names = {"trust": "Verdict", "optimum": "Solution"}
+    body = template("document.html.j2").render(
+        version=__version__, title=document.title, lead=document.lead, parts=sections, place=place,
+        breakable=_breakable, charts=lambda: _embedded(shown), script=Markup(script),
+        digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        sections=[(s.id, s.title or names.get(s.id, s.id)) for s, _ in sections])
+    return body
+
+
+def _breakable(equation: str) -> str:
+    """Leave line breaks to the places before a sign."""
+    return re.sub(r" (?![+-] )", "\N{NO-BREAK SPACE}", equation)
+
+
+def _coded(chart: Chart) -> dict[str, Any]:
+    """Return a chart as JSON types for the script of the page."""
+    axes = {name: {key: value for key, value in asdict(axis).items() if value not in (None, False, "")}
+            for name, axis in (("x", chart.x), ("y", chart.y))}
+    cursor = all(one.kind in ("curve", "area", "bars") for one in chart.series)
+    return {"title": chart.title, "caption": chart.caption, "group": chart.group, "equal": chart.equal,
+            "height": chart.height, "cursor": cursor, **axes, "series": [_series(one) for one in chart.series]}
+
+
+def _series(one: Series) -> dict[str, Any]:
+    xs, ys, lows = (None if v is None else np.asarray(v, dtype=float) for v in (one.xs, one.ys, one.lows))
+    assert xs is not None and ys is not None
+    if ys.size > MOST:
+        kept = _extremes(ys, MOST // 2)
+        xs, ys, lows = xs[kept], ys[kept], None if lows is None else lows[kept]
+    coded = {"name": one.name, "kind": one.kind, "colour": f"var(--{one.colour})", "dash": one.dash,
+             "width": one.width, "aside": one.aside, "xs": _numbers(xs, "<f8"), "ys": _numbers(ys, "<f4")}
+    return coded if lows is None else {**coded, "lows": _numbers(lows, "<f4")}
+
+
+def _extremes(values: np.ndarray, bins: int) -> np.ndarray:
+    """Return the indices of the smallest and the largest value of each of so many stretches."""
+    edges = np.linspace(0, values.size, bins + 1).astype(int)
+    kept = set()
+    for a, b in zip(edges[:-1], edges[1:]):
+        part = values[a:b]
+        here = np.isfinite(part)
+        kept |= {a} if not here.all() else set()
+        if here.any():
+            kept |= {a + int(np.nanargmin(part)), a + int(np.nanargmax(part))}
+    return np.array(sorted(kept))
+
+
+def _numbers(values: np.ndarray, kind: str) -> Any:
+    """Return numbers as the script reads them: an even grid, bytes, or a list with few digits."""
+    steps = np.diff(values)
+    if values.size > 40 and np.ptp(steps) <= 1e-9 * abs(steps).max():
+        return {"start": float(values[0]), "step": float((values[-1] - values[0]) / (values.size - 1)),
+                "count": values.size}
+    if values.size > 40:
+        data = base64.b64encode(values.astype(kind).tobytes()).decode()
+        return {"bytes" if kind == "<f4" else "wide": data}
+    return [float(f"{v:.9g}") if np.isfinite(v) else None for v in values]
+
+
+def _embedded(payload: Sequence[Any]) -> Markup:
+    """Return a value as JSON that can stand inside a script element: no text in it can end the element."""
+    text = json.dumps(payload, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 def template(name: str) -> Any:

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
-from optid.identify.equation_error import EquationError
 from optid.identify.validation import Validation, validate
 from optid.identify.validation.predictions import one_step, simulated
 from optid.lazy import public_names
@@ -26,6 +25,7 @@ from optid.structures.least_squares import rank_one_of
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
+    from optid.identify.search import Identification
 
 MOST_EXPERIMENTS = 3
 """Experiments drawn side by side; the title says how many there are."""
@@ -167,7 +167,7 @@ def singular_values(fit: "Fit") -> Figure:
     Raises:
         DataError: the formulation has no matrix Theta.
     """
-    found = theta_singular_values(fit)
+    found = summary.theta_singular_values(fit)
     if not found:
         raise DataError(f"formulation {fit.formulation!r} has no matrix Theta with more than one row and column")
     figure = Figure(figsize=(min(9.0, 3.4 * len(found) + 1.0), 2.9), layout="constrained")
@@ -193,28 +193,9 @@ def spectra(fit: "Fit") -> Figure:
     return figure
 
 
-def theta_singular_values(fit: "Fit") -> dict[str, Array]:
-    """Return the singular values of Theta by input: of the relaxed programme, or of least squares without the rank.
-
-    Inputs whose Theta is a vector are left out.
-    """
-    compressed, found = fit.program.compressed, {}
-    heights = fit.program.view.units
-    if not isinstance(compressed, EquationError) or not fit.solution.has_point:
-        return found
-    if rank_one_of(fit.program) is not None:
-        z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
-        thetas = []
-        for rows, columns in compressed.problem.blocks:
-            thetas.append(z[position : position + rows * columns].reshape(rows, columns, order="F"))
-            position += rows * columns
-    else:
-        thetas = compressed.matrices(fit.solution.values)
-    unit = 1.0 if heights is None else heights.y_scale[0]  # of Theta in the units of the record
-    for name, theta in zip(fit.model.inputs, thetas):
-        if min(theta.shape) > 1:
-            found[name] = unit * np.linalg.svd(theta, compute_uv=False)
-    return found
+def search_overview(found: "Identification", test: Data | None = None) -> Figure:
+    """Draw the fit that a search ended with, as `overview` does."""
+    return overview(found.fit, test)
 
 
 def _record(fit: "Fit", data: Data | None) -> Data:

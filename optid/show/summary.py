@@ -6,23 +6,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.data.record import Data
+from optid.identify.equation_error import EquationError
 from optid.identify.validation.predictions import predictors
 from optid.models.functions import has_feedback, static_functions
 from optid.models.kalman import NoiseCovariances
 from optid.program.solution import Status
+from optid.show.sections import Facts
 from optid.show.wording import Table, gap_text, number, percent, seconds
+from optid.structures.least_squares import rank_one_of
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
     from optid.identify.verdict import Verdict
 
-Facts = list[tuple[str, str]]
-
 MOST = 12
 """Entries of an array among the figures that are printed."""
-
-TONES = {"good": "good", "fair": "plain", "poor": "fair", "useless": "bad"}
-"""How a verdict on a model is coloured."""
 
 PRICE_NOTE = (
     "Multiplier: change of the objective per unit of the bound. Price: points of one-step fit (%) gained when the "
@@ -61,7 +59,7 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
 def verdict_table(found: "Verdict") -> Table:
     """What the verdict on a model rests on, part by part."""
     rows = [(part.name, part.value, "PASS" if part.passed else "FAIL") for part in found.parts]
-    return Table(f"The model on this record: {found.word}", ("", "", ""), rows)
+    return Table("", ("test", "found", "outcome"), rows)
 
 
 def fit_table(fit: "Fit") -> Table:
@@ -160,6 +158,30 @@ def spectra(fit: "Fit") -> dict[str, np.ndarray]:
     lists = {name: value for name, value in named.items() if isinstance(value, np.ndarray | list | tuple)}
     found = {name: np.asarray(value, dtype=float) for name, value in lists.items()}
     return {name: values for name, values in found.items() if values.ndim == 1 and values.size > 1}
+
+
+def theta_singular_values(fit: "Fit") -> dict[str, np.ndarray]:
+    """Return the singular values of Theta by input: of the relaxed programme, or of least squares without the rank.
+
+    Inputs whose Theta is a vector are left out.
+    """
+    compressed, found = fit.program.compressed, {}
+    heights = fit.program.view.units
+    if not isinstance(compressed, EquationError) or not fit.solution.has_point:
+        return found
+    if rank_one_of(fit.program) is not None:
+        z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
+        thetas = []
+        for rows, columns in compressed.problem.blocks:
+            thetas.append(z[position : position + rows * columns].reshape(rows, columns, order="F"))
+            position += rows * columns
+    else:
+        thetas = compressed.matrices(fit.solution.values)
+    unit = 1.0 if heights is None else heights.y_scale[0]  # of Theta in the units of the record
+    for name, theta in zip(fit.model.inputs, thetas):
+        if min(theta.shape) > 1:
+            found[name] = unit * np.linalg.svd(theta, compute_uv=False)
+    return found
 
 
 def channel_table(fit: "Fit") -> Table | None:

@@ -1,5 +1,6 @@
 "use strict";
-// A small plot: lines, steps and dots as SVG. It zooms by dragging, by buttons, keys, pinching, and the wheel with Ctrl.
+// A small plot: lines, steps, bands, stems, bars and dots as SVG. It zooms by dragging, by buttons, keys, pinching, and the
+// wheel with Ctrl. Of a long curve the extremes of every pixel are drawn, at every zoom.
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -55,16 +56,42 @@ function ticksOf(axis, low, high, most) {
   return found;
 }
 
+// First index of an ascending list whose value is not below another.
+function firstFrom(values, value) {
+  let low = 0, high = values.length;
+  while (low < high) { const middle = (low + high) >> 1; if (values[middle] < value) low = middle + 1; else high = middle; }
+  return low;
+}
+
+// Indices of a curve to draw between two: all, or first, extremes and last of each of so many bins.
+function extremes(values, from, to, bins) {
+  if (to - from <= 4 * bins) return [...Array(Math.max(0, to - from)).keys()].map((k) => k + from);
+  const kept = [];
+  for (let b = 0; b < bins; b++) {
+    const a = from + Math.floor((b * (to - from)) / bins), z = from + Math.floor(((b + 1) * (to - from)) / bins);
+    let low = a, high = a, gap = -1;
+    for (let i = a; i < z; i++) {
+      if (!Number.isFinite(values[i])) { gap = i; continue; }
+      if (!(values[i] >= values[low])) low = i;
+      if (!(values[i] <= values[high])) high = i;
+    }
+    kept.push(...[...new Set([low, high, ...(gap < 0 ? [] : [gap])])].sort((p, q) => p - q));
+  }
+  return kept;
+}
+
 let plots = 0;
 
 // spec: label, x and y axes {title, log, categories, ticks, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
-// rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off.
+// rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off. Curves may have lows
+// (bands); `aside` keeps a series out of the extent, `equal` makes both units as long, `cursor` shows every curve at a place,
+// and `moved(low, high)` hears of another extent of x.
 function makePlot(host, spec, hidden) {
   const id = "plot" + ++plots, box = element("div", { class: "plot" });
-  const svg = element("svg:svg", { role: "img", tabindex: "0", "aria-label": spec.label, "aria-describedby": id + "-keys" });
-  const tip = element("div", { class: "tip", hidden: true });
+  const svg = element("svg:svg", { class: "chart", role: "img", tabindex: "0", "aria-label": spec.label, "aria-describedby": id + "-keys" });
+  const tip = element("div", { class: "tip", hidden: true, role: spec.cursor ? "status" : null });
   const keys = element("span", { id: id + "-keys", hidden: true },
-    "Keys: plus and minus zoom, arrows move, 0 shows everything. The numbers stand below the figure.");
+    "Keys: plus and minus zoom, arrows move, 0 shows everything." + (spec.cursor ? " Comma and full stop read the values." : " The numbers stand below the figure."));
   const buttons = [["+", "Zoom in", () => zoom(0.6)], ["\u2212", "Zoom out", () => zoom(1 / 0.6)], ["\u21ba", "Show everything", reset]];
   const bar = element("div", { class: "zoom" }, ...buttons.map(([text, label, act]) =>
     element("button", { type: "button", "aria-label": `${label}: ${spec.title}`, title: label, onclick: act }, text)));
@@ -72,7 +99,7 @@ function makePlot(host, spec, hidden) {
   host.append(box);
 
   const axes = [spec.x, spec.y];
-  const series = spec.series.map((one) => ({ ...one, tx: transformed(one.xs, spec.x), ty: transformed(one.ys, spec.y) }));
+  const series = spec.series.map((one) => ({ ...one, tx: transformed(one.xs, spec.x), ty: transformed(one.ys, spec.y), tl: one.lows && transformed(one.lows, spec.y) }));
   const whole = extent();
   let view = [...whole], frame = null, drag = null;
   const touches = new Map();
@@ -85,7 +112,8 @@ function makePlot(host, spec, hidden) {
     return axes.flatMap((axis, a) => {
       if (axis.categories) return [-0.6, axis.categories.length - 0.4];
       let low = Infinity, high = -Infinity;
-      for (const one of series) {
+      for (const one of series.filter((one) => !one.aside)) {
+        if (a && one.tl) one.tl.forEach((v) => { if (Number.isFinite(v)) low = Math.min(low, v); });
         const values = a ? one.ty : one.tx;
         values.forEach((v, i) => {
           if (!Number.isFinite(v)) return;
@@ -103,7 +131,8 @@ function makePlot(host, spec, hidden) {
 
   function measure() {
     const width = Math.max(280, Math.round(box.clientWidth || 560));
-    const rows = spec.y.categories ? 70 + 30 * spec.y.categories.length : Math.min(380, Math.max(260, 0.56 * width));
+    if (spec.equal) return { width, height: width - 32, left: 72, right: 14, top: 10, bottom: 44 };
+    const rows = spec.y.categories ? 70 + 30 * spec.y.categories.length : spec.height || Math.min(380, Math.max(260, 0.56 * width));
     const longest = spec.y.categories ? Math.max(...spec.y.categories.map((n) => n.length)) : 0;
     return { width, height: Math.round(rows), left: spec.y.categories ? Math.min(0.4 * width, 16 + 7 * longest) : 72, right: 14, top: 10, bottom: 44 };
   }
@@ -143,6 +172,7 @@ function makePlot(host, spec, hidden) {
 
   function drawn(one, f, right) {
     const style = { fill: "none", stroke: one.colour, "stroke-dasharray": one.dash, "data-series": one.name };
+    if (["curve", "area", "stems", "bars", "diamonds", "poles", "line-only"].includes(one.kind)) return shaped(one, f, style);
     const seen = [...one.tx.keys()].filter((i) => Number.isFinite(one.tx[i]) && Number.isFinite(one.ty[i]));
     const px = (i) => f.x(one.tx[i]).toFixed(1), py = (i) => f.y(one.ty[i]).toFixed(1);
     if (one.kind === "step") {
@@ -165,7 +195,42 @@ function makePlot(host, spec, hidden) {
     return [element("svg:path", { ...style, "stroke-width": 2, d: seen.map((i, k) => `${k ? "L" : "M"}${px(i)} ${py(i)}`).join("") }), points];
   }
 
-  function setView(next) {
+  function shaped(one, f, style) {
+    const x = (i) => f.x(one.tx[i]).toFixed(1), y = (v) => f.y(v).toFixed(1), marks = (d, width) => element("svg:path", { ...style, "stroke-dasharray": null, "stroke-width": width, d });
+    if (one.kind === "bars") {
+      const foot = f.height - f.bottom, tall = 0.16 * (foot - f.top), wide = Math.abs(f.x(one.tx[1]) - f.x(one.tx[0])) || 8;
+      const d = [...one.ys].map((v, i) => (v > 0 ? `M${x(i)} ${foot}v${(-tall * v).toFixed(1)}h${wide.toFixed(1)}V${foot}z` : "")).join("");
+      return [element("svg:path", { d, fill: one.colour, "fill-opacity": 0.35, "data-series": one.name })];
+    }
+    if (one.kind === "stems" || one.kind === "diamonds" || one.kind === "poles") {
+      const seen = [...one.tx.keys()].filter((i) => Number.isFinite(one.ty[i]) && Number.isFinite(one.tx[i]));
+      if (one.kind === "poles") return [marks(seen.map((i) => `M${x(i) - 5} ${y(one.ty[i]) - 5}l10 10m0 -10l-10 10`).join(""), 2.2)];
+      const foot = f.y(0).toFixed(1), r = one.kind === "stems" ? 2.4 : 3.6;
+      const heads = seen.map((i) => `M${x(i)} ${y(one.ty[i]) - r}l${r} ${r}l${-r} ${r}l${-r} ${-r}z`).join("");
+      return [marks(seen.map((i) => `M${x(i)} ${foot}V${y(one.ty[i])}`).join(""), 1.4), element("svg:path", { ...style, fill: one.colour, d: heads })];
+    }
+    const sorted = one.kind !== "line-only", all = one.tx.length;
+    const from = sorted ? Math.max(0, firstFrom(one.tx, view[0]) - 1) : 0, to = sorted ? Math.min(all, firstFrom(one.tx, view[1]) + 1) : all;
+    const kept = sorted ? extremes(one.ty, from, to, Math.round(f.width - f.left - f.right)) : [...Array(all).keys()];
+    if (one.kind === "area") {
+      const there = kept.filter((i) => Number.isFinite(one.ty[i]) && Number.isFinite(one.tl[i]));
+      const d = [...there.map((i) => `${x(i)} ${y(one.ty[i])}`), ...there.reverse().map((i) => `${x(i)} ${y(one.tl[i])}`)].join("L");
+      return d ? [element("svg:path", { d: `M${d}z`, fill: one.colour, "fill-opacity": 0.2, "data-series": one.name })] : [];
+    }
+    let d = "", pen = false;
+    for (const i of kept) {
+      if (!Number.isFinite(one.ty[i])) { pen = false; continue; }
+      d += `${pen ? "L" : "M"}${x(i)} ${y(one.ty[i])}`;
+      pen = true;
+    }
+    return [element("svg:path", { ...style, "stroke-width": one.width || 1.6, "stroke-linejoin": "round", d })];
+  }
+
+  function setView(next, quiet = false) {
+    if (spec.equal) {
+      const half = Math.max(next[1] - next[0], next[3] - next[2]) / 2, cx = (next[0] + next[1]) / 2, cy = (next[2] + next[3]) / 2;
+      next = [cx - half, cx + half, cy - half, cy + half];
+    }
     const tiny = axes.some((_, a) => !(next[2 * a + 1] - next[2 * a] > 1e-6 * (whole[2 * a + 1] - whole[2 * a])));
     const huge = axes.some((_, a) => next[2 * a + 1] - next[2 * a] > 20 * (whole[2 * a + 1] - whole[2 * a]));
     if (tiny || huge) return;
@@ -173,6 +238,7 @@ function makePlot(host, spec, hidden) {
     svg.dataset.view = view.map((v) => v.toPrecision(6)).join(" ");
     hideTip();
     draw();
+    if (spec.moved && !quiet) spec.moved(view[0], view[1]);
   }
   function reset() { setView([...whole]); }
   function zoom(factor, cx = (view[0] + view[1]) / 2, cy = (view[2] + view[3]) / 2) {
@@ -187,7 +253,7 @@ function makePlot(host, spec, hidden) {
     const area = svg.getBoundingClientRect(), scale = frame.width / area.width;
     return [(event.clientX - area.left) * scale, (event.clientY - area.top) * scale];
   }
-  function hideTip() { tip.hidden = true; }
+  function hideTip() { tip.hidden = true; svg.querySelector(".cursor")?.remove(); }
 
   function nearest(x, y) {
     let best = null, least = 24 * 24;
@@ -202,7 +268,32 @@ function makePlot(host, spec, hidden) {
   }
   function f_x(one, i) { return frame.x(one.tx[i]); }
 
+  // Values of every curve at a place, with a line there.
+  let at = null;
+  function showValues(x) {
+    const value = Math.min(Math.max(frame.unx(x), view[0]), view[1]), lines = [], unit = spec.y.unit ? " " + spec.y.unit : "";
+    let here = value;
+    for (const one of series) {
+      if (hidden.has(one.name) || !["curve", "area"].includes(one.kind)) continue;
+      let i = Math.min(firstFrom(one.tx, value), one.tx.length - 1);
+      if (i > 0 && value - one.tx[i - 1] < one.tx[i] - value) i--;
+      here = one.tx[i];
+      if (one.kind === "area" && Number.isFinite(one.ys[i])) lines.push(`${one.name}: ${significant(one.lows[i], 4)} to ${significant(one.ys[i], 4)}${unit}`);
+      else if (Number.isFinite(one.ys[i])) lines.push(`${one.name}: ${significant(one.ys[i], 4)}${unit}`);
+    }
+    if (!lines.length) return hideTip();
+    at = frame.x(here);
+    svg.querySelector(".cursor")?.remove();
+    svg.append(element("svg:line", { class: "cursor", x1: at, x2: at, y1: frame.top, y2: frame.height - frame.bottom }));
+    tip.textContent = [`${spec.x.title}: ${significant(spec.x.log ? 10 ** here : here, 5)}`, ...lines].join("\n");
+    tip.hidden = false;
+    const place = (at * box.clientWidth) / frame.width, room = box.clientWidth - tip.offsetWidth;
+    tip.style.left = Math.max(0, Math.min(room, place + 12 > room ? place - tip.offsetWidth - 12 : place + 12)) + "px";
+    tip.style.top = "12px";
+  }
+
   function showTip(x, y) {
+    if (spec.cursor) return showValues(x);
     const found = spec.tip && nearest(x, y);
     if (!found) return hideTip();
     const scale = box.clientWidth / frame.width, [one, i] = found;
@@ -266,12 +357,13 @@ function makePlot(host, spec, hidden) {
   svg.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
     const acts = { "+": () => zoom(0.6), "=": () => zoom(0.6), "-": () => zoom(1 / 0.6), 0: reset, Escape: reset,
-      ArrowLeft: () => move(-0.15, 0), ArrowRight: () => move(0.15, 0), ArrowUp: () => move(0, 0.15), ArrowDown: () => move(0, -0.15) };
+      ArrowLeft: () => move(-0.15, 0), ArrowRight: () => move(0.15, 0), ArrowUp: () => move(0, 0.15), ArrowDown: () => move(0, -0.15),
+      ...(spec.cursor ? { ",": () => showValues((at ?? frame.left) - 6), ".": () => showValues((at ?? frame.left) + 6) } : {}) };
     if (!acts[event.key]) return;
     event.preventDefault();
     acts[event.key]();
   });
   new ResizeObserver(() => { if (frame && Math.abs(measure().width - frame.width) > 1) draw(); }).observe(box);
   draw();
-  return { draw, svg };
+  return { draw, svg, setX: (low, high) => setView([low, high, view[2], view[3]], true) };
 }

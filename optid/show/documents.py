@@ -1,0 +1,229 @@
+"""What every result has to say, most important first: the documents that terminal, notebook and page render."""
+
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.data.record import Data
+from optid.errors import DataError, DataWarning
+from optid.identify.validation import Validation, validate
+from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT, POOR_FIT, USELESS_FIT
+from optid.show import charts, checks, estimates, summary, wording
+from optid.show.order_table import describe as describe_order
+from optid.show.sections import (
+    TONES,
+    Banner,
+    Charts,
+    Code,
+    Columns,
+    Document,
+    Fold,
+    Heading,
+    Notes,
+    Pair,
+    Section,
+)
+
+if TYPE_CHECKING:
+    from optid.identify.fitting import Fit
+    from optid.identify.order.study import OrderStudy
+    from optid.identify.search import Identification
+    from optid.identify.validation import Comparison
+    from optid.identify.verdict import Verdict
+
+ADVISED = ("poor", "useless")
+"""Verdicts with which a page says what would help; to know it, neighbouring structures are fitted."""
+
+
+def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | None" = None, command: str = "",
+                 advise: bool = True) -> Document:
+    """Return the document of a fit.
+
+    Args:
+        fit: the fit, with a model.
+        test: record that the fit has not seen; adds its validation.
+        judged: the verdict on the model; that of the fit when not given.
+        command: the command line behind the fit.
+        advise: whether to say what would help a poor model, which takes time.
+    """
+    judged = fit.verdict if judged is None else judged
+    tables = [*estimates.parameter_tables(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)]
+    noise = summary.noise_table(fit)
+    coefficients = estimates.coefficient_table(fit)
+    evidence = summary.evidence_facts(fit)
+    lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
+    sections = [
+        *([_trust(fit, judged, test, advise)] if judged is not None else []),
+        _optimum(fit),
+        Section("model", "Model", [
+            Code(fit.model.equation(), equation=True),
+            summary.model_facts(fit),
+            Pair([*tables, *([noise] if noise else [])]),
+            *([Heading("Measured on the way"), evidence] if evidence else []),
+            *([Fold("Coefficients of the basis", [coefficients])] if coefficients else []),
+        ]),
+        *([Section("constraints", "Constraints and their prices", [summary.constraint_table(fit)])]
+          if fit.prices else []),
+        Section("figures", "Figures", lambda: _fit_charts(fit), page_only=True),
+        *([Section("validation", "Validation", lambda: _validations(fit, test), page_only=True)]
+          if isinstance(fit.data, Data) or test is not None else []),
+        Section("certificate", "Certificate", [summary.certificate_facts(fit)], page_only=True),
+        Section("data", "Data", lambda: [summary.record_facts(fit), *filter(None, [summary.channel_table(fit)])],
+                page_only=True),
+        Section("solver", "Solver and times", [summary.solver_facts(fit)], page_only=True),
+        Section("reproduce", "Reproduce", lambda: _reproduce(
+            "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
+    ]
+    return Document(summary.title(fit), lead, sections)
+
+
+def _length(data: Any) -> str:
+    return f"{data.n_samples} samples" if data.n_samples else ""
+
+
+def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Section:
+    failed = [f"{part.name} ({part.value})" for part in judged.failed]
+    sentence = f"FAIL: {'; '.join(failed)}." if failed else "All tests of the verdict pass."
+    if not failed and judged.word != GOOD:
+        sentence += f" A model is called good from a fit of {GOOD_FIT:g} %, and {GOOD_BLOCK:g} % in its worst block."
+    which = ", lowest output" if fit.model.l > 1 else ""
+    fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
+    if test is not None:
+        simulated = [q.fit for q in _validated(fit, test).simulation.values()]
+        fits.append(("simulation fit, test record", np.array(simulated or np.nan)))
+    cards = tuple((label + which, wording.percent(np.min(values))) for label, values in fits)
+    advice = [str(one) for one in fit.advice] if advise and judged.word in ADVISED else []
+    parts = [Banner(TONES[judged.word], f"The model on this record: {judged.word}", sentence, cards),
+             summary.verdict_table(judged)]
+    return Section("trust", "", [*parts, *([Notes(advice)] if advice else [])])
+
+
+def _optimum(fit: "Fit") -> Section:
+    tone, word, sentence = summary.verdict(fit)
+    solution = fit.solution
+    cards = [("relative gap to the bound", "none" if solution.bound is None else wording.gap_text(solution.gap))]
+    if fit.prices:
+        cards.append(("constraints active", f"{sum(p.binding for p in fit.prices)} of {len(fit.prices)}"))
+    cards.append(("time", wording.seconds(fit.seconds)))
+    right = [(name, value) for name, value in summary.certificate_facts(fit)
+             if name in ("Objective", "Bound", "Relative gap")]
+    right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "In all")]
+    return Section("optimum", "", [Banner(tone, f"Solution: {word}", sentence, tuple(cards)),
+                                   Columns(summary.record_facts(fit), right),
+                                   *([Notes(fit.findings)] if fit.findings else [])])
+
+
+def _validated(fit: "Fit", record: Data) -> Validation:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # they stand in the notes
+        return validate(fit.model, record)
+
+
+def _fit_charts(fit: "Fit") -> list[Any]:
+    parts: list[Any] = []
+    if isinstance(fit.data, Data):
+        parts.append(Charts(charts.record_charts({"": fit.model}, fit.data), wide=True))
+    several = [*charts.nonlinearity_charts(fit), *charts.dynamics_charts({"": fit.model}, fit)]
+    for name, values in summary.theta_singular_values(fit).items():
+        several.append(charts.spectrum_chart(f"Singular values of Theta, {name}", values, 1))
+    order = fit.model.orders.get("nx", 0)
+    several += [charts.spectrum_chart(name[:1].upper() + name[1:], values, int(order) or 1)
+                for name, values in summary.spectra(fit).items()]
+    if summary.has_noise(fit.model):
+        several.append(charts.noise_chart(fit.model))
+    return [*parts, Charts(several)]
+
+
+def _validations(fit: "Fit", test: Data | None) -> list[Any]:
+    parts: list[Any] = []
+    for title, record in (("Estimation record", fit.data), ("Test record, not seen by the fit", test)):
+        if isinstance(record, Data):
+            parts += [Heading(title), *validation_parts(_validated(fit, record))]
+            if record is test:
+                parts.append(Charts(charts.record_charts({"": fit.model}, record, group="test"), wide=True))
+    return parts
+
+
+def validation_parts(checked: Validation) -> list[Any]:
+    """Return errors, tests, notes and the correlations of a validation."""
+    notes = [Notes(checked.notes)] if checked.notes else []
+    return [*checks.validation_tables(checked), *notes, Charts(charts.correlation_charts(checked))]
+
+
+def _reproduce(call: str, text: str) -> list[Any]:
+    from optid.show.page import versions
+
+    return [Code(call), versions(), Fold("Result as plain text", [Code(text)])]
+
+
+def search_document(found: "Identification", test: Data | None = None, *, command: str = "") -> Document:
+    """Return the document of a search: verdict, structures on trial, score by block, then the fit it ended with."""
+    document = fit_document(found.fit, test, judged=found.verdict, command=command)
+    chosen = found.chosen.candidate
+    ended = f"The search was ended by {found.stopped}; more time may find a better structure."
+    notes = [ended] if found.stopped else []
+    trials = [t for t in found.trials if np.isfinite(t.score)]
+    table = wording.Table(f"Every structure that was tried on all blocks ({len(trials)})",
+                          ("structure", "fit %", "worst block", "parameters", "time"),
+                          [(f"{t.candidate.kind}: {t.candidate.formulation} {t.candidate.words}", f"{t.score:.1f}",
+                            f"{t.by_block.min():.1f}", str(t.parameters), wording.seconds(t.seconds))
+                           for t in sorted(trials, key=lambda t: -t.score)])
+    section = Section("search", "Search for the structure", [
+        checks.search_table(found), Notes([*found.reasons, *notes]),
+        Code(f"--formulation {chosen.formulation} {chosen.words}"),
+        Charts([charts.block_chart(found)]), Fold(table.title, [table])])
+    return Document(document.title, document.lead, [*document.sections[:2], section, *document.sections[2:]])
+
+
+def validation_document(checked: Validation) -> Document:
+    """Return the document of a validation."""
+    tests = [t for t in checked.tests if not np.isnan(t.p_value)]
+    failed = sum(not t.passed for t in tests)
+    sentence = f"{len(tests) - failed} of {len(tests)} residual tests pass" + (
+        "" if checked.structure is None else f"; structure test: {'PASS' if checked.structure.passed else 'FAIL'}")
+    fits = tuple((f"{name}, {word}", f"{q.fit:.2f} %") for word, table in checked.predictors.items()
+                 for name, q in table.items())[:4]
+    worst = min((q.fit for table in checked.predictors.values() for q in table.values()), default=np.nan)
+    tone = "bad" if not worst >= USELESS_FIT else "fair" if worst < POOR_FIT or not checked.passed else "good"
+    banner = Banner(tone, f"Residual tests: {'PASS' if checked.passed else 'FAIL'}", sentence + ".", fits)
+    return Document(f"Validation on {checked.data}" if checked.data else "Validation", "", [
+        Section("trust", "", [banner]), Section("tests", "Errors and tests", validation_parts(checked))])
+
+
+def comparison_document(found: "Comparison", *, command: str = "") -> Document:
+    """Return the document of several models on one record."""
+    models = dict(zip(found.names, found.models))
+    several = len(models) > 1
+    title = f"{len(models)} models on one record" if several else f"Validation of a {found.models[0].title}"
+    lead = " · ".join(part for part in (found.data.name, _length(found.data)) if part)
+
+    def figures() -> list[Any]:
+        linear = [*charts.dynamics_charts(models)] if len({(m.l, m.m) for m in found.models}) == 1 else [
+            charts.pole_chart({name: model.poles for name, model in models.items()})]
+        return [Charts(charts.record_charts(models, found.data, ahead=False), wide=True),
+                Charts([*charts.horizon_charts(found), *linear])]
+
+    each = [part for name, model, checked in zip(found.names, found.models, found.validations)
+            for part in (Heading(name), Code(model.equation(), equation=True), *validation_parts(checked))]
+    call = command or f"optid.compare_models(models, data, horizon={found.horizon})"
+    return Document(title, lead, [
+        Section("fits", "Fits", [checks.comparison_table(found), checks.facts_table(found)]),
+        Section("figures", "Figures", figures, page_only=True),
+        Section("validation", "Each model by itself", each, page_only=True),
+        Section("reproduce", "Reproduce", lambda: _reproduce(call, str(found)), page_only=True)])
+
+
+def order_document(study: "OrderStudy") -> Document:
+    """Return the document of a study of the order."""
+    notes = [Notes([*study.reasons, *study.notes])]
+    return Document(f"Order of {study.data}" if study.data else "Order", f"recommended: nx = {study.nx}", [
+        Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
+                                            Charts(charts.order_charts(study)),
+                                            Fold("Tables", [Code(describe_order(study))])])])
+
+
+def require_model(fit: "Fit") -> None:
+    """Refuse a fit that ended without a model (`DataError`)."""
+    if fit.model is None:
+        raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")

@@ -1,0 +1,83 @@
+"""What a notebook shows of a result: the verdict, the model and one table, at most one screen."""
+
+from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup, escape
+
+from optid.show import documents, estimates, summary
+from optid.show.checks import comparison_table, search_table, validation_tables
+from optid.show.printing import describe
+from optid.show.sections import TONES, Banner
+from optid.show.wording import Table, percent
+
+if TYPE_CHECKING:
+    from optid.identify.fitting import Fit
+    from optid.identify.parameters import Parameters
+    from optid.identify.search import Identification
+    from optid.identify.validation import Comparison, Validation
+    from optid.identify.verdict import Verdict
+
+MOST_ROWS = 12
+"""Rows of a table; the rest stands in the printed text."""
+
+COLOURS = {"good": "#00843f", "plain": "#1f72c9", "fair": "#b85600", "bad": "#c83350"}
+
+
+def fit_html(fit: "Fit", judged: "Verdict | None" = None) -> str:
+    """Show the verdict, the status of the solution, the equation and the parameters of a fit."""
+    if fit.model is None:
+        return f"<pre>{escape(describe(fit))}</pre>"
+    judged = fit.verdict if judged is None else judged
+    tone, word, sentence = summary.verdict(fit)
+    head = [] if judged is None else [Banner(TONES[judged.word], f"The model on this record: {judged.word}", "; ".join(
+        f"{part.name} {part.value}: FAIL" for part in judged.failed) or f"all tests pass, fit {judged.score:.1f} %")]
+    fits = ", ".join(f"{name} {percent(values)}" for name, values in (
+        ("one step", fit.one_step_fit), ("simulation", summary.simulation_fit(fit))))
+    return _html(summary.title(fit), [*head, Banner(tone, f"Solution: {word}", sentence), fits,
+                                      ("pre", fit.model.equation()), estimates.parameters_table(fit.params)])
+
+
+def search_html(found: "Identification") -> str:
+    """Show the best structures by class above the fit."""
+    return _html("", [search_table(found)]) + fit_html(found.fit, found.verdict)
+
+
+def parameters_html(found: "Parameters") -> str:
+    """Show estimates with their intervals."""
+    return _html("", [estimates.parameters_table(found)])
+
+
+def validation_html(checked: "Validation") -> str:
+    """Show the outcome, the errors and the tests of a validation."""
+    document = documents.validation_document(checked)
+    sections = [section.parts for section in document.sections[:1] if not callable(section.parts)]
+    return _html(document.title, [*sections[0], *validation_tables(checked)])
+
+
+def comparison_html(found: "Comparison") -> str:
+    """Show the fits of several models."""
+    return _html("", [comparison_table(found)])
+
+
+def _html(title: str, parts: list[Any]) -> str:
+    shown = [Markup("<b>{}</b>").format(title)] if title else []
+    for part in parts:
+        if isinstance(part, Banner):
+            shown.append(Markup('<div style="border-left:4px solid {0};padding-left:8px;margin:4px 0"><b>{1}</b><br>{2}'
+                                "</div>").format(COLOURS[part.tone], part.word, part.sentence))
+        elif isinstance(part, Table):
+            shown.append(_table(part))
+        elif isinstance(part, tuple):
+            shown.append(Markup('<pre style="white-space:pre-wrap;margin:4px 0">{}</pre>').format(part[1]))
+        else:
+            shown.append(Markup("<div>{}</div>").format(part))
+    return '<div class="optid">' + "".join(shown) + "</div>"
+
+
+def _table(table: Table) -> Markup:
+    head = Markup("").join(Markup("<th>{}</th>").format(cell) for cell in table.head)
+    rows = Markup("").join(Markup("<tr>{}</tr>").format(Markup("").join(
+        Markup("<td>{}</td>").format(cell) for cell in row)) for row in table.rows[:MOST_ROWS])
+    more = f"... and {len(table.rows) - MOST_ROWS} more: print the result" if len(table.rows) > MOST_ROWS else ""
+    return Markup("<div>{}</div><table><thead><tr>{}</tr></thead><tbody>{}</tbody></table><div>{}</div>").format(
+        table.title, head, rows, more)

@@ -1,0 +1,161 @@
+"""What a result has to say: sections of banners, facts, tables, charts and notes, for every renderer."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from optid.show.wording import Table
+
+Facts = list[tuple[str, str]]
+
+TONES = {"good": "good", "fair": "plain", "poor": "fair", "useless": "bad"}
+"""How a verdict on a model is coloured; green is left to models that are good."""
+
+
+@dataclass(frozen=True)
+class Banner:
+    """A verdict in one word, with a sentence.
+
+    Attributes:
+        tone: "good", "plain", "fair" or "bad".
+        word: the verdict.
+        sentence: what it means.
+        cards: (label, value) of the first glance.
+    """
+
+    tone: str
+    word: str
+    sentence: str = ""
+    cards: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Axis:
+    """An axis: its title with the unit, whether it is logarithmic, its ends where they are fixed, the bare unit."""
+
+    title: str
+    log: bool = False
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Series:
+    """One curve of a chart.
+
+    Attributes:
+        name: of the legend; "" stands in none.
+        xs: (n,) places, ascending but for "line-only".
+        ys: (n,) values, NaN where there are none; (n,) upper ends of an area.
+        kind: "curve", "line-only" (any order), "area", "stems", "diamonds", "dots",
+            "poles" or "bars" (heights 0 to 1).
+        colour: variable of the style sheet.
+        lows: (n,) lower ends of an area.
+        dash: SVG dashes.
+        width: of the line, in pixels.
+        aside: whether the extent of the chart does not count it.
+    """
+
+    name: str
+    xs: Any
+    ys: Any
+    kind: str = "curve"
+    colour: str = "c0"
+    lows: Any = None
+    dash: str = ""
+    width: float = 1.6
+    aside: bool = False
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure: axes, curves, and the name of the group whose x axes move together."""
+
+    title: str
+    caption: str
+    x: Axis
+    y: Axis
+    series: Sequence[Series]
+    group: str = ""
+    equal: bool = False
+    height: int | None = None
+
+
+@dataclass(frozen=True)
+class Notes:
+    """Remarks, each with a mark beside it."""
+
+    sentences: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Code:
+    """Text of fixed width: equations, calls. `equation` breaks long lines before a sign."""
+
+    text: str
+    equation: bool = False
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Parts that open on a click."""
+
+    title: str
+    parts: Sequence[Any]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Tables side by side where there is room."""
+
+    tables: Sequence[Table]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Facts in two columns where there is room."""
+
+    left: Facts
+    right: Facts
+
+
+@dataclass(frozen=True)
+class Charts:
+    """Charts side by side where there is room, or one below the other in the whole width."""
+
+    charts: Sequence[Chart]
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading inside a section."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a document.
+
+    Attributes:
+        id: anchor on a page.
+        title: heading, "" for a banner, which has its own.
+        parts: banners, facts, tables, charts, notes, code, folds; a function that returns them where that takes time.
+        page_only: whether printed text and notebooks leave it out.
+    """
+
+    id: str
+    title: str
+    parts: Sequence[Any] | Callable[[], Sequence[Any]]
+    page_only: bool = False
+
+
+@dataclass(frozen=True)
+class Document:
+    """Everything about a result, most important first."""
+
+    title: str
+    lead: str
+    sections: Sequence[Section]

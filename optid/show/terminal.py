@@ -1,0 +1,105 @@
+"""Documents as text of 80 columns, which can be pasted into a paper."""
+
+from itertools import zip_longest
+from textwrap import wrap
+
+from optid.show.sections import Banner, Code, Columns, Document, Facts, Notes, Pair
+from optid.show.wording import Table
+
+WIDTH, LEFT = 80, 36
+
+MOST_NAME = 44
+"""First cells of a table wider than this stand on lines of their own."""
+
+
+def text(document: Document) -> str:
+    """Return a document without what only a page shows."""
+    lines = [_rule("="), document.title.center(WIDTH).rstrip(), document.lead.center(WIDTH).rstrip(), _rule("=")]
+    for section in document.sections:
+        if section.page_only or callable(section.parts):
+            continue
+        for part in section.parts:
+            if shown := _lines(part):
+                lines += [*shown, _rule("-")]
+    return "\n".join([*lines[:-1], _rule("=")])
+
+
+def _lines(part: object) -> list[str]:
+    """Return the lines of a part; none for charts and folds."""
+    if isinstance(part, Banner):
+        return [*wrapped(part.word), *(wrapped(part.sentence) if part.sentence else [])]
+    if isinstance(part, Columns):
+        return _columns(part.left, part.right)
+    if isinstance(part, list):
+        return facts_lines(part)
+    if isinstance(part, Table):
+        return set_table(part)
+    if isinstance(part, Pair):
+        blocks = [set_table(table) for table in part.tables]
+        return [line for k, block in enumerate(blocks) for line in ([_rule("-")] * bool(k) + block)]
+    if isinstance(part, Notes):
+        return [line for sentence in part.sentences for line in wrapped(f"Note: {sentence}")]
+    if isinstance(part, Code):
+        return _equation(part.text) if part.equation else part.text.splitlines()
+    return []
+
+
+def _rule(sign: str) -> str:
+    return sign * WIDTH
+
+
+def wrapped(text: str, indent: str = "  ") -> list[str]:
+    """Break a sentence into lines of the page, those after the first indented."""
+    return wrap(text, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
+
+
+def _equation(text: str) -> list[str]:
+    """Break long equations before a sign, aligned behind the equals sign."""
+    lines = []
+    for equation in text.splitlines():
+        head, _, terms = equation.partition(" = ")
+        indent = " " * (len(head) + 3)
+        line = f"{head} = "
+        for k, term in enumerate(terms.replace(" + ", "\n+ ").replace(" - ", "\n- ").split("\n")):
+            if k and len(line) + 1 + len(term) > WIDTH:
+                lines.append(line.rstrip())
+                line = indent
+            line += term + " "
+        lines.append(line.rstrip())
+    return lines
+
+
+def facts_lines(facts: Facts) -> list[str]:
+    """Set facts one below the other."""
+    lines = []
+    for name, value in facts:
+        lines += wrapped(f"{name}: {value}")
+    return lines
+
+
+def _columns(left: Facts, right: Facts) -> list[str]:
+    """Set two lists of facts side by side; what is too wide for its half gets a line of its own below."""
+    widths = (LEFT, WIDTH - 2 - LEFT)
+    fits: list[list[str]] = []
+    wide: Facts = []
+    for facts, width in zip((left, right), widths):
+        lines = [(f"{name:<12} {value}", (name, value)) for name, value in facts]
+        fits.append([line for line, _ in lines if len(line) <= width])
+        wide += [fact for line, fact in lines if len(line) > width]
+    return [f"{a:<{LEFT}}  {b}".rstrip() for a, b in zip_longest(*fits, fillvalue="")] + facts_lines(wide)
+
+
+def set_table(table: Table) -> list[str]:
+    """Set a table in 80 columns: first column left, numbers right, a long first cell on a line of its own."""
+    widths = [max(len(row[c]) for row in [table.head, *table.rows]) for c in range(1, len(table.head))]
+    room = WIDTH - sum(widths) - len(widths)
+    names = min(max(len(row[0]) for row in [table.head, *table.rows]), MOST_NAME, max(room, 0))
+    gap = 2 if names + sum(widths) + 2 * len(widths) <= WIDTH else 1
+    lines = wrapped(table.title) if table.title else []
+    for row in (*[table.head] * any(table.head), *table.rows):
+        cells = "".join(" " * gap + f"{cell:>{width}}" for cell, width in zip(row[1:], widths))
+        if len(row[0]) > names:
+            lines += [row[0], " " * names + cells]
+        else:
+            lines.append(f"{row[0]:<{names}}{cells}".rstrip())
+    return lines + (wrapped(table.note) if table.note else [])

@@ -1,0 +1,158 @@
+"""Pages of results in a headless browser: nothing is cut off, nothing overlaps, everything can be read and operated."""
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, NO_BROWSER, Browser
+from sample_fits import example_fit, feedback_fit, mimo_fit, two_by_two
+
+import optid
+from optid import report
+
+OVERLAPS = """[...document.querySelectorAll('.plot svg')].flatMap((svg) => {
+  const texts = [...svg.querySelectorAll('text')].map((t) => [t.textContent, t.getBoundingClientRect()]);
+  return texts.flatMap(([a, p], i) => texts.slice(i + 1).filter(([, q]) =>
+    p.left < q.right - 1 && q.left < p.right - 1 && p.top < q.bottom - 1 && q.top < p.bottom - 1)
+    .map(([b]) => `${svg.getAttribute('aria-label')}: ${a} over ${b}`));
+})"""
+
+COVERED = """[...document.querySelectorAll('h3, .legend button, .zoom button, figcaption')].flatMap((one, i, all) =>
+  all.slice(i + 1).filter((other) => { if (!one.offsetParent || !other.offsetParent) return false;
+    const a = one.getBoundingClientRect(), b = other.getBoundingClientRect();
+    const text = (e, r) => e.tagName === 'H3' ? Object.assign(document.createRange(), {}) && (() => {
+      const range = document.createRange(); range.selectNodeContents(e); return range.getBoundingClientRect(); })() : r;
+    const p = text(one, a), q = text(other, b);
+    return p.left < q.right - 1 && q.left < p.right - 1 && p.top < q.bottom - 1 && q.top < p.bottom - 1; })
+  .map((other) => `${one.textContent} | ${other.textContent || other.ariaLabel}`))"""
+
+CONTRAST = """(() => {
+  const canvas = document.createElement('canvas').getContext('2d', { willReadFrequently: true });
+  const rgba = (colour) => { canvas.clearRect(0, 0, 1, 1); canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1);
+    const d = canvas.getImageData(0, 0, 1, 1).data; return [d[0], d[1], d[2], d[3] / 255]; };
+  const over = (top, low) => [0, 1, 2].map((k) => top[k] * top[3] + low[k] * (1 - top[3])).concat(1);
+  const light = (c) => [0, 1, 2].map((k) => c[k] / 255)
+    .map((v) => v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4)
+    .reduce((sum, v, k) => sum + v * [.2126, .7152, .0722][k], 0);
+  const found = [];
+  for (const one of document.querySelectorAll('body *')) {
+    if (![...one.childNodes].some((n) => n.nodeType === 3 && n.data.trim())) continue;
+    if (['SCRIPT', 'STYLE', 'NOSCRIPT'].includes(one.tagName)) continue;
+    if (!one.getClientRects().length) continue;
+    const style = getComputedStyle(one), layers = [];
+    for (let up = one; up; up = up.parentElement) layers.push(rgba(getComputedStyle(up).backgroundColor));
+    let back = [255, 255, 255, 1];
+    for (const layer of layers.reverse()) back = over(layer, back);
+    const ink = over(rgba(one instanceof SVGElement ? style.fill : style.color), back);
+    const [a, b] = [light(ink), light(back)].sort((p, q) => q - p), ratio = (a + .05) / (b + .05);
+    if (ratio < 4.5) found.push(`${one.tagName} "${one.textContent.slice(0, 30)}" ${ratio.toFixed(2)}`);
+  }
+  return [...new Set(found)];
+})()"""
+
+DRAWN = "[...document.querySelectorAll('[data-chart]')].every((host) => host.querySelector('svg'))"
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """Every kind of page, the names of channels awkward."""
+    folder = tmp_path_factory.mktemp("pages")
+    fit, record = example_fit("thruster"), example_fit("thruster").data
+    useless = optid.fit(optid.Data(record.u, np.random.default_rng(0).standard_normal(record.y.shape), record.dt),
+                        "arx", na=1, nb=1)
+    return {
+        "fit": report.write(fit, folder / "fit.html"),
+        "several": report.write(mimo_fit(), folder / "several.html", two_by_two(seed=5)),
+        "feedback": report.write(feedback_fit(), folder / "feedback.html"),
+        "useless": report.write(useless, folder / "useless.html"),
+        "validation": fit.validate().report(folder / "validation.html"),
+        "comparison": optid.compare_models({"exact": fit.model, "smaller": fit.refit(na=1).model}, record).report(
+            folder / "comparison.html"),
+        "order": optid.order(record).report(folder / "order.html"),
+        "search": optid.identify(record, budget=3, workers=1).report(folder / "search.html"),
+    }
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    with Browser(tmp_path_factory.mktemp("profile")) as one:
+        yield one
+
+
+def shown(browser, path, width, dark=False):
+    """Open a page, bring every figure into view once, and return the milliseconds until it could be used."""
+    browser.window(width, 900, dark=dark, phone=width < 500)
+    browser.open(path)
+    ready = float(browser.run("document.documentElement.dataset.ready"))
+    browser.run("(async () => { for (const host of document.querySelectorAll('[data-chart]')) { host.scrollIntoView("
+                "{behavior: 'instant'}); await new Promise((done) => requestAnimationFrame(() => "
+                "requestAnimationFrame(done))); } })()")
+    browser.wait(DRAWN)
+    return ready
+
+
+NAMES = ["fit", "several", "feedback", "useless", "validation", "comparison", "order", "search"]
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [1300, 390])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_page_fits_the_window_and_can_be_read(pages, browser, name, width, dark):
+    ready = shown(browser, pages[name], width, dark)
+    assert browser.complaints() == [] and browser.requests() == []
+    assert ready < 1000
+    assert browser.run("document.documentElement.scrollWidth") <= width
+    cut = browser.run("[...document.querySelectorAll('.scroll')].filter((e) => e.scrollWidth > e.clientWidth + 1)"
+                      ".map((e) => e.ariaLabel)")
+    assert cut == []
+    assert browser.run(OVERLAPS) == []
+    assert browser.run(COVERED) == []
+    assert browser.run(CONTRAST) == []
+
+
+def test_a_useless_model_is_never_green(pages, browser):
+    shown(browser, pages["useless"], 1300)
+    assert browser.run("document.querySelector('main section').className") == "verdict bad"
+    assert "useless" in browser.run("document.querySelector('main section .word').textContent")
+
+
+def test_records_zoom_together_and_show_their_values(pages, browser):
+    shown(browser, pages["fit"], 1300)
+    views = "[...document.querySelectorAll('.charts svg.chart')].map((s) => s.dataset.view)"
+    browser.drag(".charts figure:first-child svg.chart", (0.4, 0.4), (0.6, 0.6))
+    first, second = browser.run(views)[:2]
+    assert first.split()[:2] == second.split()[:2] and float(first.split()[1]) - float(first.split()[0]) < 30
+    browser.run("document.querySelector('.charts svg.chart').focus()")
+    browser.press(".")
+    assert "measured: " in browser.run("document.querySelector('.charts .tip:not([hidden])').textContent")
+    browser.press("0")
+    again = browser.run(views)[:2]
+    assert [view.split()[:2] for view in again] == [again[0].split()[:2]] * 2 and float(again[0].split()[1]) > 55
+
+
+def test_curves_are_switched_off_by_the_legend(pages, browser):
+    shown(browser, pages["fit"], 1300)
+    count = "document.querySelectorAll('.charts figure:first-child [data-series]').length"
+    before = browser.run(count)
+    browser.click(".charts figure:first-child .legend button")
+    assert browser.run(count) == before - 1
+
+
+def test_the_theme_is_switched_by_a_button(pages, browser):
+    shown(browser, pages["fit"], 1300)
+    light = browser.run("getComputedStyle(document.body).backgroundColor")
+    browser.click("#theme")
+    assert browser.run("getComputedStyle(document.body).backgroundColor") != light
+
+
+def test_ten_thousand_samples_stay_light_and_quick(browser, tmp_path):
+    rng = np.random.default_rng(2)
+    u, y = rng.standard_normal(10_000), np.zeros(10_000)
+    for k in range(1, u.size):
+        y[k] = 0.8 * y[k - 1] + np.tanh(u[k - 1]) + 0.05 * rng.standard_normal()
+    fit = optid.fit(optid.Data(u, y, 0.01), na=1, nb=1, nk=1, basis="triangular:10")
+    path = report.write(fit, tmp_path / "long.html")
+    assert path.stat().st_size < 2e6
+    assert shown(browser, path, 1300) < 1000
+    drawn = browser.run("document.querySelector('.charts path[data-series=measured]').getAttribute('d').length")
+    assert drawn < 80_000  # the extremes of every pixel, not every sample
