@@ -48,6 +48,7 @@ PRINTED = {  # table 5.1: why an order is open
 EXPECTED: dict[str, dict[str, Range]] = {
     "quickstart": {"one-step fit": (90, 93), "simulation fit": (80, 85), "gap": (0, 1e-8), "proved": (1, 1)},
     "constraints": {"gain": about(9.0, 1e-6), "a1": (-1.6, -1.45), "proved": (1, 1), "explained": (1, 1)},
+    "predictive_control": {"thrust": about(0.8, 0.01), "difference": (0, 1e-9)},
     "two_tanks": {"pump": about(0.4, 0.004), "upper": about(0.3, 0.001), "lower": about(0.25, 0.002),
                   "gain": about(5.12, 0.05)},
     "solvers": {

@@ -1,11 +1,15 @@
 """Exports against the model's own responses and simulation."""
 
+import ctypes
+import shutil
+import subprocess
 import sys
 
 import casadi as ca
 import numpy as np
 import pytest
-from scipy import signal
+from sample_fits import feedback_fit
+from scipy import signal, special
 from systems import BASES, inputs, mimo, nonlinearity, siso
 
 from optid.bases import UserFunctions
@@ -95,7 +99,56 @@ def test_casadi_in_a_predictive_controller():
     assert model.simulate(np.array([[best]]), x0=[0.1, 0.0])[0, 0] == pytest.approx(0.8, abs=1e-4)
 
 
-def test_user_functions_have_no_symbolic_form():
-    functions = UserFunctions((np.tanh,), ("tanh",)).fitted(-1, 1)
-    with pytest.raises(StructureError, match="BSpline"):
+def test_user_functions_are_called_with_symbols():
+    functions = UserFunctions((np.tanh, lambda v: v**3 + np.exp(-v)), ("tanh", "mixed")).fitted(-1, 1)
+    model = siso(nonlinearities=(Nonlinearity(functions, [1.0, -0.4]),))
+    u = np.random.default_rng(3).uniform(-1.4, 1.4, (60, 1))
+    state = np.array([[0.4], [-0.3]])
+    assert iterate(model.to_casadi(), u, state) == pytest.approx(model.simulate(u, x0=state), abs=1e-12)
+
+
+def test_a_user_function_that_takes_arrays_only_is_refused():
+    functions = UserFunctions((special.j1,), ("bessel",)).fitted(-1, 1)
+    with pytest.raises(StructureError, match="CasADi scalar"):
         siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi()
+
+
+def test_a_user_function_that_means_something_else_of_symbols_is_refused():
+    functions = UserFunctions((lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0),), ("two",)).fitted(-1, 1)
+    with pytest.raises(StructureError, match="other values"):
+        siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi()
+
+
+def test_control_keeps_the_names_of_the_channels():
+    pytest.importorskip("control")
+    model = mimo()
+    system = model.to_control()
+    assert system.output_labels == list(model.outputs)
+    assert system.input_labels == [name if f.is_linear else f"f({name})"
+                                   for name, f in zip(model.inputs, model.nonlinearities)]
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on PATH")
+@pytest.mark.parametrize("name", ["triangular", "spline", "several", "feedback"])
+def test_compiled_c_equals_the_simulation(name, tmp_path):
+    model = {"triangular": lambda: siso(BASES[0], nk=1), "spline": lambda: siso(BASES[3]), "several": mimo,
+             "feedback": lambda: feedback_fit().model}[name]()
+    source = model.to_c(tmp_path / "plant.c", "plant")
+    library = tmp_path / "plant.so"
+    warned = ["-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror"]
+    subprocess.run(["gcc", "-std=c99", "-O2", *warned, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"],
+                   check=True)
+    step = ctypes.CDLL(str(library)).plant_step
+    u = np.random.default_rng(5).uniform(-1.2, 1.2, (200, model.m))
+    x, y, found = np.zeros(model.to_casadi().size1_in(0)), np.zeros(model.l), []
+    at = ctypes.POINTER(ctypes.c_double)
+    for row in np.ascontiguousarray(u):
+        step(x.ctypes.data_as(at), row.ctypes.data_as(at), y.ctypes.data_as(at))
+        found.append(y.copy())
+    expected = model.simulate(u)
+    assert np.array(found) == pytest.approx(expected, abs=1e-12 * max(1.0, np.max(np.abs(expected))))
+
+
+def test_c_refuses_a_name_that_is_none(tmp_path):
+    with pytest.raises(StructureError, match="C function"):
+        siso().to_c(tmp_path / "a.c", "my-plant")

@@ -252,8 +252,8 @@ HOW: dict[str, dict[str, Any]] = {
 
 
 def main() -> None:
-    from optid.faults import dictionary, health, whiten
     from optid.faults import diagnose as diagnosed
+    from optid.faults import dictionary, health, whiten
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=4)

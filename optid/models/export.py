@@ -1,6 +1,8 @@
-"""Models for other tools: SciPy, python-control, and CasADi for predictive control."""
+"""Models for other tools: SciPy, python-control, CasADi for predictive control, and C."""
 
+import warnings
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -32,8 +34,9 @@ def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
 def to_control(model: Any) -> Any:
     """Return the linear part, from every f to every output, as a python-control system.
 
-    Its inputs are the values of the nonlinearities; the constants are not part of it. A transfer-function model with
-    one output is a transfer function, every other one a state-space system.
+    Its inputs are the values of the nonlinearities, "f(u)" of an input "u" (a linear one keeps its name); the constants
+    are not part of it. A transfer-function model with one output is a transfer function, every other one a state-space
+    system. The outputs keep their names; a full stop, which python-control reserves, becomes an underscore.
 
     Raises:
         OptidError: python-control is not installed.
@@ -42,10 +45,15 @@ def to_control(model: Any) -> Any:
         import control
     except ImportError as error:
         raise OptidError("to_control needs python-control: pip install 'optid[control]'") from error
+    places = list(getattr(model, "input_of", range(model.m)))
+    drives = [model.inputs[i] if f.is_linear else f"f{places[:k].count(i) + 1 if places.count(i) > 1 else ''}"
+              f"({model.inputs[i]})" for k, (f, i) in enumerate(zip(model.nonlinearities, places))]
+    names = {"inputs": [name.replace(".", "_") for name in drives],
+             "outputs": [name.replace(".", "_") for name in model.outputs]}
     if model.structure == "ss" or model.l > 1:
-        return control.ss(*state_space(model), model.dt)
+        return control.ss(*state_space(model), model.dt, **names)
     pairs = [_polynomials(model, c) for c in range(model.m)]
-    return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt)
+    return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt, **names)
 
 
 def to_casadi(model: Any) -> Any:
@@ -58,7 +66,7 @@ def to_casadi(model: Any) -> Any:
     cannot raise). Iterating equals `model.simulate`.
 
     Raises:
-        StructureError: a basis of UserFunctions, which has no symbolic form.
+        StructureError: a basis of UserFunctions that cannot be called with a CasADi scalar.
     """
     import casadi as ca
 
@@ -85,6 +93,59 @@ def to_casadi(model: Any) -> Any:
     return ca.Function(name, [x, u], [following, y], ["x", "u"], ["x_next", "y"])
 
 
+def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
+    """Write a model as one C file without dependencies, for a control loop: the free run, one sample a call.
+
+    ``NAME_step(x, u, y)`` computes the outputs y of a sample from its inputs u and takes the state x to the next one;
+    NAME_STATES, NAME_INPUTS and NAME_OUTPUTS are their lengths, NAME_DT is the sampling time. The state is that of
+    `to_casadi`; zeros are a start at rest. Iterating equals `model.simulate`. The code allocates nothing.
+
+    Args:
+        model: the model.
+        path: the file, replaced when it exists.
+        name: prefix of the names in C.
+
+    Raises:
+        StructureError: a name that C does not take, or as `to_casadi`.
+    """
+    import casadi as ca
+
+    if not (name.isidentifier() and name.isascii()):
+        raise StructureError(f"name={name!r} cannot be the name of a C function: use letters, digits and underscores")
+    function = model.to_casadi()
+    x, u = (ca.SX.sym(word, function.size1_in(i)) for i, word in enumerate("xu"))
+    kernel = ca.Function(f"{name}_kernel", [x, u], list(function(x, u)))
+    code = ca.CodeGenerator(f"{name}.c", {"with_header": False})
+    code.add(kernel)
+    channels = [f"{kind} {k}: {channel}{f' ({unit})' if unit else ''}" for kind, names, units in (
+        ("u", model.inputs, model.input_units), ("y", model.outputs, model.output_units))
+        for k, (channel, unit) in enumerate(zip(names, units))]
+    lines = [model.title, *channels, *model.equation().splitlines()]
+    notes = "\n".join(f" * {line.replace('*/', '* /')}" for line in lines)
+    up = name.upper()
+    path = Path(path)
+    path.write_text(f"""/*
+{notes}
+ */
+#define {up}_STATES {x.numel()}
+#define {up}_INPUTS {u.numel()}
+#define {up}_OUTPUTS {model.l}
+#define {up}_DT {model.dt!r}
+
+{code.dump()}
+/* Compute y (of {up}_OUTPUTS) from x and u (of {up}_STATES, {up}_INPUTS), and take x to the next sample. */
+void {name}_step(double *x, const double *u, double *y) {{
+  const double *arg[{max(kernel.sz_arg(), 2)}] = {{x, u}};
+  double next[{max(x.numel(), 1)}], w[{max(kernel.sz_w(), 1)}];
+  double *res[{max(kernel.sz_res(), 2)}] = {{next, y}};
+  casadi_int iw[{max(kernel.sz_iw(), 1)}];
+  {name}_kernel(arg, res, iw, w, 0);
+  for (int i = 0; i < {x.numel()}; i++) x[i] = next[i];
+}}
+""", encoding="utf-8")
+    return path
+
+
 def state_space(model: Any) -> tuple[Array, Array, Array, Array]:
     """Return A, B, C, D of the linear part, of a transfer function in observer form with n l states."""
     if model.structure == "ss":
@@ -109,11 +170,8 @@ def symbolic(nonlinearity: Nonlinearity, u: Any) -> Any:
 
     tables = tabulated([nonlinearity])
     kind, low, high, numbers = tables.kind[0], float(tables.low[0]), float(tables.high[0]), tables.numbers[0]
-    if kind == USER:
-        raise StructureError(
-            f"{type(nonlinearity.basis).__name__} has no symbolic form for CasADi: fit the model again with BSpline or "
-            "Triangular."
-        )
+    if kind == USER and not tables.outside[0] == LINEAR:
+        return _called(nonlinearity, u if tables.outside[0] == FREE else ca.fmin(ca.fmax(u, low), high))
     if tables.outside[0] == LINEAR:
         slope = nonlinearity.slope(np.array([low, high]))
         inside = symbolic(Nonlinearity(replace(cast(Any, nonlinearity.basis), outside="clamp"), nonlinearity.mu,
@@ -137,6 +195,32 @@ def symbolic(nonlinearity: Nonlinearity, u: Any) -> Any:
     for k, (cosine, sine) in enumerate(numbers, start=1):
         f = f + float(cosine) * ca.cos(k * angle) + float(sine) * ca.sin(k * angle)
     return f
+
+
+def _called(nonlinearity: Nonlinearity, u: Any) -> Any:
+    """Call functions of the user with a CasADi scalar, and compare the values with those of arrays at a few points."""
+    import casadi as ca
+
+    basis = cast(Any, nonlinearity.basis)
+    weights = basis.contrast @ nonlinearity.mu
+    scalar = ca.MX.sym("u")
+    try:
+        with warnings.catch_warnings():  # CasADi announces another kind of result for arrays; scalars stay scalars
+            warnings.simplefilter("ignore", FutureWarning)
+            values = [function(scalar) for function in basis.functions]
+        f = ca.Function("f", [scalar], [sum(float(w) * value for w, value in zip(weights, values))])
+    except Exception as error:  # whatever the user's function does with what is no array
+        raise StructureError(
+            f"{type(basis).__name__} cannot be called with a CasADi scalar ({type(error).__name__}: {error}): write it "
+            "in arithmetic and NumPy functions, or fit the model again with BSpline or Triangular.") from None
+    low, high = basis.interval or (-1.0, 1.0)
+    points = np.linspace(low, high, 7)
+    expected = replace(nonlinearity, offset=0.0)(points)
+    found = np.array(f(points[None])).ravel()
+    if not np.allclose(found, expected, rtol=1e-9, atol=1e-9 * float(np.max(np.abs(expected)))):
+        raise StructureError(f"{type(basis).__name__} has other values for a CasADi scalar than for an array: write it "
+                             "in arithmetic and NumPy functions, or fit the model again with BSpline or Triangular.")
+    return f(u) + (nonlinearity.offset or 0.0)
 
 
 def _piecewise(pieces: Array, x: Any) -> Any:

@@ -304,7 +304,7 @@ class Model(Ports):
 
     # -- other tools and files -----------------------------------------------------------------------------------
 
-    to_dlti, to_control, to_casadi = export.to_dlti, export.to_control, export.to_casadi
+    to_dlti, to_control, to_casadi, to_c = export.to_dlti, export.to_control, export.to_casadi, export.to_c
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""
