@@ -1,11 +1,13 @@
 """Synthetic rows of a study, for the tests of whatever reads them."""
 
+import hashlib
+import json
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 
-from optid.studies.storage.rows import as_json, complete, place
+from optid.studies.storage.rows import as_json, complete
 
 START = datetime(2026, 3, 1, 8, 0, tzinfo=UTC)
 # solver: (factor of its time, share of runs that fail, share of false claims, exponent of the growth with N)
@@ -41,9 +43,8 @@ def _row(rng: np.random.Generator, k: int, turn: int, data: str, formulation: st
     factor, failing, lying, growth = SOLVERS[solver]
     noise, seed, repetition = (0.1, turn, 0) if system else (None, None, turn)
     labels = ("synthetic", data, formulation, solver, samples, noise, seed, 1e-8, repetition)
-    hashed = place(*labels)
     row: dict[str, Any] = dict(
-        key=f"{place(*labels[:-1]):0<64}", repetition=repetition, place=hashed, study="synthetic", data=data,
+        key=f"{place(*labels[:-1]):0<64}", repetition=repetition, study="synthetic", data=data,
         formulation=formulation, solver=solver, system=system or None, file=None if system else f"{data}.csv",
         data_hash=None if system else place(data),
         samples=samples, noise=noise, seed=seed, formulation_name=name, options=as_json({"na": 2, "nb": 2}),
@@ -131,7 +132,7 @@ def times_of(*factors, problems=20, spread=0.1, seed=0):
 
 def row(solver, **values):
     """One complete row of a comparison on one record: solved unless said otherwise."""
-    given = {"key": solver, "repetition": 0, "place": solver, "study": "s", "data": "d", "formulation": "f",
+    given = {"key": solver, "repetition": 0, "study": "s", "data": "d", "formulation": "f",
              "solver": solver, "formulation_name": "f", "options": "{}", "constraints": "[]", "solver_name": solver,
              "solver_options": "{}", "accuracy": 1e-8, "holdout": 0.3, "time_limit": 60.0, "memory_limit": 2e3,
              "outcome": "done", "status_verified": "optimal", "proved": True, "reached": True, "objective": 1.0,
@@ -143,3 +144,8 @@ def row(solver, **values):
 
 LOCAL = {"status_verified": "locally optimal", "proved": False}
 FAILED = {"status_verified": "failed", "reached": False, "proved": False, "objective": None, "reason": "it broke"}
+
+
+def place(*labels):
+    """The hash of labels, in 32 digits."""
+    return hashlib.sha256(json.dumps(labels).encode()).hexdigest()[:32]

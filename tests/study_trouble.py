@@ -14,7 +14,7 @@ import numpy as np
 from optid.studies.definition.description import DataEntry
 from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell
-from optid.studies.storage.rows import as_json, complete, place
+from optid.studies.storage.rows import as_json, complete
 
 FINE = "fine"
 
@@ -31,9 +31,8 @@ def cell(number: int, do: str = FINE, *, time_limit: float = 300.0, memory_limit
 
 def row(of: Cell, **values: Any) -> dict[str, Any]:
     """Return a row of such a cell, made without running anything."""
-    labels = (of.study, of.data, of.formulation, of.solver, of.samples, of.noise, of.seed, of.accuracy, of.repetition)
     return complete({
-        "key": of.key, "repetition": of.repetition, "place": place(*labels), "study": of.study, "data": of.data,
+        "key": of.key, "repetition": of.repetition, "study": of.study, "data": of.data,
         "formulation": of.formulation, "solver": of.solver, "seed": of.seed, "formulation_name": of.formulation_name,
         "options": "{}", "constraints": "[]", "solver_name": of.solver_name,
         "solver_options": as_json(of.solver_options), "accuracy": of.accuracy, "warm": of.warm, "holdout": of.holdout,
@@ -110,12 +109,12 @@ def _keep(cell: Cell, words: dict[str, Any]) -> Any:
     return row(cell)
 
 
-def _family(cell: Cell, words: dict[str, Any]) -> None:
-    """Leave the memory and the work to a child."""
+def _family(cell: Cell, words: dict[str, Any]) -> Any:
+    """Leave the memory and the work to a child; the row has its exit code."""
     child = subprocess.Popen([sys.executable, "-c", words["program"]])
     with open(words["pids"], "a") as file:
         file.write(f"{child.pid}\n")
-    child.wait()
+    return row(cell, iterations=child.wait())
 
 
 def _cores(cell: Cell, words: dict[str, Any]) -> Any:
@@ -151,3 +150,8 @@ def _noisy(cell: Cell, words: dict[str, Any]) -> Any:
         print("x" * 10_000)
         print("y" * 10_000, file=sys.stderr)
     return row(cell)
+
+
+def fail_to_start() -> None:
+    """Prepare a worker that cannot work."""
+    import no_such_module  # pyright: ignore # noqa: F401

@@ -14,7 +14,7 @@ from optid.studies.definition.description import Study
 from optid.studies.execution.cell import lost_row
 from optid.studies.grid import cells
 from optid.studies.page import write_page
-from optid.studies.storage.database import append, read_rows
+from optid.studies.storage.store import append, read_rows
 from optid.studies.verdicts.verdict import conclude
 
 SOLVERS = '["clarabel", "gauss_newton", "auto"]'
@@ -73,13 +73,13 @@ def folder(tmp_path, monkeypatch):
 
 def test_a_study_from_run_to_page(folder):
     plan = run("study", "run", "rigs.toml", "--dry-run")
-    assert plan.exit_code == 0 and "18 cells, 18 of them to run" in plan.stdout and not Path("rigs.duckdb").exists()
+    assert plan.exit_code == 0 and "18 cells, 18 of them to run" in plan.stdout and not Path("rigs.sqlite").exists()
 
     first = run("study", "run", "rigs.toml", "-w", 1, "--export", "rows.csv")
     assert first.exit_code == 0, first.stderr
     assert first.stdout.startswith("18 cells to run\n") and "18 rows written to rows.csv" in first.stdout
-    assert "optid study report rigs.duckdb -o rigs.html" in first.stdout
-    rows = read_rows("rigs.duckdb")
+    assert "optid study report rigs.sqlite -o rigs.html" in first.stdout
+    rows = read_rows("rigs.sqlite")
     pairs = set(zip(rows["formulation"], rows["solver"], rows["outcome"], rows["status_verified"]))
     assert pairs == {("exact", "gauss_newton", "done", "optimal"), ("exact", "auto", "done", "optimal"),
                      ("arx", "clarabel", "done", "optimal"), ("arx", "auto", "done", "optimal"),
@@ -91,40 +91,38 @@ def test_a_study_from_run_to_page(folder):
 
     started = sorted(rows["started"])
     again = run("study", "run", "rigs.toml")
-    assert again.stdout.startswith("18 of 18 cells are in rigs.duckdb already; nothing is left to run")
-    assert sorted(read_rows("rigs.duckdb")["started"]) == started  # nothing was computed again
+    assert again.stdout.startswith("18 of 18 cells are in rigs.sqlite already; nothing is left to run")
+    assert sorted(read_rows("rigs.sqlite")["started"]) == started  # nothing was computed again
 
     Path("rigs.toml").write_text(STUDY.format(solvers='["clarabel", "gauss_newton", "auto", "osqp"]'))
     more = run("study", "run", "rigs.toml", "-w", 1)
-    assert more.stdout.startswith("18 of 24 cells are in rigs.duckdb already; 6 to run")
+    assert more.stdout.startswith("18 of 24 cells are in rigs.sqlite already; 6 to run")
 
-    told = run("study", "report", "rigs.duckdb", "-o", "page.html")
+    told = run("study", "report", "rigs.sqlite", "-o", "page.html")
     assert told.exit_code == 0 and "report written to page.html" in told.stdout
     assert "auto" in told.stdout and Path("page.html").stat().st_size > 20_000
-    assert run("study", "export", "rigs.duckdb", "rows.parquet").stdout == "24 rows written to rows.parquet\n"
+    assert run("study", "export", "rigs.sqlite", "rows.parquet").stdout == "24 rows written to rows.parquet\n"
 
 
 def test_data_that_changed_are_refused_until_accepted(folder):
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]'))
     assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
-    before = read_rows("rigs.duckdb")
+    before = read_rows("rigs.sqlite")
     write_rig(folder / "rig.csv", seed=1)
     refused = run("study", "run", "rigs.toml", "-w", 1)
     assert refused.exit_code == 2 and "rig.csv" in refused.stderr and "--accept-changed-data" in refused.stderr
-    assert len(read_rows("rigs.duckdb")["key"]) == len(before["key"]) == 6
+    assert len(read_rows("rigs.sqlite")["key"]) == len(before["key"]) == 6
     accepted = run("study", "run", "rigs.toml", "-w", 1, "--accept-changed-data")
-    assert accepted.exit_code == 0 and "4 of 6 cells are in rigs.duckdb already; 2 to run" in accepted.stdout
-    after = read_rows("rigs.duckdb")
+    assert accepted.exit_code == 0 and "4 of 6 cells are in rigs.sqlite already; 2 to run" in accepted.stdout
+    after = read_rows("rigs.sqlite")
     assert len(after["key"]) == 6 and len(set(after["key"]) & set(before["key"])) == 4
     assert run("study", "run", "rigs.toml").exit_code == 0  # and is now what the database knows
 
 
 def test_a_dry_run_counts_what_the_run_would_run(folder):
-    from optid.studies.storage.journal import Journal, locked
-
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("seeds = 2", "seeds = 2\nmemory_limit = 1.0"))
     assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 4
-    rows, before = read_rows("rigs.duckdb"), Path("rigs.duckdb").read_bytes()
+    rows, before = read_rows("rigs.sqlite"), Path("rigs.sqlite").read_bytes()
     assert set(rows["outcome"]) == {"memory limit"} and rows["key"].size == 6
 
     def left(*words):
@@ -143,12 +141,9 @@ def test_a_dry_run_counts_what_the_run_would_run(folder):
     assert left() == 6
     text = Path("rigs.toml").read_text()
     cell = next(c for c in cells(Study.from_text(text, folder)) if c.seed == 1)
-    Journal(folder / "rigs.duckdb").add(lost_row(cell, "crashed", "for the test"))
-    kept = Path("rigs.duckdb.journal").read_bytes()
-    assert left() == 5 and Path("rigs.duckdb.journal").read_bytes() == kept
-    assert Path("rigs.duckdb").read_bytes() == before  # nothing was run, and nothing was written
-    with locked(folder / "rigs.duckdb"):
-        assert "another run is writing to" in run("study", "run", "rigs.toml", "--dry-run").stderr
+    assert Path("rigs.sqlite").read_bytes() == before  # nothing was run, and nothing was written
+    append(folder / "rigs.sqlite", [lost_row(cell, "crashed", "for the test")])
+    assert left() == 5
     told = run("study", "run", "rigs.toml", "--dry-run", "--db", "rig.csv").stderr
     assert told.startswith("error: rig.csv ")
 
@@ -158,11 +153,11 @@ def test_every_reason_is_told_once_and_a_run_without_an_answer_ends_with_4(folde
     Path("rigs.toml").write_text(exact.format(solvers='["clarabel", "scs"]'))
     first = run("study", "run", "rigs.toml", "-w", 1, "--export", "rows.csv")
     assert first.exit_code == 4 and Path("rows.csv").is_file()
-    for found in first, run("study", "report", "rigs.duckdb"):
+    for found in first, run("study", "report", "rigs.sqlite"):
         told = [line for line in found.stdout.splitlines() if line.startswith("clarabel: refused 3: ")]
         assert len(told) == 1 and ".exact' is not convex" in told[0] and found.stdout.count("scs: refused 3: ") == 1
     for accuracy in (-1, "nan", 1):
-        refused = run("study", "report", "rigs.duckdb", "--accuracy", accuracy)
+        refused = run("study", "report", "rigs.sqlite", "--accuracy", accuracy)
         assert refused.exit_code == 2 and f"between 0 and 1; {accuracy} is not" in refused.stderr
     Path("rigs.toml").write_text(exact.format(solvers='["clarabel", "gauss_newton"]'))
     assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
@@ -174,25 +169,25 @@ def test_two_studies_of_one_database_are_never_one(folder):
         Path("rigs.toml").write_text(text.format(solvers='["clarabel"]').replace('"rigs"', f'"{name}"'))
         told = run("study", "run", "rigs.toml", "-w", 1, "--export", "one.csv")
         assert told.exit_code == 0 and "2 rows written to one.csv" in told.stdout
-        said = "optid study report rigs.duckdb -o rigs.html" + (" --study other_rig" if name == "other_rig" else "")
+        said = "optid study report rigs.sqlite -o rigs.html" + (" --study other_rig" if name == "other_rig" else "")
         assert said in told.stdout.splitlines()
-    refused = run("study", "report", "rigs.duckdb", "-o", "page.html")
+    refused = run("study", "report", "rigs.sqlite", "-o", "page.html")
     assert refused.exit_code == 2 and not Path("page.html").exists()
     assert "holds 2 studies: 'first rig' (2 rows), 'other_rig' (2 rows). Name one: --study TITLE" in refused.stderr
-    one = run("study", "report", "rigs.duckdb", "--study", "first rig", "-o", "page.html")
+    one = run("study", "report", "rigs.sqlite", "--study", "first rig", "-o", "page.html")
     assert one.exit_code == 0 and "other_rig" not in Path("page.html").read_text()
-    assert "Did you mean 'other_rig'?" in run("study", "report", "rigs.duckdb", "--study", "othr_rig").stderr
-    assert run("study", "export", "rigs.duckdb", "all.csv").stdout == "4 rows of 2 studies written to all.csv\n"
-    assert run("study", "export", "rigs.duckdb", "1.csv", "--study", "other_rig").stdout == "2 rows written to 1.csv\n"
+    assert "Did you mean 'other_rig'?" in run("study", "report", "rigs.sqlite", "--study", "othr_rig").stderr
+    assert run("study", "export", "rigs.sqlite", "all.csv").stdout == "4 rows of 2 studies written to all.csv\n"
+    assert run("study", "export", "rigs.sqlite", "1.csv", "--study", "other_rig").stdout == "2 rows written to 1.csv\n"
     with open("1.csv", newline="") as file:
         assert {line["study"] for line in comma.DictReader(file)} == {"other_rig"}
-    assert run("study", "export", "rigs.duckdb", "2.csv", "--study", "third").exit_code == 2
+    assert run("study", "export", "rigs.sqlite", "2.csv", "--study", "third").exit_code == 2
     with pytest.raises(StudyError, match="holds 2 studies"):
-        conclude("rigs.duckdb")
+        conclude("rigs.sqlite")
     with pytest.raises(StudyError, match="holds 2 studies"):
-        write_page("rigs.duckdb", "page.html")
-    assert set(conclude("rigs.duckdb", study="first rig").table["study"]) == {"first rig"}
-    assert "other_rig" not in write_page("rigs.duckdb", "page.html", study="first rig").read_text()
+        write_page("rigs.sqlite", "page.html")
+    assert set(conclude("rigs.sqlite", study="first rig").table["study"]) == {"first rig"}
+    assert "other_rig" not in write_page("rigs.sqlite", "page.html", study="first rig").read_text()
 
 
 def test_reasons_that_differ_in_their_numbers_are_one(capsys):
@@ -211,13 +206,13 @@ def test_what_is_taken_out_of_a_study_leaves_its_reports_which_say_so(folder):
     first = run("study", "run", "rigs.toml", "-w", 1)
     assert first.exit_code == 0 and "superseded" not in first.stdout
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]'))
-    before = Path("rigs.duckdb").read_bytes()
+    before = Path("rigs.sqlite").read_bytes()
     said = "6 rows are set aside: solver gauss_newton is no longer in the study (6)"
-    assert said in run("study", "run", "rigs.toml", "--dry-run").stdout and Path("rigs.duckdb").read_bytes() == before
+    assert said in run("study", "run", "rigs.toml", "--dry-run").stdout and Path("rigs.sqlite").read_bytes() == before
     assert said in run("study", "run", "rigs.toml", "-w", 1).stdout.splitlines()
-    report = run("study", "report", "rigs.duckdb").stdout
+    report = run("study", "report", "rigs.sqlite").stdout
     assert "gauss_newton" not in report
-    assert "6 rows of former entries" in report and "kept in rigs.duckdb (table superseded)" in report
+    assert "6 rows of former entries" in report and "kept in rigs.sqlite (table superseded)" in report
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto", "gauss_newton"]'))
     assert "set aside" not in run("study", "run", "rigs.toml", "-w", 1).stdout  # they are back
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("0.1", "0.2"))
@@ -245,7 +240,7 @@ def test_the_database_is_called_as_the_study_file(folder):
         Path(f"{name}.toml").write_text(STUDY.format(solvers='["gauss_newton"]').split("[[data]]\nfile")[0]
                                         + STUDY[STUDY.index("[[formulation]]"):].split("[[formulation]]\nform")[0])
         assert run("study", "run", f"{name}.toml", "-w", 1).exit_code == 0
-        assert Path(f"{name}.duckdb").is_file()
+        assert Path(f"{name}.sqlite").is_file()
 
 
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(folder, monkeypatch):
@@ -260,7 +255,7 @@ def test_ctrl_c_says_what_is_kept_and_how_to_go_on(folder, monkeypatch):
     monkeypatch.setattr(running, "run", interrupted)
     found = run("study", "run", "rigs.toml")
     assert found.exit_code == 130
-    assert "stopped: 1 of 18 cells are in rigs.duckdb; the same command goes on from there" in found.stdout
+    assert "stopped: 1 of 18 cells are in rigs.sqlite; the same command goes on from there" in found.stdout
 
 
 def test_the_built_in_study_is_one(tmp_path, monkeypatch):
@@ -293,16 +288,16 @@ def test_systems_are_listed():
 def test_compare_says_which_solver_to_use(folder):
     words = ("compare", "rig.csv", "--inputs", "current", "--outputs", "thrust", "--na", 2, "--nb", 1, "--basis",
              "triangular:5", "--solvers", "gauss_newton", "ipopt", "clarabel", "--repetitions", 2)
-    found = run(*words, "-o", "page.html", "--db", "kept.duckdb")
+    found = run(*words, "-o", "page.html", "--db", "kept.sqlite")
     assert found.exit_code == 0, found.stderr
     lines = found.stdout.splitlines()
     assert lines[0].startswith("6 cells to run") and Path("page.html").stat().st_size > 20_000
     sentence = next(line for line in lines if line.startswith("Use "))
     assert "reached the accuracy of 1e-08 (verified residuals up to 1e-06 count) in" in sentence
     assert "proved globally optimal" in sentence and "not for hammerstein_arx.exact: clarabel" in found.stdout
-    assert read_rows("kept.duckdb")["warm_s"].size == 6
-    again = run(*words, "--db", "kept.duckdb")
-    assert again.stdout.startswith("6 of 6 cells are in kept.duckdb already; nothing is left to run")
+    assert read_rows("kept.sqlite")["warm_s"].size == 6
+    again = run(*words, "--db", "kept.sqlite")
+    assert again.stdout.startswith("6 of 6 cells are in kept.sqlite already; nothing is left to run")
 
 
 def test_compare_assumes_orders_that_nobody_gives_and_says_so(folder):
@@ -327,15 +322,15 @@ def test_compare_tells_an_error_of_the_record_once(folder):
     (("study", "run", "rigs.toml", "--example"), "not both"),
     (("study", "run", "rags.toml"), "study file rags.toml cannot be read: No such file"),
     (("study", "run", "rig.csv"), "line 1, column"),
-    (("study", "run", "rigs.toml", "--db", "no/rows.duckdb"), "there is no folder"),
+    (("study", "run", "rigs.toml", "--db", "no/rows.sqlite"), "there is no folder"),
     (("study", "run", "rigs.toml", "--db", "rig.csv"), "rig.csv"),
     (("study", "run", "rigs.toml", "--export", "rows.xlsx"), ".parquet or .csv"),
     (("study", "run", "rigs.toml", "--retry", "crshed"), "Did you mean 'crashed'"),
     (("study", "run", "rigs.toml", "-w", 0), "'--workers' / '-w'"),
-    (("study", "report", "none.duckdb", "-o", "."), "it is a folder; name a file in it"),
-    (("study", "report", "none.duckdb"), "no such database"),
+    (("study", "report", "none.sqlite", "-o", "."), "it is a folder; name a file in it"),
+    (("study", "report", "none.sqlite"), "no such database"),
     (("study", "report", "rigs.toml"), "rigs.toml"),
-    (("study", "export", "none.duckdb", "rows.csv"), "no such database"),
+    (("study", "export", "none.sqlite", "rows.csv"), "no such database"),
     (("compare",), "give a data file, or --example"),
     (("compare", "none.csv"), "no file 'none.csv'"),
     (("compare", "rig.csv"), "no column 'u'"),
@@ -353,13 +348,13 @@ def test_what_a_new_user_gets_wrong(folder, words, told):
     found = run(*words)
     assert found.exit_code == 2 and not isinstance(found.exception, StudyError)
     assert told in " ".join(found.stderr.replace("│", " ").split()), found.stderr
-    assert "Traceback" not in found.stderr and not list(folder.glob("rigs.duckdb"))
+    assert "Traceback" not in found.stderr and not list(folder.glob("rigs.sqlite"))
 
 
 def test_a_place_that_takes_no_files_is_told_before_any_work(folder, monkeypatch):
     from optid.cli import arguments
 
     monkeypatch.setattr(arguments.os, "access", lambda path, mode: Path(path) == folder / "rig.csv")
-    told = run("study", "report", "none.duckdb", "-o", "page.html").stderr
+    told = run("study", "report", "none.sqlite", "-o", "page.html").stderr
     assert f"page.html cannot be written: folder {folder} is read-only here; give a file in another folder" in told
     arguments.check_folders(folder / "rig.csv")

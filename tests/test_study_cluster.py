@@ -20,8 +20,8 @@ from optid.studies import Study
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.execution import cluster, running, workers
 from optid.studies.grid import cells as cells_of
-from optid.studies.storage.database import finished, read_rows
 from optid.studies.storage.rows import NAMES
+from optid.studies.storage.store import finished, read_rows
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
@@ -101,7 +101,7 @@ def test_a_study_writes_every_cell_once_and_resumes_on_a_cluster(client, monkeyp
     """A Dask worker is killed, the run is stopped as by Ctrl-C, and the second run, here, does the rest."""
     todo = [cell(k, seconds=0.05) for k in range(40)]
     monkeypatch.setattr(running, "cells", lambda study: list(todo))
-    ran, pids, db = [], client.run(os.getpid), tmp_path / "study.duckdb"
+    ran, pids, db = [], client.run(os.getpid), tmp_path / "study.sqlite"
 
     def follow(done, total, row):
         if done == 8 and row:
@@ -138,11 +138,11 @@ formulation = "arx"
 na = 1
 nb = 1
 """)
-    result = CliRunner().invoke(app, ["study", "run", str(tmp_path / "study.toml"), "--db", str(tmp_path / "s.duckdb"),
+    result = CliRunner().invoke(app, ["study", "run", str(tmp_path / "study.toml"), "--db", str(tmp_path / "s.sqlite"),
                                       "--scheduler", "tcp://127.0.0.1:1"])
     assert result.exit_code == 2
     assert "no scheduler can be reached at tcp://127.0.0.1:1" in " ".join(result.output.split())
-    assert not (tmp_path / "s.duckdb").exists()
+    assert not (tmp_path / "s.sqlite").exists()
 
 
 def test_a_cell_whose_dask_worker_always_dies_is_a_row(client, two_processes, monkeypatch, tmp_path):
@@ -289,9 +289,9 @@ def test_a_client_that_is_closed_ends_the_study_and_loses_no_cell_to_a_row(two_p
             lost.close()
 
     with pytest.raises(ClusterError, match="Rows so far are kept|the scheduler went away"):
-        running.run(SMALL, tmp_path / "study.duckdb", progress=progress,
+        running.run(SMALL, tmp_path / "study.sqlite", progress=progress,
                     execute=lambda cells: cluster.execute(cells, behave, scheduler=lost))
-    rows = read_rows(tmp_path / "study.duckdb")
+    rows = read_rows(tmp_path / "study.sqlite")
     assert set(rows["outcome"]) == {"done"} and len(rows["key"]) < 40
 
 

@@ -35,7 +35,7 @@ def test_recommendations(rows, words):
 
 
 def test_lines_have_the_numbers_of_the_rows():
-    rows = [row("a", compile_s=0.02, repetition=k, solve_s=s, place=f"a{k}") for k, s in enumerate((0.01, 0.03, 0.02))]
+    rows = [row("a", compile_s=0.02, repetition=k, solve_s=s) for k, s in enumerate((0.01, 0.03, 0.02))]
     found = compare([*rows, row("b", objective=1.5, one_step_fit=90.0), row("c", **FAILED), row("d", **FAILED)])
     a, b = (next(line for line in found.lines if line.solver == name) for name in "ab")
     assert a.cold == pytest.approx(0.04) and a.above == 0 and a.warm == 0.005

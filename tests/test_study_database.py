@@ -1,22 +1,20 @@
 """The database of a study: what goes in comes out, and what cannot be used is refused."""
 
+import sqlite3
+
 import numpy as np
 import pytest
 from study_rows import rows
 
 from optid.errors import DatabaseError
-from optid.studies.storage import database, opening
-from optid.studies.storage.database import append, data_hashes, export, finished, read_rows
-from optid.studies.storage.journal import Journal
-from optid.studies.storage.opening import opened
+from optid.studies.storage.export import export
 from optid.studies.storage.rows import COLUMNS, NAMES
-
-duckdb = pytest.importorskip("duckdb")
+from optid.studies.storage.store import Store, append, finished, read_rows, rows_of_one
 
 
 @pytest.fixture
 def path(tmp_path):
-    return tmp_path / "study.duckdb"
+    return tmp_path / "study.sqlite"
 
 
 def test_rows_come_back_as_they_went_in(path):
@@ -43,7 +41,8 @@ def test_the_largest_whole_numbers_come_back(path):
     (row,) = rows(1)
     row |= {"iterations": 2**63 - 1, "seed": -(2**63)}
     append(path, [row])
-    (back,) = database.rows_of(path, None, [(row["key"], row["repetition"])])
+    with Store(path) as store:
+        (back,) = store.rows_of(None, [(row["key"], row["repetition"])])
     assert (back["iterations"], back["seed"]) == (2**63 - 1, -(2**63))
 
 
@@ -51,7 +50,8 @@ def test_hashes_of_data_files_by_study_and_label(path):
     made = rows(200)
     append(path, made)
     expected = {("synthetic", row["data"]): {row["data_hash"]} for row in made if row["data_hash"]}
-    assert expected and data_hashes(path) == expected
+    with Store(path) as store:
+        assert expected and store.data_hashes() == expected
 
 
 @pytest.mark.slow
@@ -60,31 +60,20 @@ def test_ten_thousand_rows_are_written_and_read(path):
     assert read_rows(path)["key"].size == 10_000
 
 
-def test_a_row_twice_is_refused_and_leaves_the_rest(path):
-    made = rows(20)
-    append(path, made[:10])
-    with pytest.raises(DatabaseError, match="cannot be written"):
-        append(path, made[9:])
-    assert len(finished(path)) == 10
-
-
-def test_a_newer_row_of_the_same_place_moves_the_older_aside(path):
+def test_a_row_for_the_same_cell_replaces_the_former_one(path):
     made = rows(10)
     append(path, made)
-    append(path, [{**made[3], "key": "f" * 64, "objective": 5.0}])
-    assert len(finished(path)) == 10 and ("f" * 64, made[3]["repetition"]) in finished(path)
-    with opened(path) as connection:
-        assert connection.execute("SELECT key FROM superseded").fetchall() == [(made[3]["key"],)]
-
-
-def test_a_cell_under_another_label_moves_the_former_row_aside(path):
-    made = rows(10)
-    append(path, made)
-    append(path, [{**made[3], "solver": "renamed", "place": "p" * 32}])
+    append(path, [{**made[3], "solver": "renamed"}])
     found = read_rows(path)
     assert len(found["key"]) == 10 and "renamed" in found["solver"]
-    with opened(path) as connection:
-        assert connection.execute("SELECT solver FROM superseded").fetchall() == [(made[3]["solver"],)]
+
+
+def test_a_batch_with_a_row_that_is_none_changes_nothing(path):
+    made = rows(10)
+    append(path, made[:5])
+    with pytest.raises(ValueError, match="no column is called"):
+        append(path, [*made[5:], {**made[0], "strange": 1}])
+    assert len(finished(path)) == 5
 
 
 def test_only_the_cells_of_the_grid_as_it_is_now_keep_their_rows_and_former_ones_come_back(path):
@@ -92,24 +81,29 @@ def test_only_the_cells_of_the_grid_as_it_is_now_keep_their_rows_and_former_ones
     identities = [(row["key"], row["repetition"]) for row in made]
     append(path, made)
     append(path, [{**made[0], "study": "another"}])
-    database.keep(path, "synthetic", identities[:6])
-    assert finished(path, "synthetic") == set(identities[:6]) and len(finished(path, "another")) == 1
-    assert database.former(path) == database.former(path, "synthetic") == 4 and database.former(path, "another") == 0
-    late = {**made[8], "objective": 5.0, "started": "2027-01-01T00:00:00+00:00"}
-    append(path, [late])
-    database.keep(path, "synthetic", identities[:6])
-    database.keep(path, "synthetic", identities)  # made[8] is there twice: the newest comes back
-    found = [(row["key"], row["objective"]) for row in database.rows_of(path, "synthetic", identities[6:])]
-    assert found == [(row["key"], row["objective"]) for row in (*made[6:8], late, made[9])]
-    assert database.former(path) == 1
-    database.keep(path, "synthetic", [])
-    assert finished(path, "synthetic") == set() and database.former(path) == 11
+    with Store(path, write=True) as store:
+
+        def aside(study=None):
+            return sum(store.superseded(study).values())
+
+        store.keep("synthetic", identities[:6])
+        assert finished(path, "synthetic") == set(identities[:6]) and len(finished(path, "another")) == 1
+        assert aside() == aside("synthetic") == 4 and aside("another") == 0
+        late = {**made[8], "objective": 5.0, "started": "2027-01-01T00:00:00+00:00"}
+        store.append([late])
+        store.keep("synthetic", identities[:6])
+        store.keep("synthetic", identities)  # made[8] is there twice: the newest comes back
+        found = [(row["key"], row["objective"]) for row in store.rows_of("synthetic", identities[6:])]
+        assert found == [(row["key"], row["objective"]) for row in (*made[6:8], late, made[9])]
+        assert aside() == 1
+        store.keep("synthetic", [])
+        assert store.finished("synthetic") == set() and aside() == 11
 
 
 def test_studies_in_one_database_do_not_touch_each_other(path):
     made = rows(10)
     append(path, made)
-    append(path, [{**row, "study": "another", "place": row["place"][::-1]} for row in made[:4]])
+    append(path, [{**row, "study": "another"} for row in made[:4]])
     assert [read_rows(path, name)["key"].size for name in ("synthetic", "another")] == [10, 4]
     assert len(finished(path, "another")) == 4 and read_rows(path)["key"].size == 14
 
@@ -119,7 +113,8 @@ def test_of_rows_of_several_studies_one_that_is_done_comes_first_then_the_newest
     for study, outcome, year, first in (("a", "crashed", 2031, "a"), ("b", "done", 2028, "b"),
                                         ("c", "done", 2030, "c"), ("d", "error", 2029, "c")):
         append(path, [{**one, "study": study, "outcome": outcome, "started": f"{year}-01-01T00:00:00+00:00"}])
-        found = database.rows_of(path, None, [(one["key"], one["repetition"])])
+        with Store(path) as store:
+            found = store.rows_of(None, [(one["key"], one["repetition"])])
         assert [row["study"] for row in found] == [first]
 
 
@@ -136,47 +131,12 @@ def test_export_has_every_row_and_column(path, tmp_path, ending):
     assert frame["objective"].isna().sum() == sum(row["objective"] is None for row in made)
 
 
-def test_rows_that_are_only_in_the_journal_are_read_and_exported_and_nothing_is_written(path, tmp_path):
-    """One of them is in the database too, one takes the place of a row there, one is half written."""
-    import pandas as pd
-
-    made = rows(10)
-    append(path, made[:7])
-    journal = Journal(path)
-    newer = {**made[3], "key": "f" * 64, "objective": 5.0}
-    for row in (made[6], *made[7:], newer):
-        journal.add(row)
-    with open(journal.path, "a") as file:
-        file.write('{"key": "half a ro')
-    link = tmp_path / "link.duckdb"
-    link.symlink_to(path)
-    before = {file.name: file.read_bytes() for file in path.parent.iterdir()}
-    want = {row["key"]: row["objective"] for row in (*made[:3], newer, *made[4:])}
-    for name in (path, link):
-        found = read_rows(name)
-        assert found["key"].size == 10 == read_rows(name, "synthetic")["key"].size
-        assert tuple(found) == NAMES and list(found["started"]) == sorted(found["started"])
-        assert set(found["key"]) == set(want)
-    np.testing.assert_array_equal(found["objective"], [np.nan if want[k] is None else want[k] for k in found["key"]])
-    assert read_rows(path, "another")["key"].size == 0
-    assert {file.name: file.read_bytes() for file in path.parent.iterdir()} == before
-    assert export(path, tmp_path / "rows.csv") == 10 == export(path, tmp_path / "rows.csv", "synthetic")
-    assert set(pd.read_csv(tmp_path / "rows.csv")["key"]) == set(want)
-
-
-def test_a_journal_of_another_version_is_told_to_readers_too(path, tmp_path):
-    append(path, rows(1))
-    path.with_name("study.duckdb.journal").write_text('{"sover": 1}\n')
-    for attempt in (lambda: read_rows(path), lambda: export(path, tmp_path / "rows.csv")):
-        with pytest.raises(DatabaseError, match="journal holds what is no row of this version.*Remove it"):
-            attempt()
-
-
 def test_no_rows_are_not_exported(path, tmp_path):
     append(path, rows(1))
     with pytest.raises(DatabaseError, match="has no rows of a study 'another' to export"):
         export(path, tmp_path / "rows.csv", "another")
-    database.keep(path, "synthetic", [])
+    with Store(path, write=True) as store:
+        store.keep("synthetic", [])
     with pytest.raises(DatabaseError, match="has no rows to export: `optid study run`"):
         export(path, tmp_path / "rows.csv")
     assert not (tmp_path / "rows.csv").exists()
@@ -195,7 +155,7 @@ def test_missing_database(path):
 
 def test_another_version_is_refused_for_reading_and_writing(path):
     append(path, rows(3))
-    with duckdb.connect(str(path)) as connection:
+    with sqlite3.connect(path) as connection:
         connection.execute("UPDATE meta SET value = '99' WHERE name = 'schema version'")
     for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished(path)):
         with pytest.raises(DatabaseError, match="schema version 99.*made by optid"):
@@ -203,7 +163,7 @@ def test_another_version_is_refused_for_reading_and_writing(path):
 
 
 def test_other_files_are_refused(path):
-    with duckdb.connect(str(path)) as connection:
+    with sqlite3.connect(path) as connection:
         connection.execute("CREATE TABLE mine (x INTEGER)")
     for attempt in (lambda: read_rows(path), lambda: append(path, rows(1))):
         with pytest.raises(DatabaseError, match="not a database of studies"):
@@ -213,8 +173,9 @@ def test_other_files_are_refused(path):
 @pytest.mark.parametrize("name, content, words", [
     ("valve.csv", b"time,u,y\n1,2,3\n" * 1000, "valve.csv is a file of another kind, .*give the one that `optid study"),
     ("study.toml", b'name = "small"\n' * 30, "study.toml is a file of another kind"),
-    ("short.duckdb", b"\n", "is a file of another kind"),
-    ("empty.duckdb", b"", "is empty, and no database: remove it"),
+    ("short.sqlite", b"\n", "is a file of another kind"),
+    ("old.duckdb", b"\0" * 8 + b"DUCK" + b"\0" * 99,
+     "kept rows in DuckDB. Export it with that version .`optid study export old.duckdb rows.parquet`"),
 ])
 def test_files_of_another_kind_are_told_with_what_to_do(tmp_path, name, content, words):
     path = tmp_path / name
@@ -225,14 +186,92 @@ def test_files_of_another_kind_are_told_with_what_to_do(tmp_path, name, content,
     assert path.read_bytes() == content
 
 
-@pytest.mark.sampled(2)
-@pytest.mark.parametrize("share", [0.001, 0.01, 0.1, 0.3])
-def test_a_database_that_was_cut_short_is_told_with_what_to_do(path, share):
-    append(path, rows(2000))
+@pytest.mark.parametrize("seed", range(4))
+def test_damaged_databases_are_named_and_end_in_time(path, seed):
+    """Cut short, bytes changed, pages exchanged: an error that names the file, or rows that are still whole."""
+    append(path, rows(60))
     content = path.read_bytes()
-    path.write_bytes(content[:max(int(share * len(content)), 20)])
-    with pytest.raises(DatabaseError, match="cannot be (opened|read): .*cut short, take another copy, or remove it"):
+    rng = np.random.default_rng(seed)
+    refused = 0
+    for _ in range(60):
+        damaged = bytearray(content)
+        way = rng.integers(3)
+        if way == 0:
+            damaged = damaged[: rng.integers(16, len(content))]
+        elif way == 1:
+            for at in rng.integers(16, len(content), rng.integers(1, 400)):
+                damaged[at] = rng.integers(256)
+        else:
+            a, b = 4096 * rng.integers(0, len(content) // 4096, 2)
+            damaged[a : a + 4096], damaged[b : b + 4096] = damaged[b : b + 4096], damaged[a : a + 4096]
+        path.write_bytes(damaged)
+        for attempt in (read_rows, finished, lambda there: append(there, rows(1))):
+            try:
+                attempt(path)
+            except DatabaseError as error:
+                assert "study.sqlite" in str(error)
+                refused += 1
+        for beside in path.parent.glob("study.sqlite-*"):
+            beside.unlink()
+    assert refused > 60
+
+
+def test_tables_and_values_of_another_shape_are_refused(path, tmp_path):
+    append(path, rows(3))
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE rows SET started = 'yesterday'")
+    with pytest.raises(DatabaseError, match="study.sqlite holds values that no run writes"):
         read_rows(path)
+    with sqlite3.connect(path) as connection:
+        connection.execute("ALTER TABLE rows DROP COLUMN objective")
+    with pytest.raises(DatabaseError, match="table rows does not have the columns of a study"):
+        read_rows(path)
+
+
+def test_a_run_under_way_can_be_read_and_leaves_one_file(path):
+    made = rows(20)
+    with Store(path, write=True) as store:
+        for k, row in enumerate(made):
+            store.append([row])
+            assert len(finished(path)) == k + 1
+    read_rows(path)
+    assert [file.name for file in path.parent.iterdir()] == ["study.sqlite"]
+
+
+def test_two_processes_write_into_one_database(path):
+    import subprocess
+    import sys
+    from pathlib import Path
+
+    program = ("import sys; sys.path.insert(0, sys.argv[1]); from study_rows import rows; "
+               "from optid.studies.storage.store import append; "
+               "[append(sys.argv[2], [{**row, 'study': sys.argv[3]}]) for row in rows(60)]")
+    started = [subprocess.Popen([sys.executable, "-c", program, str(Path(__file__).parent), str(path), name])
+               for name in ("one", "two")]
+    assert [process.wait() for process in started] == [0, 0]
+    assert [len(finished(path, name)) for name in ("one", "two")] == [60, 60]
+
+
+def test_texts_in_csv_are_no_formulas_and_parquet_has_them_as_they_are(path, tmp_path):
+    import polars
+
+    hostile = ["=cmd|' /C calc'!A0", "+1", "-1", "@SUM(1)", "\t=1", "plain", "a=b"]
+    append(path, [{**row, "reason": text} for row, text in zip(rows(7), hostile)])
+    assert export(path, tmp_path / "rows.csv") == export(path, tmp_path / "rows.parquet") == 7
+    assert sorted(polars.read_parquet(tmp_path / "rows.parquet")["reason"]) == sorted(hostile)
+    written = polars.read_csv(tmp_path / "rows.csv", infer_schema=False)["reason"].to_list()
+    assert sorted(written) == sorted([*("'" + text for text in hostile[:5]), *hostile[5:]])
+
+
+def test_an_export_reads_like_its_database(path, tmp_path):
+    from optid.studies.verdicts.verdict import conclude
+
+    append(path, rows(300))
+    export(path, tmp_path / "rows.parquet")
+    assert str(conclude(tmp_path / "rows.parquet")) == str(conclude(path))
+    (tmp_path / "bad.parquet").write_bytes(b"PAR1" + b"no table" * 9)
+    with pytest.raises(DatabaseError, match="bad.parquet cannot be read"):
+        rows_of_one(tmp_path / "bad.parquet")
 
 
 def test_a_folder_is_no_database(tmp_path):
@@ -247,18 +286,3 @@ def test_export_to_another_ending_or_nowhere(path, tmp_path):
         export(path, tmp_path / "rows.xlsx")
     with pytest.raises(DatabaseError, match="cannot be written"):
         export(path, tmp_path / "no folder" / "rows.csv")
-
-
-def test_a_database_in_use_is_waited_for_then_refused(path, monkeypatch):
-    import subprocess
-    import sys
-
-    append(path, rows(1))
-    monkeypatch.setattr(opening, "PATIENCE", 0.1)
-    hold = f"import duckdb, sys; c = duckdb.connect({str(path)!r}); print('open', flush=True); sys.stdin.read()"
-    with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None and other.stdout.readline() == b"open\n"
-        with pytest.raises(DatabaseError, match="in use by another process"):
-            read_rows(path)
-        other.communicate()
-    assert len(finished(path)) == 1

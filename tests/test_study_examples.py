@@ -55,14 +55,14 @@ def test_the_built_in_study_solves_everything():
 
 def test_constraints_pay_under_noise(tmp_path):
     study = fewer(read("constraints_under_noise"), seeds=6)  # 80 samples, three times as much noise as signal
-    error = script("figures")(study, tmp_path / "c.duckdb", ["nonlinearity_error"], workers=1)["nonlinearity_error"]
+    error = script("figures")(study, tmp_path / "c.sqlite", ["nonlinearity_error"], workers=1)["nonlinearity_error"]
     assert list(error.columns) == ["free", "monotone", "monotone, odd", "monotone, odd, stable"]
     assert (error["free"] > 1.2 * error["monotone"]).all() and (error["monotone"] > error["monotone, odd"]).all()
 
 
 def test_relaxations_lie_below_and_the_exact_fit_is_proved(tmp_path):
     study = fewer(read("relaxations"), seeds=4)
-    found = script("figures")(study, tmp_path / "r.duckdb", ["gap", "excess", "proved"], workers=1)
+    found = script("figures")(study, tmp_path / "r.sqlite", ["gap", "excess", "proved"], workers=1)
     excess = found["excess"]
     assert (excess["exact"] == 0).all() and (excess[["split, plain", "nuclear, no weight"]] < 0).all(axis=None)
     assert found["proved"]["exact"].min() == 1 and found["gap"]["exact"].max() < 1e-6
@@ -73,7 +73,7 @@ def test_the_monte_carlo_has_the_figures_of_the_benchmark(tmp_path, capsys):
 
     data = read("monte_carlo").data
     study = read("monte_carlo", seeds=5, data=(replace(data[0], samples=(200,)), replace(data[1], samples=(1000,))))
-    found = script("monte_carlo")(study, tmp_path / "m.duckdb", workers=1)
+    found = script("monte_carlo")(study, tmp_path / "m.sqlite", workers=1)
     efficiency = benchmark("efficiency")
     errors, bounds, _ = map(np.array, zip(*(efficiency.run((200, seed)) for seed in range(5))))
     sigma = efficiency.noise_level(efficiency.VALUES)
@@ -87,7 +87,7 @@ def test_who_solves_what_is_written_from_the_study(tmp_path):
     whole = read("who_solves_what")
     study = replace(whole, solvers=["clarabel", "osqp", "gauss_newton", "auto"], formulations=tuple(
         entry for entry in whole.formulations if entry.formulation in ("arx", "hammerstein_arx.exact")))
-    counts = script("who_solves_what")(study, tmp_path / "w.duckdb", tmp_path / "table.md", workers=1)
+    counts = script("who_solves_what")(study, tmp_path / "w.sqlite", tmp_path / "table.md", workers=1)
     assert counts["unverified"] == 0 and counts["optimal"] >= 12 and counts["problems"] == 5
     text = (tmp_path / "table.md").read_text()
     assert "| `arx` | linear | " in text and "**gauss_newton**" in text and "| osqp | LP QP | 2 | 2 | 2 | 0 |" in text

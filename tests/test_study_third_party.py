@@ -72,9 +72,9 @@ def test_it_takes_part_in_a_study(installed, tmp_path):
     (tmp_path / "study.toml").write_text(STUDY)
     printed = run(installed, "-m", "optid", "study", "run", "study.toml", "-w", "1", folder=tmp_path)
     assert "6 cells to run" in printed
-    from optid.studies.storage.database import read_rows
+    from optid.studies.storage.store import read_rows
 
-    rows = read_rows(tmp_path / "study.duckdb")
+    rows = read_rows(tmp_path / "study.sqlite")
     status = {(f, s): (o, v) for f, s, o, v in zip(rows["formulation_name"], rows["solver"], rows["outcome"],
                                                    rows["status_verified"])}
     for formulation in ("fir.decaying", "arx"):

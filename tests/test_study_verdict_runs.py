@@ -211,12 +211,11 @@ def test_studies_of_one_database_are_kept_apart():
 
 
 def test_a_database_is_read(tmp_path):
-    pytest.importorskip("duckdb")
-    from optid.studies.storage import database
+    from optid.studies.storage.store import append
 
     rows = synthetic(300, 2)
-    database.append(tmp_path / "s.duckdb", rows)
-    assert conclude(tmp_path / "s.duckdb").headline == conclude(rows).headline
+    append(tmp_path / "s.sqlite", rows)
+    assert conclude(tmp_path / "s.sqlite").headline == conclude(rows).headline
 
 
 @pytest.mark.parametrize(

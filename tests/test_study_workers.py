@@ -1,7 +1,6 @@
 """Workers: whatever a cell does to its process is a row, and the others go on."""
 
 import os
-import pickle
 import re
 import resource
 import signal
@@ -18,8 +17,6 @@ from processes import cell_workers, gone, wait_for
 from study_trouble import behave, cell
 
 from optid.errors import StudyError
-from optid.studies.execution import workers
-from optid.studies.execution.worker_process import WorkerProcess
 from optid.studies.execution.workers import Pool, execute
 from optid.studies.storage.rows import NAMES
 
@@ -45,7 +42,7 @@ FAILURES = {
     "abort": ("crashed", "signal SIGABRT"),
     "orphan": ("crashed", "signal SIGABRT"),
     "leave": ("crashed", "exit code 3"),
-    "complain": ("crashed", "exit code 134, terminate called after throwing an instance of 'std::bad_alloc'"),
+    "complain": ("memory limit", "got no more memory .*std::bad_alloc"),
     "raise": ("error", "KeyError: 'no such thing'"),
     "garbage": ("error", "TypeError"),
     "partial": ("error", "is no row: .*needs a value in every row"),
@@ -102,61 +99,19 @@ def test_an_endless_cell_is_stopped(do):
 def test_a_memory_hog_is_stopped():
     rows = by_key([cell(0, "hog", memory_limit=500.0), cell(1)], workers=1)
     assert rows[0]["outcome"] == "memory limit" and "the limit is 500 MB" in rows[0]["reason"]
-    assert rows[0]["peak_mb"] > 500.0
     assert rows[1]["outcome"] == "done"
 
 
-def test_children_count_and_go_with_their_worker(tmp_path):
-    pids, left = tmp_path / "pids", tmp_path / "left"
-    hog = "held = bytearray(400_000_000)\nimport time\ntime.sleep(600)"
-    sleeper = f"import os, time\nos.setsid()\nopen({str(left)!r}, 'w').close()\ntime.sleep(600)"
-    rows = by_key([cell(0, "family", memory_limit=400.0, program=hog, pids=str(pids)),
+def test_children_have_the_same_limit_and_go_with_their_worker(tmp_path):
+    pids = tmp_path / "pids"
+    hog = "import sys\ntry:\n    held = bytearray(4_000_000_000)\nexcept MemoryError:\n    sys.exit(9)"
+    sleeper = "import time\ntime.sleep(600)"
+    rows = by_key([cell(0, "family", memory_limit=700.0, program=hog, pids=str(pids)),
                    cell(1, "family", time_limit=5.0, program=sleeper, pids=str(pids))], workers=1)
-    assert (rows[0]["outcome"], rows[1]["outcome"]) == ("memory limit", "time limit")
+    assert (rows[0]["outcome"], rows[0]["iterations"], rows[1]["outcome"]) == ("done", 9, "time limit")
     children = [int(line) for line in pids.read_text().split()]
-    assert len(children) == 2 and left.exists()  # the second was out of the session of its worker
+    assert len(children) == 2
     wait_for(lambda: all(map(gone, children)))
-
-
-@pytest.fixture
-def with_child(tmp_path):
-    """Give a worker a cell whose child runs a program, and wait until that has made a file."""
-    started = []
-
-    def start(program):
-        worker = WorkerProcess(pickle.dumps((behave, None)))
-        started.append(worker)
-        assert worker.connection.recv()[0] == "ready"
-        ready = tmp_path / "ready"
-        program = f"{program}\nopen({str(ready)!r}, 'w').close()\nimport time\ntime.sleep(600)"
-        assert worker.give(cell(0, "family", program=program, pids=str(tmp_path / "pids")))
-        wait_for(ready.exists)
-        return worker
-
-    yield start
-    for worker in started:
-        worker.end()
-
-
-def test_memory_that_a_process_shares_with_its_forks_counts_once(with_child):
-    if not hasattr(psutil.Process().memory_full_info(), "pss"):
-        pytest.skip("this system does not tell which memory processes share")
-    worker = with_child("import os\nheld = bytearray(400_000_000)\nos.fork()")
-    family = [psutil.Process(worker.pid), *psutil.Process(worker.pid).children(recursive=True)]
-    assert len(family) == 3 and sum(member.memory_info().rss for member in family) > 800e6
-    assert 400.0 < worker.resident_mb(family=True) < 800.0
-
-
-def test_a_child_that_ends_while_a_family_is_looked_at_hides_none_of_it(with_child, monkeypatch):
-    worker = with_child("held = bytearray(400_000_000)")
-    with subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE) as short:
-        ended = psutil.Process(short.pid)
-        short.communicate()
-    with pytest.raises(psutil.NoSuchProcess):
-        ended.memory_info()
-    real = psutil.Process.children
-    monkeypatch.setattr(psutil.Process, "children", lambda self, recursive: [ended, *real(self, recursive=recursive)])
-    assert worker.resident_mb(family=True) > 400.0
 
 
 def test_a_worker_that_crashes_leaves_no_core_file():
@@ -183,9 +138,8 @@ def test_a_noisy_solver_disturbs_nobody(capfd):
     assert not out and not err
 
 
-def test_a_worker_that_keeps_memory_is_replaced(monkeypatch):
-    monkeypatch.setattr(workers, "KEPT_MB", 100.0)
-    cells = [cell(0, "keep", memory_limit=700.0, megabytes=300), cell(1, memory_limit=700.0), cell(2)]
+def test_a_worker_that_keeps_memory_is_replaced():
+    cells = [cell(0, "keep", memory_limit=1000.0, megabytes=400), cell(1, memory_limit=700.0), cell(2)]
     rows = by_key(cells, workers=1)
     assert [row["outcome"] for row in rows.values()] == ["done"] * 3
     assert rows[0]["unknowns"] != rows[1]["unknowns"] == rows[2]["unknowns"]
@@ -220,18 +174,18 @@ for row in execute([cell(0), cell(1), cell(2, "stuck"), cell(3, "stuck")], behav
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
         parent.stdout.readline(), parent.stdout.readline()
-        children = psutil.Process(parent.pid).children()
+        children = cell_workers(parent.pid)
         assert len(children) == 2
         time.sleep(0.2)
         parent.kill()
-    wait_for(lambda: all(gone(child.pid) for child in children))
+    wait_for(lambda: all(map(gone, children)))
 
 
 @pytest.mark.parametrize("missing, error, words", [
-    ("psutil", StudyError, "pip install 'optid"),
-    ("optid.solving.isolated", ModuleNotFoundError, "optid.solving.isolated")])
-def test_only_a_missing_psutil_is_said_to_be_missing(monkeypatch, missing, error, words):
-    monkeypatch.delitem(sys.modules, "optid.studies.execution.worker_process")
+    ("pebble", StudyError, "pip install 'optid"), ("pebble.pool.channel", ModuleNotFoundError, "pebble.pool.channel")])
+def test_only_a_missing_pebble_is_said_to_be_missing(monkeypatch, missing, error, words):
+    for name in [name for name in sys.modules if name.partition(".")[0] == "pebble"]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(error, match=words):
         Pool(behave, 1)
@@ -252,7 +206,7 @@ print("once", [row["outcome"] for row in execute([cell(0)], behave)])
 
 @pytest.mark.parametrize("number", [0, -2])
 def test_no_workers_are_refused(number):
-    with pytest.raises(StudyError, match="at least one, is needed"):
+    with pytest.raises(StudyError, match="must be a positive integer"):
         list(execute([cell(0)], behave, workers=number))
 
 
@@ -262,9 +216,9 @@ def test_a_function_without_a_name_is_refused():
 
 
 def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatch):
-    program = "import no_such_module_{parent}  # {path} {descriptor}"
-    monkeypatch.setattr("optid.studies.execution.worker_process.PROGRAM", program)
-    with pytest.raises(StudyError, match="5 workers, one after another, .*exit code 1, ModuleNotFoundError"):
+    monkeypatch.setattr("optid.studies.execution.workers.prepare", study_trouble.fail_to_start)
+    monkeypatch.setattr("optid.studies.execution.workers.run_cell", behave)
+    with pytest.raises(StudyError, match="before they could work, 3 times in a row: ModuleNotFoundError"):
         list(execute([cell(0)], behave))
 
 

@@ -95,10 +95,10 @@ def compare_rows(client: Any, seeds: int, folder: Path) -> bool:
                            for label, (name, options, rules) in FORMULATIONS.items()),
         solvers=tuple(SolverEntry(name, name) for name in SOLVERS))
     clock = time.perf_counter()
-    here = rows_of(study, folder / "here.duckdb")
+    here = rows_of(study, folder / "here.sqlite")
     between = time.perf_counter()
     with Killer(client, (8.0, 15.0), most=6) as killer:
-        there = rows_of(study, folder / "there.duckdb", scheduler=client)
+        there = rows_of(study, folder / "there.sqlite", scheduler=client)
     end = time.perf_counter()
     outcomes = {word: sum(row["outcome"] == word for row in here.values())
                 for word in sorted({str(row["outcome"]) for row in here.values()})}

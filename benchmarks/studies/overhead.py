@@ -3,7 +3,7 @@
     python benchmarks/studies/overhead.py [--cells 200] [--workers 2] [--seconds 0.2] [--cpu]
 
 First, for several formulations, one worker runs the same quick cells again and again, the whole way: cell to the
-worker, record, fit, judgement, figures on the hold-out, row to the journal and the database. The overhead of a cell is
+worker, record, fit, judgement, figures on the hold-out, row to the database. The overhead of a cell is
 its wall time, from one row to the next, less the time inside build and solve (compilation included, judgement, proof
 and figures not). Goal: at most 20 ms.
 
@@ -13,7 +13,7 @@ and solve, from the first row of each worker on and for the whole command, which
 
 Cells of 200 ms are nuclear-norm relaxations with so many basis functions that they take that. On a machine that
 does other work both figures are those of the other work; with --cpu every clock counts CPU time instead, cells run in
-this process, and journal and database are measured apart, on rows that are there already.
+this process, and the database is measured apart, on rows that are there already.
 """
 
 import argparse
@@ -60,7 +60,7 @@ def watched(described: Study, number: int) -> tuple[list[tuple[float, dict]], fl
 
     with tempfile.TemporaryDirectory() as folder:
         started = time.perf_counter()
-        running.run(described, Path(folder) / "study.duckdb", progress=progress,
+        running.run(described, Path(folder) / "study.sqlite", progress=progress,
                     execute=partial(workers.execute, workers=number))
         return came, started, time.perf_counter()
 
@@ -126,11 +126,11 @@ def by_cpu(count: int) -> None:
         print(f"{formulation:<26}{solver:<14}{whole:>9.1f}{part:>9.1f}{whole - part:>10.1f}")
     described = study(*QUICK[0][:2], HAMMERSTEIN, 300, ROWS)
     made = run_cell(cells(described)[0])
-    rows = [{**made, "key": cell.key, "place": cell.key[:32]} for cell in cells(described)]
+    rows = [{**made, "key": cell.key} for cell in cells(described)]
     with tempfile.TemporaryDirectory() as folder:
         clock = time.process_time()
-        running.run(described, Path(folder) / "study.duckdb", execute=lambda todo: iter(rows))
-        print(f"grid, journal and database: {1e3 * (time.process_time() - clock) / ROWS:.1f} CPU ms a row, {ROWS} rows")
+        running.run(described, Path(folder) / "study.sqlite", execute=lambda todo: iter(rows))
+        print(f"grid and database: {1e3 * (time.process_time() - clock) / ROWS:.1f} CPU ms a row, {ROWS} rows")
 
 
 def main() -> None:

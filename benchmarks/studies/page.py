@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.studies.page import write_page
-from optid.studies.storage.database import append
+from optid.studies.storage.store import append
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from browser import CHROMIUM, NO_BROWSER, Browser
@@ -46,8 +46,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "study.html"
         build("built from rows", rows, path)
-        append(Path(folder) / "study.duckdb", rows)
-        build("built from a database", Path(folder) / "study.duckdb", path)
+        append(Path(folder) / "study.sqlite", rows)
+        build("built from a database", Path(folder) / "study.sqlite", path)
         line("size", path.stat().st_size / 1e6, SIZE, "MB")
         if arguments.keep:
             arguments.keep.write_bytes(path.read_bytes())

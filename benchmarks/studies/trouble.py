@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from optid.studies.storage.database import read_rows
+from optid.studies.storage.store import read_rows
 
 SOLVERS = '''
 """Back ends that do not behave."""
@@ -145,7 +145,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         distribution(folder)
-        file, db = folder / "study.toml", folder / "study.duckdb"
+        file, db = folder / "study.toml", folder / "study.sqlite"
         file.write_text(STUDY.format(seeds=arguments.seeds, limit=arguments.limit, solvers=list(solvers)))
         path = os.pathsep.join(filter(None, [str(folder), os.environ.get("PYTHONPATH", "")]))
         clock = time.monotonic()

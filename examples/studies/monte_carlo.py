@@ -1,4 +1,4 @@
-"""The accuracy figures of the Monte Carlo study, from its database: python monte_carlo.py [monte_carlo.duckdb].
+"""The accuracy figures of the Monte Carlo study, from its database: python monte_carlo.py [monte_carlo.sqlite].
 
 Root mean square errors over the Cramer-Rao bound (gauge norm of b one), and the trigonometric coefficients of Table 3.1
 of the dissertation (gauge beta = 0.75) with their spread.
@@ -62,4 +62,4 @@ def main(study: Any, db: Any, workers: int | None = None) -> dict[str, float]:
 
 if __name__ == "__main__":
     here = Path(__file__).with_suffix("")
-    main(optid.Study.from_toml(here.with_suffix(".toml")), *sys.argv[1:2] or [here.with_suffix(".duckdb").name])
+    main(optid.Study.from_toml(here.with_suffix(".toml")), *sys.argv[1:2] or [here.with_suffix(".sqlite").name])

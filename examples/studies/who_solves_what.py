@@ -1,4 +1,4 @@
-"""Write who_solves_what.md from the study of the same name: python who_solves_what.py [who_solves_what.duckdb]."""
+"""Write who_solves_what.md from the study of the same name: python who_solves_what.py [who_solves_what.sqlite]."""
 
 import json
 import sys
@@ -66,5 +66,5 @@ def main(study: Any, db: Any, target: Path, workers: int | None = None) -> dict[
 
 
 if __name__ == "__main__":
-    database = sys.argv[1] if len(sys.argv) > 1 else HERE.with_suffix(".duckdb").name
+    database = sys.argv[1] if len(sys.argv) > 1 else HERE.with_suffix(".sqlite").name
     main(optid.Study.from_toml(HERE.with_suffix(".toml")), database, HERE.with_suffix(".md"))

@@ -111,7 +111,7 @@ def compare(
     except StudyError as error:
         raise StudyError(_as_options(str(error))) from None
     with TemporaryDirectory() as folder, follow_progress(db) as follow:
-        rows = running.run(study, db or Path(folder) / "compare.duckdb", workers=workers, progress=follow,
+        rows = running.run(study, db or Path(folder) / "compare.sqlite", workers=workers, progress=follow,
                            accept_changed_data=accept_changed_data)
     found = side_by_side(rows)
     if (reason := found.common_error) is not None:

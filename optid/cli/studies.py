@@ -51,7 +51,7 @@ def run(
     example: Annotated[bool, typer.Option("--example", help="A built-in study of half a minute instead.")] = False,
     db: Annotated[
         Path | None,
-        typer.Option("--db", metavar="FILE", help="Database of the rows; the study file's name with .duckdb."),
+        typer.Option("--db", metavar="FILE", help="Database of the rows; the study file's name with .sqlite."),
     ] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
@@ -67,22 +67,22 @@ def run(
 ) -> None:
     """Run a study, or what is left of it; stop it whenever you like, the same command goes on.
 
-    Example: optid study run study.toml --db study.duckdb
+    Example: optid study run study.toml --db study.sqlite
     """
     from optid.cli.arguments import check_folders
     from optid.errors import StudyError
     from optid.studies.definition.built_in import example_study
     from optid.studies.definition.description import Study
     from optid.studies.execution import running
-    from optid.studies.storage import database
+    from optid.studies.storage import export as exporting
 
     if (file is None) != example:
         raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))
     described = example_study() if file is None else Study.from_toml(file)
-    db = db or Path(f"{file.stem if file is not None else 'example'}.duckdb")
+    db = db or Path(f"{file.stem if file is not None else 'example'}.sqlite")
     check_folders(db, export)
     if export is not None:
-        database.check_target(export)
+        exporting.check_target(export)
     if dry_run:
         _plan(described, db, accept_changed_data=accept_changed_data, retry=retry or ())
         return
@@ -91,7 +91,7 @@ def run(
                     accept_changed_data=accept_changed_data, retry=retry or ())
     solved = _summary(db, described.name)
     if export is not None:
-        count = database.export(db, export, described.name)
+        count = exporting.export(db, export, described.name)
         say(f"{count} rows written to {export}")
     if not solved:
         raise typer.Exit(NOTHING_SOLVED)
@@ -109,12 +109,12 @@ def report(
 ) -> None:
     """Print the verdict of a study, and write its page.
 
-    Example: optid study report study.duckdb -o study.html
+    Example: optid study report study.sqlite -o study.html
     """
     from optid.cli.arguments import check_folders
     from optid.cli.study_summary import print_former, print_reasons
     from optid.studies.page import write_page
-    from optid.studies.storage.one_study import rows_of_one
+    from optid.studies.storage.store import rows_of_one
     from optid.studies.verdicts.verdict import conclude
 
     check_folders(page)
@@ -135,15 +135,15 @@ def export(
 ) -> None:
     """Write the rows of a database, of one study or of all, to a Parquet or CSV file.
 
-    Example: optid study export study.duckdb rows.parquet
+    Example: optid study export study.sqlite rows.parquet
     """
     from optid.cli.arguments import check_folders
-    from optid.studies.storage import database
-    from optid.studies.storage.one_study import rows_of_one
+    from optid.studies.storage import export as exporting
+    from optid.studies.storage.store import read_rows, rows_of_one
 
     check_folders(target)
-    rows = rows_of_one(db, title) if title is not None else database.read_rows(db)
-    count = database.export(db, target, title)
+    rows = rows_of_one(db, title) if title is not None else read_rows(db)
+    count = exporting.export(db, target, title)
     studies = len(set(rows["study"]))
     say(f"{count} rows{f' of {studies} studies' if studies > 1 else ''} written to {target}")
 
@@ -188,7 +188,8 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
     from rich import progress
     from rich.console import Console
 
-    from optid.studies.storage.former import told_former
+    from optid.studies.execution.running import told_former
+    from optid.studies.storage.store import Store
 
     console = Console(stderr=True)
     bar = progress.Progress(
@@ -205,8 +206,11 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
             say(f"{done:,} of {total:,} cells are in {db} already; {left}")
         elif row is None and db is not None:
             say(f"{total:,} cells to run")
-        if row is None and db is not None and described is not None and (former := told_former(db, described)):
-            say(former)
+        if row is None and db is not None and described is not None:
+            with Store(db) as store:
+                former = told_former(store, described)
+            if former:
+                say(former)
         bar.update(task, completed=done, total=total, description=_now(row))
 
     try:
@@ -231,44 +235,15 @@ def _short(text: str) -> str:
     return escape(text if len(text) <= 28 else text[:27] + "…")
 
 
-class _Planned(Exception):
-    """A run that has counted its cells, and shall go no further."""
-
-
 def _plan(described: Any, db: Path, **settings: Any) -> None:
-    """Print the size of a study and what is left of it: what a run says that works on a copy of the database."""
-    import shutil
-    from tempfile import TemporaryDirectory
-
-    from optid.errors import DatabaseError
-    from optid.studies import grid
+    """Print the size of a study and what is left of it."""
     from optid.studies.execution import running
-    from optid.studies.storage.former import told_former
-    from optid.studies.storage.journal import locked
 
-    counts, former = [0, 0], ""
-
-    def stop(done: int, total: int, _: Any) -> None:
-        nonlocal former
-        counts[:], former = (done, total), told_former(copy, described)
-        raise _Planned
-
-    source = db.resolve()
-    with locked(source), TemporaryDirectory() as folder:
-        copy = Path(folder).resolve() / source.name
-        for ending in ("", ".wal", ".journal"):
-            if (there := source.with_name(source.name + ending)).is_file():
-                shutil.copyfile(there, copy.with_name(copy.name + ending))
-        try:
-            running.run(described, copy, execute=lambda _: iter(()), progress=stop, **settings)
-        except _Planned:
-            pass
-        except DatabaseError as error:
-            raise DatabaseError(str(error).replace(str(copy), str(db))) from None
+    every, left, former = running.plan(described, db, **settings)
     say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
-        f"{len(described.solvers)} solvers; {counts[1]:,} cells, {counts[1] - counts[0]:,} of them to run")
+        f"{len(described.solvers)} solvers; {len(every):,} cells, {len(left):,} of them to run")
     refusals: dict[str, int] = {}
-    for cell in grid.cells(described):
+    for cell in every:
         if cell.refusal:
             refusals[cell.refusal] = refusals.get(cell.refusal, 0) + 1
     for refusal, count in refusals.items():
@@ -282,7 +257,7 @@ def _summary(db: Path, name: str) -> bool:
     import shlex
 
     from optid.cli import study_summary as summary
-    from optid.studies.storage.database import read_rows
+    from optid.studies.storage.store import read_rows
     from optid.studies.verdicts.verdict import conclude
 
     every = read_rows(db)

@@ -85,9 +85,13 @@ def nothing_solved(rows: Mapping[str, Any]) -> bool:
 
 def print_former(db: Path, study: str | None = None) -> None:
     """Say how many rows are in the database that no report has."""
-    from optid.studies.storage.database import former
+    from optid.studies.storage.store import Store
 
-    if count := former(db, study):
+    if db.suffix == ".parquet":
+        return
+    with Store(db) as store:
+        count = sum(store.superseded(study).values())
+    if count:
         rows, stay = ("row", "is") if count == 1 else ("rows", "are")
         say(Text(f"{count:,} {rows} of former entries, data, settings or versions, or of cells that were run again, "
                  f"{stay} kept in {db} (table superseded) and in no report", "dim"))

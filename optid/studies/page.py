@@ -91,7 +91,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "tolerance": f"{verdict.found.tolerance:.0e}",
         "clock": f"{' + '.join(TIMES[verdict.time])}: {TIME_WORDS[verdict.time]}",
         "states": [*OUTCOMES.items(), *MEANINGS.items()],
-        "call": command or "optid study report STUDY.duckdb -o study.html",
+        "call": command or "optid study report STUDY.sqlite -o study.html",
         "versions": [*versions(), *_machines(verdict)],
         "text": str(verdict),
         "style": Markup((files("optid") / "show" / "templates" / "study.css").read_text(encoding="utf-8")),

@@ -16,7 +16,6 @@ from optid.studies.verdicts.verdict import Verdict
 
 TEXT_BUDGET = 1_500_000  # characters of different texts that a column may bring to the page
 POINTS = 400  # steps of a profile that a screen can show
-LEFT_OUT = ("place",)  # internal to the database
 DIGITS = {"objective": 10, "bound": 10, "scale": 8}
 
 
@@ -113,8 +112,6 @@ def _columns(table: Mapping[str, np.ndarray], states: np.ndarray, time: str) -> 
     ]
     for column in COLUMNS:
         values = table[column.name]
-        if column.name in LEFT_OUT:
-            continue
         if column.kind in ("number", "integer"):
             digits = 12 if column.kind == "integer" else DIGITS.get(column.name, 5)
             made.append(_numbers(column.name, column.meaning, column.unit, values, digits))

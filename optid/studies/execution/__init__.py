@@ -1,1 +1,1 @@
-"""Running cells: in worker processes or on a cluster, with limits, one row for each whatever happens."""
+"""Running cells: in worker processes of this machine or on a Dask cluster, into the database."""

@@ -19,12 +19,11 @@ from optid.errors import DataError, SolverMissing, SolverRefused
 from optid.identify.fitting import Fit, fit
 from optid.program.solution import Solution, Times
 from optid.solving.solve import NOT_FINITE, solve
-from optid.studies.execution.environment import machine
-from optid.studies.execution.memory import Peak
+from optid.studies.execution.machine import Peak, machine
 from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash
 from optid.studies.sources.records import Record, load
-from optid.studies.storage.rows import DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, as_json, complete, place
+from optid.studies.storage.rows import DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, as_json, complete
 from optid.studies.versions import determining
 
 KEPT = 3
@@ -137,12 +136,10 @@ def without_warm(row: Mapping[str, Any], reason: str) -> dict[str, Any]:
 
 def known(cell: Cell) -> dict[str, Any]:
     """Return the columns of a cell that are known before it runs."""
-    labels = (cell.study, cell.data, cell.formulation, cell.solver, cell.samples, cell.noise, cell.seed, cell.accuracy,
-              cell.repetition)
     entry = cell.data_source
     versions = determining(cell.formulation_name, cell.solver_name, entry.system is not None)
     return {
-        "key": cell.key, "repetition": cell.repetition, "place": place(*labels), "study": cell.study,
+        "key": cell.key, "repetition": cell.repetition, "study": cell.study,
         "data": cell.data, "formulation": cell.formulation, "solver": cell.solver, "system": entry.system,
         "file": ", ".join(map(str, entry.files)) or None, "data_hash": cell.data_hash or None,
         "samples": cell.samples, "n_estimation": cell.samples, "noise": cell.noise, "seed": cell.seed,

@@ -1,9 +1,8 @@
 """Run a study into its database: what has a row already is not run again, and what is finished is never lost."""
 
 import tempfile
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +10,8 @@ from optid.errors import DatabaseError, StudyError, nearest
 from optid.studies.definition.description import Study
 from optid.studies.execution.cell import known, lost_row
 from optid.studies.grid import Cell, cells, check_unchanged, left
-from optid.studies.storage import database
-from optid.studies.storage.journal import Journal, kept, locked
-from optid.studies.storage.opening import InUse
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
-
-BATCH, EVERY = 500, 2.0  # rows, and seconds, after which what is in the journal goes to the database
-WAIT = 0.2  # seconds that it then waits for a reader of the database; it is safe in the journal, and tried again later
+from optid.studies.storage.store import LABELS, Store
 
 Row = dict[str, Any]
 Executor = Callable[[Sequence[Cell]], Iterator[Row]]
@@ -51,29 +45,77 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
             (what is finished is kept then, and the next run goes on from there).
         ClusterError: the cluster cannot be used.
     """
-    db = Path(db).resolve()  # a link and what it leads to have one journal
+    retry = _checked(retry)
+    grid = cells(study)
+    if execute is None:
+        execute = _executor(grid, workers, scheduler)
+    with Store(db, write=True) as store, store.claim(study.name):
+        todo = _prepared(store, study, grid, accept_changed_data, retry)
+        store.describe(study.name, _description(study))
+        _work(todo, len(grid), execute, store, progress)
+        return store.rows_of(study.name, [(cell.key, cell.repetition) for cell in grid])
+
+
+def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
+         ) -> tuple[list[Cell], list[Cell], str]:
+    """Return what a run would do, without changing the database.
+
+    Args:
+        study: what would be run.
+        db: the database, which need not be there.
+        accept_changed_data: as in `run`.
+        retry: as in `run`.
+
+    Returns:
+        All cells, those that a run would run, and which rows it would set aside, in words.
+
+    Raises:
+        StudyError: as in `run`.
+        DatabaseError: the database cannot be read.
+    """
+    retry, grid = _checked(retry), cells(study)
+    if not Path(db).exists():
+        return grid, grid, ""
+    with Store(db) as store, store.copy() as copy:
+        todo = _prepared(copy, study, grid, accept_changed_data, retry)
+        return grid, todo, told_former(copy, study)
+
+
+def told_former(store: Store, study: Study) -> str:
+    """Return in words which rows of a study are set aside, and why; empty where none is."""
+    axes = {"data": study.data, "formulation": study.formulations, "solver": study.solvers}
+    known_labels = [{entry.name for entry in entries} for entries in axes.values()]
+    counts: dict[str, int] = {}
+    for labels, count in store.superseded(study.name).items():
+        gone = next((f"{axis} {label} is" for axis, label, names in zip(axes, labels, known_labels)
+                     if label not in names), "")
+        counts[gone] = counts.get(gone, 0) + count
+    reasons = [f"{gone} no longer in the study ({count:,})" for gone, count in sorted(counts.items()) if gone]
+    if "" in counts:
+        reasons.append(f"former data, settings or versions, or run again ({counts['']:,})")
+    total = sum(counts.values())
+    return f"{total:,} {'row is' if total == 1 else 'rows are'} set aside: {'; '.join(reasons)}" if total else ""
+
+
+def _checked(retry: str | Sequence[str]) -> Sequence[str]:
     retry = (retry,) if isinstance(retry, str) else retry
     for outcome in retry:
         if outcome not in OUTCOMES:
             raise StudyError(f"no outcome is called {outcome!r}. {nearest(outcome, OUTCOMES)}")
-    grid = cells(study)
-    if execute is None:
-        execute = _executor(grid, workers, scheduler)
-    with locked(db):
-        writer = _Writer(db)
-        try:
-            if not accept_changed_data:
-                check_unchanged(grid, database.data_hashes(db))
-            database.keep(db, study.name, [(cell.key, cell.repetition) for cell in grid])
-            database.set_aside(db, study.name, retry)
-            if relabelled := _relabelled(db, grid, retry):
-                writer.write(relabelled)
-            todo = left(grid, database.finished(db, study.name))
-            database.describe(db, study.name, _description(study))
-            _work(todo, len(grid), execute, writer, progress)
-        finally:
-            writer.close()
-        return database.rows_of(db, study.name, [(cell.key, cell.repetition) for cell in grid])
+    return retry
+
+
+def _prepared(store: Store, study: Study, grid: list[Cell], accept_changed_data: bool, retry: Sequence[str]
+              ) -> list[Cell]:
+    """Make the rows of a database those of the grid, and return the cells that have none."""
+    if not accept_changed_data:
+        check_unchanged(grid, store.data_hashes())
+    store.keep(study.name, [(cell.key, cell.repetition) for cell in grid])
+    if retry:
+        store.set_aside(study.name, retry)
+    if relabelled := _relabelled(store, grid, retry):
+        store.append(relabelled)
+    return left(grid, store.finished(study.name))
 
 
 def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) -> Any:
@@ -86,7 +128,7 @@ def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) ->
     """
     if db is None:
         with tempfile.TemporaryDirectory() as folder:
-            return _framed(run(study, Path(folder) / "study.duckdb", **settings))
+            return _framed(run(study, Path(folder) / "study.sqlite", **settings))
     return _framed(run(study, db, **settings))
 
 
@@ -104,83 +146,26 @@ def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Exec
     return lambda todo: processes.execute(todo, workers=workers)
 
 
-class _Writer:
-    """The one writer of a database: every row to the journal at once, batches of rows to the database."""
-
-    def __init__(self, db: Path) -> None:
-        self._db, self._journal = db, Journal(db)
-        self._pending: list[Row] = []
-        self.added = 0  # rows that are safe in the journal
-        self._full, self._since = BATCH, time.monotonic()
-        try:
-            self.absorb()  # refuses a database of another version before anything is written
-        except BaseException:
-            self._journal.close()
-            raise
-
-    def absorb(self) -> None:
-        """Write to the database what is in the journal and not in the database, wherever a run was stopped."""
-        there = database.identities(self._db)
-        self.write([row for row in kept(self._db) if (row["study"], row["key"], row["repetition"]) not in there])
-
-    def add(self, row: Row) -> None:
-        self._journal.add(row)
-        self.added += 1
-        if not self._pending:
-            self._since = time.monotonic()
-        self._pending.append(row)
-        if len(self._pending) >= self._full or time.monotonic() - self._since > EVERY:
-            try:
-                self.write(self._pending, WAIT)
-            except InUse:
-                self._full, self._since = len(self._pending) + BATCH, time.monotonic()
-
-    def flush(self) -> None:
-        try:
-            if self._pending:
-                self.write(self._pending)
-        except InUse as error:
-            raise InUse(f"{error}. Nothing is lost: {self._journal.path} has the rows, and the next run of the study "
-                        "takes them over") from None
-
-    def write(self, rows: Sequence[Row], patience: float | None = None) -> None:
-        """Write rows to the database; the journal is empty then."""
-        database.append(self._db, rows, patience)
-        self._pending, self._full = [], BATCH
-        self._journal.clear()
-
-    def close(self) -> None:
-        self._journal.close()
-
-
-def _work(todo: list[Cell], total: int, execute: Executor, writer: _Writer, progress: Progress | None) -> None:
-    """Run cells and write their rows down as they come, until all are there or something stops it."""
+def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progress: Progress | None) -> None:
+    """Run cells and write their rows as they come, until all are there or something stops it."""
     done = total - len(todo)
     if progress is not None:
         progress(done, total, None)
     expected = {(cell.key, cell.repetition) for cell in todo}
     with closing(_all_rows(todo, execute)) as rows:
-        try:
-            for row in rows:
-                identity = (row["key"], row["repetition"])
-                if identity not in expected:  # a cluster may run a cell twice when a machine is lost
-                    continue
-                expected.remove(identity)
-                writer.add(row)
-                done += 1
-                if progress is not None:
-                    progress(done, total, row)
-            writer.flush()
-        except InUse:
-            raise
-        except DatabaseError as error:
-            kept = total - len(todo) + writer.added
-            raise DatabaseError(f"{error}. {kept:,} of {total:,} cells are kept. Where the disk is full, free space; "
-                                "the same run goes on from there") from error
-        except BaseException:  # Ctrl-C at any point, a lost cluster
-            with suppress(InUse):  # the journal has the rows
-                writer.absorb()
-            raise
+        for row in rows:
+            identity = (row["key"], row["repetition"])
+            if identity not in expected:  # a cluster may run a cell twice when a machine is lost
+                continue
+            try:
+                store.append([row])
+            except DatabaseError as error:
+                raise DatabaseError(f"{error}. {done:,} of {total:,} cells are kept. Where the disk is full, free "
+                                    "space; the same run goes on from there") from error
+            expected.remove(identity)
+            done += 1
+            if progress is not None:
+                progress(done, total, row)
     if expected:
         raise StudyError(f"{len(expected)} cells of {total} came back without a row; run the study again")
 
@@ -191,26 +176,23 @@ def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, N
     yield from execute([cell for cell in todo if not cell.refusal])
 
 
-def _relabelled(db: Path, grid: Iterable[Cell], retry: Sequence[str]) -> list[Row]:
+def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> list[Row]:
     """Rows for cells that were run under other labels or for another study: what determines them is the same.
 
     Those with an outcome that is to be run again are left out.
     """
-    places = database.identities(db)
-    wanted, found = [], {(key, repetition) for _, key, repetition in places}
+    there = store.labels()
+    wanted, any_study = [], {identity[1:] for identity in there}
     for cell in grid:
-        if (cell.key, cell.repetition) in found:
+        if (cell.key, cell.repetition) in any_study:
             facts = known(cell)
-            if places.get((cell.study, cell.key, cell.repetition)) != facts["place"]:
+            if there.get((cell.study, cell.key, cell.repetition)) != tuple(facts[name] for name in LABELS):
                 wanted.append((cell, facts))
     former = {(row["key"], row["repetition"]): row
-              for row in database.rows_of(db, None, [(cell.key, cell.repetition) for cell, _ in wanted])
+              for row in store.rows_of(None, [(cell.key, cell.repetition) for cell, _ in wanted])
               if row["outcome"] not in retry}
-    return [{**former[cell.key, cell.repetition], **{name: facts[name] for name in LABELS}} for cell, facts in wanted
+    return [former[cell.key, cell.repetition] | {name: facts[name] for name in LABELS} for cell, facts in wanted
             if (cell.key, cell.repetition) in former]
-
-
-LABELS = ("place", "study", "data", "formulation", "solver", "file")
 
 
 def _description(study: Study) -> str:

@@ -1,67 +1,142 @@
-"""What a worker process does: receive cells one after another and send back what the function returns.
+"""What a worker process does beside running cells.
 
-On Linux it ends when its parent does (the thread that started it), whatever it is doing; elsewhere when it next looks
-for a cell.
+The processes are pebble's: it gives them cells, ends those beyond their time, and replaces those that die. Loky has no
+time limit for a task, and one crash breaks all of an executor. What neither does is here: a limit of memory for each
+cell, the last words of a process that crashed, a row that stands where the rest of its cell comes to no end, and the
+end of a process, its children included, together with its parent.
 """
 
 import ctypes
 import faulthandler
+import json
 import os
 import pickle
 import resource
 import signal
 import sys
 from collections.abc import Callable, Mapping
-from multiprocessing.connection import Connection
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
-READY, KEEP, ROW, RAISED = "ready", "keep", "row", "raised"
-"""First word of every message to the parent."""
+from optid.studies.execution.machine import MB, resident_mb
+from optid.studies.storage.rows import ERROR, MEMORY_LIMIT
 
-_parent: Connection | None = None
+RETIRED = 77
+"""Exit code of a worker that holds so much memory of earlier cells that another one takes the cell it was given."""
+KEPT, KEPT_MB = 0.5, 150.0  # share of the limit, and MB, that a worker may hold of earlier cells
+TOLD, LONGEST = 100_000, 300  # bytes of the words of a worker that are looked at, and characters of them in a reason
+
+_function: Callable[[Any], Mapping[str, Any]]
+_folder: Path | None = None
+_kept: Path | None = None
+_fresh_mb = 0.0
 
 
-def main(descriptor: int, parent: int) -> None:
-    """Work until the parent closes the connection.
+def start(folder: str, packed: bytes, parent: int) -> None:
+    """Prepare a new process.
 
     Args:
-        descriptor: of one end of a pair of sockets, inherited. First comes a function with what prepares for it (or
-            None), then cells.
-        parent: its process id.
+        folder: for its words and notes.
+        packed: what makes a row of a cell, and what prepares for it (or None), pickled.
+        parent: process id of the parent.
     """
-    global _parent
+    global _function, _folder, _fresh_mb
+    _folder = Path(folder)
+    os.setsid()  # a kill of its group takes its children along, and Ctrl-C in the terminal does not reach it
+    _die_with(parent)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # ends a solver that never returns from its own code, too
+    with open(words(_folder, os.getpid()), "wb") as file, open(os.devnull, "wb") as null:
+        os.dup2(file.fileno(), 2)
+        os.dup2(null.fileno(), 1)
     faulthandler.enable()  # a segmentation fault then says where
     resource.setrlimit(resource.RLIMIT_CORE, (0, resource.getrlimit(resource.RLIMIT_CORE)[1]))  # no files of crashes
-    _die_with(parent)
-    connection = Connection(descriptor)
-    function, prepare = pickle.loads(connection.recv_bytes())
+    _function, prepare = pickle.loads(packed)
     if prepare is not None:
         prepare()
-    connection.send((READY, os.getpid()))
-    _parent = connection
-    while True:
-        try:
-            cell = connection.recv_bytes()
-        except EOFError:
-            return
-        connection.send(_answer(function, cell))
+    _fresh_mb = resident_mb()
+
+
+def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] | None, str, str]:
+    """Run a cell.
+
+    Args:
+        token: names the cell in the notes.
+        packed: the cell, pickled.
+        memory_limit: MB.
+
+    Returns:
+        The row; or None, an outcome and a reason where the function itself raised something.
+    """
+    global _kept
+    held = resident_mb()
+    if held > max(KEPT * memory_limit, _fresh_mb + KEPT_MB):
+        os._exit(RETIRED)
+    if _folder is not None:
+        os.ftruncate(2, 0)
+        os.lseek(2, 0, os.SEEK_SET)
+        note(_folder, token).write_text(str(os.getpid()))
+        _kept = kept(_folder, token)
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    try:
+        _limit_memory(memory_limit, held)
+        return dict(_function(pickle.loads(packed))), "", ""
+    except MemoryError as error:
+        return None, MEMORY_LIMIT, f"got no more memory ({error}); the limit is {memory_limit:g} MB"
+    except BaseException as error:
+        return None, ERROR, f"{type(error).__name__}: {error}"
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def keep(row: Mapping[str, Any]) -> None:
-    """Let the parent keep the row of the cell under way, which stands where the rest of that cell comes to no end.
+    """Keep the row of the cell under way, which stands where the rest of that cell comes to no end.
 
     Args:
         row: whole. Outside of a worker nothing is done.
     """
-    if _parent is not None:
-        _parent.send((KEEP, dict(row)))
+    if _kept is not None:
+        _kept.write_text(json.dumps(dict(row)))
 
 
-def _answer(function: Callable[[Any], Any], packed: bytes) -> tuple[str, Any]:
+def note(folder: Path, token: str) -> Path:
+    """Return the file that holds the process id of the worker that has a cell; it is as old as the run of the cell."""
+    return folder / token
+
+
+def kept(folder: Path, token: str) -> Path:
+    """Return the file of the row that was kept for a cell."""
+    return folder / f"{token}.row"
+
+
+def words(folder: Path, process: int) -> Path:
+    """Return the file of the standard error of a worker."""
+    return folder / f"{process}.words"
+
+
+def last_words(path: Path) -> str:
+    """Return where Python says that a process crashed, or the last line that it wrote; empty where there is none."""
     try:
-        return ROW, dict(function(pickle.loads(packed)))
-    except BaseException as error:  # the function makes rows of errors; this is one in the function itself
-        return RAISED, f"{type(error).__name__}: {error}"
+        with path.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - TOLD))
+            lines = [line.strip() for line in file.read().decode(errors="replace").splitlines() if line.strip()]
+    except OSError:
+        return ""
+    fatal = [k for k, line in enumerate(lines) if line.startswith("Fatal Python error")]
+    if fatal:
+        said = lines[fatal[-1] - 1] if fatal[-1] and "alloc" in lines[fatal[-1] - 1] else ""
+        places = [line for line in lines[fatal[-1]:] if line.startswith("File ")]
+        return said or (f"at {places[0]}" if places else "")
+    return lines[-1][-LONGEST:] if lines else ""
+
+
+def _limit_memory(limit: float, held: float) -> None:
+    """Let the system refuse memory beyond the limit; what the process has reserved and does not use is free."""
+    with suppress(OSError, ValueError):  # a system without this figure: the peak is compared when the cell has ended
+        reserved = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+        wanted = reserved + max(int((limit - held) * MB), 0)
+        resource.setrlimit(resource.RLIMIT_AS, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
 
 
 def _die_with(parent: int) -> None:

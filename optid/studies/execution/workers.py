@@ -1,33 +1,37 @@
-"""Run cells in worker processes, one per core: reused over cells, killed and replaced when a cell does not behave.
+"""Run cells in worker processes, one per core: reused over cells, replaced when a cell does not behave.
 
-The parent watches time, resident memory of the worker with its children, and life. Whatever happens to a worker, its
-cell becomes a row.
+pebble keeps the processes; `worker` says what it does not do. Whatever happens to a worker, its cell becomes a row.
 """
 
+import json
+import multiprocessing.spawn
 import os
 import pickle
+import signal
+import tempfile
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from multiprocessing.connection import wait
-from typing import TYPE_CHECKING, Any
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, TimeoutError, wait
+from contextlib import suppress
+from datetime import UTC, datetime
+from itertools import count
+from multiprocessing.context import SpawnContext, SpawnProcess
+from pathlib import Path
+from typing import Any
 
 from optid.errors import StudyError
-from optid.solving.isolated import GRACE
-from optid.studies.execution.cell import lost_row, prepare, run_cell
-from optid.studies.execution.worker import KEEP, RAISED, READY
+from optid.solving.isolated import GRACE, death
+from optid.studies.execution.cell import lost_row, prepare, run_cell, without_warm
+from optid.studies.execution.worker import RETIRED, kept, last_words, note, run, start, words
 from optid.studies.grid import Cell
 from optid.studies.storage.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
 
-if TYPE_CHECKING:
-    from optid.studies.execution.worker_process import WorkerProcess
-
-TICK = 0.1  # seconds between looks at time and memory of the workers
-FAMILY = 1.0  # seconds between looks at the children of workers, which take a scan of all processes
-START = 300.0  # seconds a worker may take to import what it needs
-STILLBORN = 5  # workers that end before they are ready, one after another, until that is an error
-DYING = 2.0  # seconds to wait for the exit code of a worker whose connection has ended
-KEPT, KEPT_MB = 0.5, 150.0  # share of the limit, and MB, that a worker may hold of earlier cells until it is replaced
+TICK = 0.2  # seconds between looks at the words of the workers
+TALK = 10_000_000  # bytes of them that are kept on the disk
+STILLBORN = 3  # pools whose workers end before they are ready, one after another, until that is an error
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 Row = dict[str, Any]
 
@@ -41,10 +45,10 @@ def check_number(workers: int | None) -> None:
     """Refuse a number of processes that is none.
 
     Raises:
-        StudyError: not a whole number from 1.
+        StudyError: not a positive integer.
     """
     if workers is not None and (not isinstance(workers, int) or isinstance(workers, bool) or workers < 1):
-        raise StudyError(f"workers = {workers!r}: a whole number of processes, at least one, is needed")
+        raise StudyError(f"workers must be a positive integer, a number of processes; {workers!r} is not")
 
 
 def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
@@ -59,8 +63,8 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
         workers: number of processes; one per core when not given.
 
     Raises:
-        StudyError: no whole number of workers, a function that has no name to import, workers that do not start (with
-            their last words), or psutil is missing (with the pip line).
+        StudyError: not a positive number of workers, a function that has no name to import, workers that do not start
+            (with their last words), or pebble is missing (with the pip line).
     """
     todo = deque(cells)
     check_number(workers)
@@ -72,154 +76,205 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
 
 
 class Pool:
-    """The workers and what they have in hand; they are kept over several calls of `run`, one at a time.
+    """Worker processes; they are kept over several calls of `run`, one at a time.
 
     Raises:
-        StudyError: psutil is missing (with the pip line), or a function that has no name to import.
+        StudyError: pebble is missing (with the pip line), or a function that has no name to import.
     """
 
     def __init__(self, function: Callable[..., Any], size: int) -> None:
         try:
-            from optid.studies.execution.worker_process import WorkerProcess
+            import pebble
         except ModuleNotFoundError as error:
-            if error.name != "psutil":
+            if error.name != "pebble":
                 raise
-            raise StudyError("workers are watched with psutil: pip install 'optid[study]'") from None
+            raise StudyError("the processes of a study are kept by pebble: pip install 'optid[study]'") from None
         try:
             self._function = pickle.dumps((function, prepare if function is run_cell else None))
         except Exception as error:
             raise StudyError(f"workers cannot import {function!r}: {error}") from None
-        self._hire = WorkerProcess
-        self._size = size
-        self._workers: list[WorkerProcess] = []
-        self._stillborn = 0
-        self._killed = False
-        self._family_at = time.monotonic()
+        self._pebble, self._size = pebble, size
+        self._notes = tempfile.TemporaryDirectory(prefix="optid-study-", ignore_cleanup_errors=True)
+        self._folder = Path(self._notes.name)
+        self._pool: Any = None
+        self._tokens, self._failed, self._killed = count(), 0, False
 
     def run(self, todo: deque[Cell]) -> Iterator[Row]:
         """Run the cells and yield their rows, as `execute`."""
-        rows = self._employ(todo)
-        while not self._killed and (rows or todo or any(worker.cell is not None for worker in self._workers)):
-            yield from rows
-            spoke = set(wait([worker.connection for worker in self._workers], TICK))
-            rows = [row for worker in list(self._workers) if worker.connection in spoke for row in self._heard(worker)]
-            rows += self._limited()
-            rows += self._employ(todo)  # before rows are handed out: no worker waits for what the caller does with them
+        pending: dict[Future[Any], tuple[Cell, str]] = {}
+        while (todo or pending) and not self._killed:
+            while todo and len(pending) < self._size + 1:  # one waits, so that no worker does
+                cell, token = todo.popleft(), str(next(self._tokens))
+                try:
+                    packed = pickle.dumps(cell)
+                except Exception as error:
+                    yield lost_row(cell, ERROR, f"the cell cannot be sent to a worker: {error}")
+                    continue
+                pending[self._scheduled(token, packed, cell)] = cell, token
+            done, _ = wait(pending, TICK, FIRST_COMPLETED)
+            for future in done:
+                cell, token = pending.pop(future)
+                row = self._row(cell, token, future)
+                if row is None:
+                    todo.appendleft(cell)
+                else:
+                    yield row
+            self._shorten_words()
 
     def kill(self) -> None:
         """End all workers from another thread; `run` ends with the rows there are, and `close` is still to come."""
         self._killed = True
-        for worker in list(self._workers):
-            worker.kill()
+        self._end_workers()
 
     def close(self) -> None:
         """End all workers."""
-        while self._workers:
-            self._dismiss(self._workers[-1])
+        self._end_workers()
+        if self._pool is not None:
+            self._pool.stop()
+            self._pool.join()
+        self._notes.cleanup()
 
-    def _among(self, which: Callable[["WorkerProcess"], bool]) -> list["WorkerProcess"]:
-        return [worker for worker in self._workers if which(worker)]
-
-    def _dismiss(self, worker: "WorkerProcess", patience: float = 0.0) -> str:
-        self._workers.remove(worker)
-        return worker.end(patience)
-
-    def _employ(self, todo: deque[Cell]) -> list[Row]:
-        """Give a cell to every idle worker and start workers while there are more cells than hands.
-
-        Returns the rows of cells that cannot be handed over.
-        """
-        rows = []
-        for worker in self._among(lambda w: w.ready and w.cell is None):
-            if todo and worker.resident_mb() > max(KEPT * todo[0].memory_limit, worker.fresh_mb + KEPT_MB):
-                self._dismiss(worker)
-                continue
-            while todo and worker.cell is None:
-                cell = todo.popleft()
-                try:
-                    if not worker.give(cell):  # it died while it was idle, which says nothing of this cell
-                        self._dismiss(worker)
-                        todo.appendleft(cell)
-                        break
-                except Exception as error:
-                    rows.append(lost_row(cell, ERROR, f"the cell cannot be sent to a worker: {error}"))
-        free = len(self._among(lambda w: w.cell is None))
-        while len(self._workers) < self._size and free < len(todo):
-            self._workers.append(self._hire(self._function))
-            free += 1
-        return rows
-
-    def _heard(self, worker: "WorkerProcess") -> list[Row]:
+    def _scheduled(self, token: str, packed: bytes, cell: Cell) -> "Future[Any]":
+        if self._pool is None:
+            self._pool = self._pebble.ProcessPool(self._size, initializer=start, context=_Context(), initargs=(
+                str(self._folder), self._function, os.getpid()))
+        arguments = (token, packed, cell.memory_limit)
         try:
-            word, content = worker.connection.recv()
-        except Exception as error:  # the end of the connection, or half a message
-            return self._died(worker, error)
-        if word == READY:
-            worker.ready, worker.fresh_mb, self._stillborn = True, worker.resident_mb(), 0
-            return []
-        if word == KEEP:
-            worker.kept = content
-            return []
-        row = worker.lost(ERROR, content) if word == RAISED else _checked(worker, content)
-        worker.take()
-        return [row]
+            return self._pool.schedule(run, arguments, timeout=cell.time_limit + GRACE)
+        except RuntimeError as error:  # the pool has just broken
+            future: Future[Any] = Future()
+            future.set_exception(BrokenExecutor(str(error)))
+            return future
 
-    def _died(self, worker: "WorkerProcess", error: Exception) -> list[Row]:
-        lost = worker.cell is not None
-        ended = self._dismiss(worker, DYING)
-        if not worker.ready:
-            self._count_stillborn(f"{ended} ({error})" if str(error) else ended)
-        return [worker.lost(CRASHED, f"the worker died: {ended}")] if lost else []
+    def _row(self, cell: Cell, token: str, future: "Future[Any]") -> Row | None:
+        """The row of a cell that has ended; None where it is to be given to another worker."""
+        begun = self._begun(token)
+        try:
+            row, outcome, reason = future.result()
+            self._failed = 0
+            found = _checked(cell, row) if row is not None else self._lost(cell, token, begun, outcome, reason)
+        except TimeoutError:
+            seconds = time.time() - begun[1] if begun else cell.time_limit
+            found = self._lost(cell, token, begun, TIME_LIMIT,
+                               f"stopped after {seconds:.1f} s; the limit is {cell.time_limit:g} s")
+        except BrokenExecutor:
+            self._renew()
+            return None
+        except Exception as error:
+            code = getattr(error, "exitcode", None)
+            if code is None:
+                found = lost_row(cell, ERROR, f"the row cannot be received: {type(error).__name__}: {error}")
+            elif code == RETIRED or begun is None:
+                return None
+            else:
+                found = self._crashed(cell, token, begun, code)
+        if begun is not None and future.exception() is not None:
+            _kill_group(begun[0])
+            words(self._folder, begun[0]).unlink(missing_ok=True)
+        for path in (note(self._folder, token), kept(self._folder, token)):
+            path.unlink(missing_ok=True)
+        return found
 
-    def _count_stillborn(self, ended: str) -> None:
-        self._stillborn += 1
-        if self._stillborn >= STILLBORN:
-            raise StudyError(f"{STILLBORN} workers, one after another, ended before they could work: {ended}")
+    def _crashed(self, cell: Cell, token: str, begun: tuple[int, float], code: int) -> Row:
+        said = last_words(words(self._folder, begun[0]))
+        if "bad_alloc" in said or "memory allocation" in said or "MemoryError" in said:
+            return self._lost(cell, token, begun, MEMORY_LIMIT, f"got no more memory ({said}); the limit is "
+                              f"{cell.memory_limit:g} MB")
+        how = ", ".join(filter(None, [death(code), said]))
+        return self._lost(cell, token, begun, CRASHED, f"the worker died: {how}")
 
-    def _limited(self) -> list[Row]:
-        """Kill the workers whose cell has used up its time or memory, and find those that died unheard.
-
-        The connection of a worker that died does not end while a child of it lives.
-        """
-        rows = []
-        for worker in self._among(lambda w: w.ended and not w.connection.poll()):
-            rows += self._died(worker, EOFError())
-        family = time.monotonic() - self._family_at > FAMILY
-        if family:
-            self._family_at = time.monotonic()
-        for worker in self._among(lambda w: not w.ready and w.seconds > START):
-            self._dismiss(worker)
-            self._count_stillborn(f"not ready after {START:.0f} s")
-        for worker in self._among(lambda w: w.cell is not None and w.seconds > TICK):
-            worker.shorten_words()
-            memory = worker.resident_mb(family)
-            worker.peak_mb = max(worker.peak_mb, memory)
-            if found := _beyond(worker, memory):
-                self._dismiss(worker)
-                rows.append(worker.lost(*found))
-        return rows
-
-
-def _beyond(worker: "WorkerProcess", memory: float) -> tuple[str, str] | None:
-    """Outcome and reason where the cell in hand is beyond its limits."""
-    cell = worker.cell
-    if cell is None:
+    def _begun(self, token: str) -> tuple[int, float] | None:
+        """Process that has, or had, a cell, and when it began; None where none has."""
+        path = note(self._folder, token)
+        with suppress(OSError, ValueError):
+            return int(path.read_text()), path.stat().st_mtime
         return None
-    if memory > cell.memory_limit:
-        return MEMORY_LIMIT, (f"held {memory:.0f} MB; the limit is {cell.memory_limit:g} MB, and a worker that does "
-                              f"nothing takes {worker.fresh_mb:.0f}")
-    if worker.seconds > cell.time_limit + GRACE:
-        return TIME_LIMIT, f"stopped after {worker.seconds:.1f} s; the limit is {cell.time_limit:g} s"
-    return None
+
+    def _lost(self, cell: Cell, token: str, begun: tuple[int, float] | None, outcome: str, reason: str) -> Row:
+        """The row of a cell whose worker did not make one: the one that was kept, where there is one."""
+        with suppress(OSError, ValueError):
+            return without_warm(complete(json.loads(kept(self._folder, token).read_text())), reason)
+        if begun is None:
+            return lost_row(cell, outcome, reason)
+        return lost_row(cell, outcome, reason, started=datetime.fromtimestamp(begun[1], UTC),
+                        total_s=time.time() - begun[1])
+
+    def _renew(self) -> None:
+        """Replace a pool that is broken; pebble breaks one when a worker ends that has no cell."""
+        if self._pool is None or self._pool.active:
+            return  # replaced by another cell of the same pool
+        self._pool.stop()
+        self._pool.join()
+        self._pool = None
+        self._failed += 1
+        if self._failed >= STILLBORN:
+            files = sorted(self._folder.glob("*.words"), key=lambda path: path.stat().st_mtime)
+            said = next(filter(None, (last_words(path) for path in reversed(files))), "they do not say why")
+            raise StudyError(f"workers ended before they could work, {STILLBORN} times in a row: {said}")
+
+    def _shorten_words(self) -> None:
+        """Forget what workers wrote where that fills the disk."""
+        for path in self._folder.glob("*.words"):
+            with suppress(OSError):
+                if path.stat().st_size > TALK:
+                    os.truncate(path, 0)
+
+    def _end_workers(self) -> None:
+        """Kill every worker with its children; pebble itself waits seconds for one that does not listen."""
+        for path in self._folder.glob("*.words"):
+            _kill_group(int(path.stem))
 
 
-def _checked(worker: "WorkerProcess", content: Mapping[str, Any]) -> Row:
+def _kill_group(process: int) -> None:
+    """Kill a worker with its children, which are of its group."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(process, signal.SIGKILL)
+
+
+def _checked(cell: Cell, content: Mapping[str, Any]) -> Row:
     """The row a function returned, or one that says why it is none."""
-    cell = worker.cell
     try:
         row = complete(content)
-        if cell is None or (row["key"], row["repetition"]) != (cell.key, cell.repetition):
+        if (row["key"], row["repetition"]) != (cell.key, cell.repetition):
             raise ValueError(f"it is of another cell, {row['key'][:12]} {row['repetition']}")
     except ValueError as error:
-        return worker.lost(ERROR, f"what the function returned is no row: {error}")
+        return lost_row(cell, ERROR, f"what the function returned is no row: {error}")
     return row
+
+
+_starting = threading.Lock()
+_preparation = multiprocessing.spawn.get_preparation_data
+
+
+def _without_main(name: str) -> dict[str, Any]:
+    found = _preparation(name)
+    path = [str(place) for place in found.get("sys_path", ())]  # a script may have put a Path into it
+    return {key: value for key, value in found.items() if not key.startswith("init_main")} | {"sys_path": path}
+
+
+class _Process(SpawnProcess):
+    """A fresh interpreter with one thread for linear algebra, that imports nothing of the caller's main module.
+
+    A daemon may start it, such as a Dask worker: it ends with its parent by itself.
+    """
+
+    def start(self) -> None:
+        """Start it with the settings of this class, which `multiprocessing` keeps in global places."""
+        own = multiprocessing.process.current_process()._config  # type: ignore[attr-defined]
+        with _starting:
+            missing = [name for name in THREADS if name not in os.environ]
+            daemon = own.pop("daemon", None)
+            os.environ.update(dict.fromkeys(missing, "1"))
+            multiprocessing.spawn.get_preparation_data = _without_main
+            try:
+                super().start()
+            finally:
+                multiprocessing.spawn.get_preparation_data = _preparation
+                for name in missing:
+                    del os.environ[name]
+                if daemon is not None:
+                    own["daemon"] = daemon
+
+
+class _Context(SpawnContext):
+    Process = _Process  # type: ignore[assignment]

@@ -1,1 +1,1 @@
-"""Rows: what they hold, the database and the journal that outlives a kill."""
+"""Rows: their columns, the SQLite database that holds them, and exports."""

@@ -1,6 +1,5 @@
 """The row of a study: names, types, units and meaning of its columns; tables and documentation come from here."""
 
-import hashlib
 import json
 import math
 import sys
@@ -10,7 +9,7 @@ from typing import Any
 
 from optid.program.solution import Status
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 DONE, TIME_LIMIT, MEMORY_LIMIT, CRASHED = "done", "time limit", "memory limit", "crashed"
 ERROR, REFUSED, NON_FINITE = "error", "refused", "non-finite"
@@ -55,17 +54,13 @@ class Column:
     @property
     def sql(self) -> str:
         """Its type in the database."""
-        kinds = {"text": "VARCHAR", "json": "VARCHAR", "number": "DOUBLE", "integer": "BIGINT", "flag": "BOOLEAN",
-                 "time": "TIMESTAMP"}
-        return kinds[self.kind]
+        return {"number": "REAL", "integer": "INTEGER", "flag": "INTEGER"}.get(self.kind, "TEXT")
 
 
 COLUMNS: tuple[Column, ...] = (
     # which cell
     Column("key", "text", "SHA-256 of everything that determines the result, the machine excepted", always=True),
     Column("repetition", "integer", "counted from 0; (study, key, repetition) identifies a row", always=True),
-    Column("place", "text", "hash of the labels below: the place in the grid, the same for other versions and options",
-           always=True),
     Column("study", "text", "title of the study", always=True),
     Column("data", "text", "label of the data entry", always=True),
     Column("formulation", "text", "label of the formulation entry", always=True),
@@ -206,15 +201,6 @@ def _cell_value(column: Column, value: Any) -> Any:
     return float(value) if column.kind == "number" else value
 
 
-def place(*labels: Any) -> str:
-    """Return the hash of a place in the grid.
-
-    Args:
-        labels: study, data, formulation and solver label, samples, noise, seed, accuracy, repetition.
-    """
-    return hashlib.sha256(json.dumps(labels).encode()).hexdigest()[:32]
-
-
 def as_json(value: Any) -> str:
     """Write a value as JSON text; numbers that are not finite become null, what JSON does not know its text."""
     return json.dumps(_finite(value), sort_keys=True, default=str, allow_nan=False)
@@ -230,16 +216,26 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+_NOTES = {"json": " (JSON)", "flag": " (flag)", "time": " (time)"}
+
+
 def markdown() -> str:
     """Return the documentation of the schema as two Markdown tables: columns and outcomes."""
     lines = ["# The rows of a study", "",
-             f"Schema version {SCHEMA_VERSION}. One row per cell and repetition, in the table `rows` of the DuckDB "
+             f"Schema version {SCHEMA_VERSION}. One row per cell and repetition, in the table `rows` of the SQLite "
              "file and in what `optid study export` writes. A column without a value is NULL; there is no NaN and no "
-             "infinity. A row of a cell that the study no longer has (entries taken out, changed data, versions or "
-             "options), or that was run again, is in the table `superseded`, from where a run takes back what the "
-             "study has again; the text of the study file is in `studies`, the schema version in `meta`.", "",
+             "infinity; flags are 0 and 1, times are texts (ISO 8601, UTC). A row of a cell that the study no longer "
+             "has (entries taken out, changed data, versions or options), or that was run again, is in the table "
+             "`superseded`, from where a run takes back what the study has again; the text of the study file is in "
+             "`studies`, runs under way are in `runs`, the schema version is in `meta`.", "",
+             "Other programs read the file as it is, also while a run goes on:", "",
+             "```python", "import sqlite3, pandas", "pandas.read_sql(\"SELECT * FROM rows\", "
+             "sqlite3.connect(\"study.sqlite\"))", "```", "",
+             "```sql", "-- DuckDB", "INSTALL sqlite; LOAD sqlite;", "SELECT solver, median(solve_s) FROM "
+             "sqlite_scan('study.sqlite', 'rows') GROUP BY solver;", "```", "",
+             "In exported CSV files a text that a spreadsheet would run as a formula begins with an apostrophe.", "",
              "| column | type | unit | meaning |", "|---|---|---|---|"]
-    lines += [f"| `{c.name}` | {c.sql}{' (JSON)' if c.kind == 'json' else ''}{' NOT NULL' if c.always else ''} "
+    lines += [f"| `{c.name}` | {c.sql}{_NOTES.get(c.kind, '')}{' NOT NULL' if c.always else ''} "
               f"| {c.unit} | {c.meaning} |" for c in COLUMNS]
     lines += ["", "| outcome | meaning |", "|---|---|", *(f"| {word} | {text} |" for word, text in OUTCOMES.items())]
     return "\n".join(lines) + "\n"

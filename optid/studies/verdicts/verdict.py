@@ -130,7 +130,7 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
     if accuracy is not None and not 0 < accuracy < 1:
         raise DataError(f"accuracy is a number between 0 and 1; {accuracy:g} is not")
     if isinstance(rows, str | Path):
-        from optid.studies.storage.one_study import rows_of_one
+        from optid.studies.storage.store import rows_of_one
 
         rows = rows_of_one(rows, study)
     table = columns(rows)

@@ -1,0 +1,410 @@
+"""The database of a study: one SQLite file in WAL mode, one row a cell and repetition.
+
+Every row is committed when it comes, so that a killed run loses only the cells under way; readers see what is committed
+while a run goes on, and several processes may write. SQLite recovers an interrupted transaction by itself.
+"""
+
+import os
+import platform
+import sqlite3
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optid.errors import DatabaseError, LookupFailed, OptidError, StudyError, nearest
+from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, complete
+
+PATIENCE = 30.0  # seconds to wait for another writer
+LABELS = ("study", "data", "formulation", "solver", "file")
+"""Columns that do not determine a result: a row takes those of its study as it is now."""
+STALE = 600.0  # seconds without a new row after which a run on another machine counts as ended
+
+_LIST = ", ".join(f'"{name}"' for name in NAMES)
+_SAME = "study = ? AND key = ? AND repetition = ?"
+_OF_STUDY = "(:study IS NULL OR study = :study)"
+_ASIDE = f"INSERT INTO superseded ({_LIST}) SELECT {_LIST} FROM rows WHERE"
+
+
+class Store:
+    """An open database; a context manager that closes it.
+
+    Args:
+        path: the file.
+        write: open it for writing; it is made when it is not there.
+
+    Raises:
+        DatabaseError: no such file, not a database of studies, a damaged one or one of another version.
+    """
+
+    def __init__(self, path: str | Path, write: bool = False) -> None:
+        self.path = Path(path)
+        if not write and not self.path.is_file():
+            raise DatabaseError(f"{self.path}: no such database; `optid study run` makes one")
+        if not self.path.parent.is_dir():
+            raise DatabaseError(f"{self.path} cannot be written: No such file or directory: {self.path.parent}")
+        if write and not self.path.exists():
+            self._make()
+        _check_kind(self.path)
+        with self._named("opened"):
+            self._connection = _connected(self.path, write)
+            try:
+                self._check()
+            except BaseException:
+                self._connection.close()
+                raise
+
+    def __enter__(self) -> "Store":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._connection.close()
+
+    @contextmanager
+    def _named(self, verb: str) -> Iterator[None]:
+        """Let errors of SQLite name the file."""
+        try:
+            yield
+        except (sqlite3.Error, OSError, UnicodeError) as error:
+            known = isinstance(error, sqlite3.OperationalError)  # a full disk, a folder that cannot be written
+            hint = "" if known else ". Where it is damaged, take another copy, or remove it and run the study again"
+            raise DatabaseError(f"{self.path} cannot be {verb}: {error}{hint}") from error
+
+    def _tables(self) -> set[str]:
+        found = self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+        return {name for (name,) in found}
+
+    def _make(self) -> None:
+        """Make the file under another name first, so that readers and later runs find all of it or nothing."""
+        from optid import __version__
+
+        new = self.path.with_name(f"{self.path.name}.{platform.node()}.{os.getpid()}.new")
+        columns = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
+        tables = (f"rows ({columns}, PRIMARY KEY (study, key, repetition))", f"superseded ({columns})",
+                  "studies (study TEXT PRIMARY KEY, description TEXT)",
+                  "runs (study TEXT PRIMARY KEY, machine TEXT, process INTEGER, since TEXT, seen TEXT)",
+                  "meta (name TEXT PRIMARY KEY, value TEXT)")
+        try:
+            with self._named("written"), closing(sqlite3.connect(new, isolation_level=None)) as connection:
+                connection.execute("PRAGMA journal_mode = WAL")
+                for table in tables:
+                    connection.execute(f"CREATE TABLE {table} STRICT")
+                connection.executemany("INSERT INTO meta VALUES (?, ?)", [
+                    ("schema version", str(SCHEMA_VERSION)), ("made by", f"optid {__version__}")])
+            with self._named("written"), suppress(FileExistsError):  # another process was first
+                os.link(new, self.path.resolve())
+        finally:
+            for rest in new.parent.glob(new.name + "*"):
+                rest.unlink()
+
+    def _check(self) -> None:
+        tables = self._tables()
+        if not {"rows", "superseded", "studies", "runs", "meta"} <= tables:
+            raise DatabaseError(f"{self.path} is an SQLite file, but not a database of studies (it has "
+                                f"{', '.join(sorted(tables)) or 'no tables'}); give another file name")
+        meta = dict(self._connection.execute("SELECT name, value FROM meta"))
+        if (version := meta.get("schema version", "unknown")) != str(SCHEMA_VERSION):
+            made = f" (made by {meta['made by']})" if "made by" in meta else ""
+            raise DatabaseError(f"{self.path} has schema version {version}{made}; this is version {SCHEMA_VERSION}. "
+                                "Export it with the optid that made it, or give another file")
+        for table in ("rows", "superseded"):
+            found = tuple(row[1] for row in self._connection.execute(f"PRAGMA table_info({table})"))
+            if found != NAMES:
+                raise DatabaseError(f"{self.path}: table {table} does not have the columns of a study (`optid study "
+                                    "schema` lists them); take another copy")
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """One transaction, which is undone when anything fails."""
+        with self._named("written"):
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+                self._connection.execute("COMMIT")
+            except BaseException:
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+                raise
+
+    def _all(self, statement: str, values: Mapping[str, Any] | Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        with self._named("read"):
+            return self._connection.execute(statement, values).fetchall()
+
+    def copy(self) -> "Store":
+        """Return a copy in memory: what is done to it leaves the file as it is."""
+        other = object.__new__(Store)
+        other.path, other._connection = self.path, sqlite3.connect(":memory:", isolation_level=None)
+        with self._named("read"):
+            self._connection.backup(other._connection)
+        return other
+
+    # -- rows ------------------------------------------------------------------------------------------------------
+
+    def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write rows in one transaction; a row that was there for the same cell and repetition is replaced.
+
+        Args:
+            rows: mappings of columns; completed and checked by `rows.complete`.
+
+        Raises:
+            DatabaseError: they cannot be written, such as on a full disk: what was there before stays.
+            ValueError: a row that does not keep the schema.
+        """
+        whole = [tuple(complete(row).values()) for row in rows]
+        marks = ", ".join("?" * len(NAMES))
+        with self._transaction():
+            self._connection.executemany(f"INSERT OR REPLACE INTO rows ({_LIST}) VALUES ({marks})", whole)
+            seen = {(datetime.now(UTC).isoformat(), row["study"]) for row in rows[-1:]}
+            self._connection.executemany("UPDATE runs SET seen = ? WHERE study = ?", seen)
+
+    def finished(self, study: str | None = None) -> set[tuple[str, int]]:
+        """Return (key, repetition) of every row, or of those of one study."""
+        return set(self._all(f"SELECT key, repetition FROM rows WHERE {_OF_STUDY}", {"study": study}))
+
+    def labels(self) -> dict[tuple[str, str, int], tuple[Any, ...]]:
+        """Return {(study, key, repetition): values of `LABELS`} of every row."""
+        found = self._all(f"SELECT key, repetition, {', '.join(LABELS)} FROM rows")
+        return {(values[0], key, repetition): values for key, repetition, *rest in found if (values := tuple(rest))}
+
+    def rows_of(self, study: str | None, identified: Collection[tuple[str, int]]) -> list[dict[str, Any]]:
+        """Return rows as they were written, in the order asked for; those that are not there are left out.
+
+        Args:
+            study: only rows of this study; None for any: one of each, "done" before others, then the newest.
+            identified: (key, repetition) of the rows.
+        """
+        found: dict[tuple[str, int], dict[str, Any]] = {}
+        for values in self._all(f"SELECT {_LIST} FROM rows WHERE {_OF_STUDY} ORDER BY outcome = :done, started, study",
+                                {"study": study, "done": DONE}):
+            row = {c.name: bool(v) if c.kind == "flag" and v is not None else v for c, v in zip(COLUMNS, values)}
+            found[row["key"], row["repetition"]] = row
+        return [found[identity] for identity in identified if identity in found]
+
+    def values(self, study: str | None = None) -> list[tuple[Any, ...]]:
+        """Return the rows as tuples in the order of the columns, sorted by the moments their cells started."""
+        return self._all(f"SELECT {_LIST} FROM rows WHERE {_OF_STUDY} ORDER BY started, key, repetition",
+                         {"study": study})
+
+    # -- a study and its rows ----------------------------------------------------------------------------------------
+
+    @contextmanager
+    def claim(self, study: str) -> Iterator[None]:
+        """Hold a study, so that no other run computes its cells meanwhile.
+
+        Raises:
+            DatabaseError: another run holds it: a process that lives on this machine, or one on another machine that
+                wrote a row within the last `STALE` seconds.
+        """
+        now, here = datetime.now(UTC), (platform.node(), os.getpid())
+        with self._transaction():
+            for machine, process, since, seen in self._connection.execute(
+                    "SELECT machine, process, since, seen FROM runs WHERE study = ?", [study]).fetchall():
+                if _lives(machine, process, since, seen, now):
+                    raise DatabaseError(f"another run of {study!r} is writing to {self.path}: process {process} on "
+                                        f"{machine} since {since[:19]} UTC. Wait until it ends, stop it, or give "
+                                        "another database")
+            self._connection.execute("INSERT OR REPLACE INTO runs VALUES (?, ?, ?, ?, ?)",
+                                     [study, *here, now.isoformat(), now.isoformat()])
+        try:
+            yield
+        finally:
+            with suppress(sqlite3.Error):  # a full disk: the process ends, and with it its claim
+                self._connection.execute("DELETE FROM runs WHERE study = ? AND machine = ? AND process = ?",
+                                         [study, *here])
+
+    def keep(self, study: str, cells: Collection[tuple[str, int]]) -> None:
+        """Make the rows of a study those of its grid as it is now.
+
+        Rows of other cells (entries taken out of the study, other data, options or versions) move to the table
+        ``superseded``, and rows of these cells that are there come back, the newest of each, so that an entry that is
+        taken out and put in again is not run again.
+
+        Args:
+            study: title of the study.
+            cells: (key, repetition) of the cells of its grid.
+        """
+        asked = "study = ? AND (key, repetition) {} (SELECT key, repetition FROM grid)"
+        with self._transaction():
+            self._connection.execute("CREATE TEMP TABLE IF NOT EXISTS grid (key TEXT, repetition INTEGER, "
+                                     "PRIMARY KEY (key, repetition))")
+            self._connection.execute("DELETE FROM grid")
+            self._connection.executemany("INSERT INTO grid VALUES (?, ?)", cells)
+            self._connection.execute(f"{_ASIDE} {asked.format('NOT IN')}", [study])
+            self._connection.execute(f"DELETE FROM rows WHERE {asked.format('NOT IN')}", [study])
+            back = self._connection.execute(
+                f"SELECT key, repetition, max(started) FROM superseded WHERE {asked.format('IN')} AND (key, repetition)"
+                " NOT IN (SELECT key, repetition FROM rows WHERE study = ?) GROUP BY key, repetition",
+                [study, study]).fetchall()
+            for row in back:
+                self._connection.execute(f"INSERT OR REPLACE INTO rows ({_LIST}) SELECT {_LIST} FROM superseded WHERE "
+                                         f"{_SAME} AND started = ?", [study, *row])
+                self._connection.execute(f"DELETE FROM superseded WHERE {_SAME} AND started = ?", [study, *row])
+
+    def set_aside(self, study: str, outcomes: Sequence[str]) -> None:
+        """Move the rows of a study with these outcomes to the table ``superseded``, so that their cells run again."""
+        chosen = f"study = ? AND outcome IN ({', '.join('?' * len(outcomes))})"
+        with self._transaction():
+            self._connection.execute(f"{_ASIDE} {chosen}", [study, *outcomes])
+            self._connection.execute(f"DELETE FROM rows WHERE {chosen}", [study, *outcomes])
+
+    def superseded(self, study: str | None = None) -> dict[tuple[str, str, str], int]:
+        """Return {(data, formulation, solver): rows set aside}: kept, but in no report."""
+        found = self._all("SELECT data, formulation, solver, count(*) FROM superseded "
+                          f"WHERE {_OF_STUDY} GROUP BY data, formulation, solver", {"study": study})
+        return {(data, formulation, solver): count for data, formulation, solver, count in found}
+
+    def describe(self, study: str, description: str) -> None:
+        """Keep the text of a study file with its rows; the newest replaces the one before."""
+        with self._transaction():
+            self._connection.execute("INSERT OR REPLACE INTO studies VALUES (?, ?)", [study, description])
+
+    def descriptions(self) -> dict[str, str]:
+        """Return {study: text of its study file}; "" for one with records in memory."""
+        return dict(self._all("SELECT study, description FROM studies"))
+
+    def data_hashes(self) -> dict[tuple[str, str], set[str]]:
+        """Return {(study, data label): hashes of the data files behind the rows}; simulated data have none."""
+        hashes: dict[tuple[str, str], set[str]] = {}
+        for study, data, value in self._all("SELECT DISTINCT study, data, data_hash FROM rows "
+                                            "WHERE data_hash IS NOT NULL"):
+            hashes.setdefault((study, data), set()).add(value)
+        return hashes
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse a file of another kind in words, before SQLite does."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise DatabaseError(f"{path} cannot be opened: {error.strerror}") from None
+    if head[8:12] == b"DUCK":
+        raise DatabaseError(f"{path} was written by an earlier optid, which kept rows in DuckDB. Export it with that "
+                            f"version (`optid study export {path.name} rows.parquet`); `optid study report "
+                            "rows.parquet` of this one reads the export. New runs need another database")
+    if head and head != b"SQLite format 3\0":
+        raise DatabaseError(f"{path} is a file of another kind, not a database of studies: give the one that `optid "
+                            "study run` wrote, or another name for a new one")
+
+
+def _connected(path: Path, write: bool) -> sqlite3.Connection:
+    place, shared = path.resolve().as_uri(), os.access(path.parent, os.W_OK)
+    mode = "rwc" if write else "rw" if shared and os.access(path, os.W_OK) else "ro"  # writers clean up
+    connection = sqlite3.connect(f"{place}?mode={mode}", uri=True, timeout=PATIENCE, isolation_level=None)
+    try:
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA synchronous = NORMAL")  # in WAL mode a killed process loses nothing with it
+        connection.execute(f"PRAGMA query_only = {'OFF' if write else 'ON'}")
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except sqlite3.OperationalError:
+        connection.close()
+        if write or shared or path.with_name(path.name + "-wal").exists():
+            raise
+        # A reader in WAL mode shares memory through a file; in a folder that cannot be written nobody else writes.
+        connection = sqlite3.connect(f"{place}?immutable=1", uri=True, isolation_level=None)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _lives(machine: str, process: int, since: str, seen: str, now: datetime) -> bool:
+    """Whether the process that claimed a study still runs it."""
+    if machine != platform.node():
+        return (now - datetime.fromisoformat(seen)).total_seconds() < STALE
+    import psutil
+
+    try:
+        return psutil.Process(process).create_time() <= datetime.fromisoformat(since).timestamp()
+    except psutil.Error:
+        return False
+
+
+def _array(values: Sequence[Any], kind: str, always: bool) -> np.ndarray:
+    if kind in ("text", "json"):
+        return np.array(["" if value is None else value for value in values], dtype=object)
+    if kind == "flag":
+        return np.array([bool(value) for value in values], dtype=bool)
+    if kind == "time":
+        return np.array([value.partition("+")[0] for value in values], dtype="datetime64[us]")
+    if kind == "integer" and always:
+        return np.array(values, dtype=np.int64)
+    return np.array(values, dtype=float)  # None becomes NaN
+
+
+def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Append rows to a database, which is made when it is not there; see `Store.append`."""
+    with Store(path, write=True) as store:
+        store.append(rows)
+
+
+def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarray]:
+    """Return the rows of a database as one array per column, in the order in which the cells started.
+
+    Args:
+        path: the database; a run may be writing to it.
+        study: only rows of this study.
+
+    Returns:
+        {column: (rows,) array} for every column of `rows.COLUMNS`: "number" float64, "integer" float64 (int64 for the
+        columns that every row has), both NaN where there is no value; "text" and "json" objects, "" where there is no
+        value; "flag" bool, False where there is none; "time" datetime64[us].
+
+    Raises:
+        DatabaseError: as for `Store`.
+    """
+    with Store(path) as store:
+        columns = list(zip(*store.values(study))) or [()] * len(COLUMNS)
+        try:
+            return {c.name: _array(values, c.kind, c.always) for c, values in zip(COLUMNS, columns)}
+        except (TypeError, ValueError, OverflowError) as error:
+            raise DatabaseError(f"{path} holds values that no run writes ({error}): take another copy") from None
+
+
+def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:
+    """Return (key, repetition) of every row of a database, or of one study; empty where there is no database yet."""
+    if not Path(path).exists():
+        return set()
+    with Store(path) as store:
+        return store.finished(study)
+
+
+def rows_of_one(path: str | Path, study: str | None = None) -> Any:
+    """Return the rows of a study as one array per column, as `read_rows` does; a frame of an exported Parquet file.
+
+    Args:
+        path: the database, or a .parquet file that `optid study export` wrote.
+        study: title of the study; it need not be given where there is only one.
+
+    Raises:
+        StudyError: the database holds several studies, and none is given.
+        LookupFailed: it holds none of this title.
+        DatabaseError: the database cannot be read.
+    """
+    rows = _exported(Path(path)) if str(path).endswith(".parquet") else read_rows(path)
+    titles = list(dict.fromkeys(rows["study"].tolist()))
+    if study is None:
+        if len(titles) > 1:
+            listed = ", ".join(f"{title!r} ({int(np.sum(rows['study'] == title)):,} rows)" for title in titles)
+            raise StudyError(f"{path} holds {len(titles)} studies: {listed}. Name one: --study TITLE (study=TITLE)")
+        return rows
+    if study not in titles:
+        raise LookupFailed(f"no study in {path} is called {study!r}. {nearest(study, titles)}")
+    return {name: values[rows["study"] == study] for name, values in rows.items()}
+
+
+def _exported(path: Path) -> dict[str, np.ndarray]:
+    import polars
+
+    try:
+        frame = polars.read_parquet(path)
+        return {name: frame[name].to_numpy() for name in frame.columns if name in (*NAMES, "study")}
+    except OptidError:
+        raise
+    except Exception as error:
+        raise DatabaseError(f"{path} cannot be read: {str(error).partition(chr(10))[0]}") from None
