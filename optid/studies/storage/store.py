@@ -23,6 +23,8 @@ LABELS = ("study", "data", "formulation", "solver", "file")
 """Columns that do not determine a result: a row takes those of its study as it is now."""
 STALE = 600.0  # seconds without a new row after which a run on another machine counts as ended
 
+Row = dict[str, Any]
+
 _LIST = ", ".join(f'"{name}"' for name in NAMES)
 _SAME = "study = ? AND key = ? AND repetition = ?"
 _OF_STUDY = "(:study IS NULL OR study = :study)"
@@ -176,10 +178,10 @@ class Store:
             study: only rows of this study; None for any: one of each, "done" before others, then the newest.
             identified: (key, repetition) of the rows.
         """
-        found: dict[tuple[str, int], dict[str, Any]] = {}
+        found: dict[tuple[str, int], Row] = {}
         for values in self._all(f"SELECT {_LIST} FROM rows WHERE {_OF_STUDY} ORDER BY outcome = :done, started, study",
                                 {"study": study, "done": DONE}):
-            row = {c.name: bool(v) if c.kind == "flag" and v is not None else v for c, v in zip(COLUMNS, values)}
+            row: Row = {c.name: bool(v) if c.kind == "flag" and v is not None else v for c, v in zip(COLUMNS, values)}
             found[row["key"], row["repetition"]] = row
         return [found[identity] for identity in identified if identity in found]
 
