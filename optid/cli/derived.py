@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
+from optid.cli.messages import option_of
 from optid.cli.terminal import Command
 from optid.descriptions import Description, describe
 from optid.errors import LookupFailed
@@ -25,6 +26,8 @@ class FittingCommand(Command):
         """Parse, after the options of the formulation have joined those of the command."""
         self.params = [p for p in self.params if not getattr(p, "derived", False)]
         name = chosen(args)
+        if "--help" in args and not any(word.partition("=")[0] in ("--formulation", "-f") for word in args):
+            self.params += options_of_others({word for p in self.params for word in p.opts})
         if name != self.spelled_out:  # whose arguments all have options of their own: nothing need be loaded
             self.params += derived_options(name, {word for p in self.params for word in p.opts})
         try:
@@ -83,6 +86,31 @@ def derived_options(name: str, taken: set[str]) -> list[Any]:
     return _options(parameters) if parameters else []
 
 
+def options_of_others(taken: set[str]) -> list[Any]:
+    """Return one option for every argument that only formulations other than the default have, for the help text."""
+    texts: dict[str, str] = {}
+    having: dict[str, list[str]] = {}
+    for name, point in sorted(registered(FORMULATIONS).items()):
+        try:
+            found = describe(point)
+        except ImportError:  # a broken plug-in takes nothing away
+            continue
+        about = found.arguments()
+        for key in found.options:
+            if key != "constraints" and option_of(key) not in taken:
+                texts.setdefault(key, about.get(key, ""))
+                having.setdefault(key, []).append(name)
+    parameters = []
+    for key, text in sorted(texts.items()):
+        names = ", ".join(having[key][:2]) + (f" and {len(having[key]) - 2} more" if len(having[key]) > 2 else "")
+        option = typer.Option(option_of(key), metavar="VALUE...", show_default=False, help=escape(
+            f"{text[:1].upper()}{text[1:]}. [{names}]"),
+            rich_help_panel="Arguments of other formulations")
+        parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None,
+                                            annotation=Annotated[list[str] | None, option]))
+    return _options(parameters)
+
+
 def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
     """Let typer make options of a signature."""
 
@@ -96,11 +124,6 @@ def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
     for option in options:
         option.derived = True  # type: ignore[attr-defined]
     return options
-
-
-def option_of(argument: str) -> str:
-    """Return the option word of an argument."""
-    return "--" + argument.replace("_", "-")
 
 
 def unknown(name: str, option: str) -> str:

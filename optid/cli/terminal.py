@@ -113,7 +113,8 @@ def coloured(text: str) -> Text:
     result.highlight_regex(r"(?m)^\S.*(?=\n[-=─═]{3})", "bold")
     result.highlight_regex(r"(?m)^[-=─═]{3,}$", "dim")
     result.highlight_regex(r"\boptimal \(proved\)", "bold green")
-    result.highlight_regex(r"(?m)^The model on this record: (good|fair)$", "bold green")
+    result.highlight_regex(r"(?m)^The model on this record: good$|\bPASS$", "bold green")
+    result.highlight_regex(r"(?m)^The model on this record: fair$", "bold blue")
     result.highlight_regex(r"(?m)^The model on this record: poor$", "bold yellow")
     result.highlight_regex(r"(?m)^The model on this record: useless$|\bFAIL$", "bold red")
     result.highlight_regex(r"\b(locally optimal|inaccurate|limit) \(not proved\)", "bold yellow")
@@ -123,6 +124,10 @@ def coloured(text: str) -> Text:
 def complain(error: BaseException) -> None:
     """Print one message for an error, on the error stream."""
     text = str(error) or type(error).__name__
+    if isinstance(error, OptidError):
+        from optid.cli.messages import in_options
+
+        text = in_options(text)
     if exit_code(error) == 1:
         text = f"{type(error).__name__}: {text}. This is a defect of optid; --debug shows where it happened"
     _tell("error", "bold red", text)

@@ -21,6 +21,7 @@ from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
+from optid.progress import log
 from optid.registry import Rendered, check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
 
@@ -350,6 +351,8 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     findings = findings + examine_figures(figures)
     prices = price_constraints(outcome.program, outcome.solution)
     earlier = price_earlier_steps(outcome.constrained, outcome.program)
+    log.info("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
+             time.perf_counter() - started)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
                time.perf_counter() - started, {**settings, "solver": solver})
 

@@ -6,7 +6,6 @@ Bootstrap, 1993, chapters 8 and 13). It needs no linearisation and no least squa
 and curved constraints, at the price of as many fits.
 """
 
-import sys
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from optid.identify.fitting import fit as refit
 from optid.identify.uncertainty import Refits, Uncertainty, aligned
 from optid.models import HammersteinTF
 from optid.models.recursions import autoregression
+from optid.progress import track
 
 FAILED = 0.1  # share of refits without a point above which the user is told
 
@@ -63,9 +63,6 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
     Warns:
         DataWarning: more than a tenth of the refits gave no point.
     """
-    from rich.console import Console
-    from rich.progress import track
-
     if isinstance(fit.data, Stream):
         raise StructureError("a stream cannot be simulated again; read the record, or use fit.uncertainty")
     if fit.model is None:
@@ -75,11 +72,9 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
     check_integer(runs, "runs", 40)
     check_probability(level, "level")
     models, failed = [], 0
-    steps = track(_records(fit, runs, seed), description="bootstrap", total=runs, transient=True,
-                  console=Console(stderr=True), disable=not sys.stderr.isatty())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # they speak of the record and were given at the fit
-        for record in steps:
+        for record in track(_records(fit, runs, seed), "bootstrap", runs):
             again = refit(record, fit.formulation, solver=solver, prove=False, raises=False, **fit.arguments)
             if again.model is None:
                 failed += 1

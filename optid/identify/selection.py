@@ -11,6 +11,7 @@ from optid.errors import StructureError
 from optid.identify.equation_error import EquationError
 from optid.identify.fitting import Fit, fit, resolve
 from optid.identify.validation.predictions import prediction_fit
+from optid.progress import track
 
 PENALTIES = ("ridge", "curvature", "weight")
 GRID = 13
@@ -72,7 +73,7 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
     train, test = data.split(1 - holdout) if holdout else (data, None)
     grid = default_weights(train) if weights is None else np.sort(np.asarray(weights, dtype=float))
     fits, scores = [], []
-    for weight in grid:
+    for weight in track(grid, f"path of {penalty}", len(grid)):
         if fits and penalty in fits[-1].program.parameters:
             one = resolve(fits[-1], {penalty: float(weight)}, solver=arguments.get("solver", "auto"))
         else:

@@ -3,6 +3,7 @@
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -18,6 +19,7 @@ from optid.identify.search.ladder import CLEAR, KINDS, LINEAR, RUNGS, Ladder, cl
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, tried
 from optid.identify.verdict import Verdict, verdict
+from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
 
 FIRST = 0.25
@@ -87,7 +89,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         solver: the back end's word, for every programme.
         accuracy: as of `optid.fit`.
         workers: processes; None for one per processor that is free to use.
-        progress: is told a sentence after every trial.
+        progress: is told a sentence after every trial; by default the log "optid", and a bar on a terminal.
 
     Returns:
         The model fitted to the whole record, with the table of what was tried and the reasons of the choice.
@@ -123,13 +125,14 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         return tried(candidate, cut, rival, {"solver": solver, "accuracy": accuracy}, rules, horizon, deadline)
 
     pool = Pool(attempt, count)
-    try:
-        if not _climb(ladder, possible, pool, FIRST * budget, end, partial(_told, ladder, progress, clock)):
-            stopped = f"the budget of {budget:g} s"
-    except KeyboardInterrupt:
-        stopped = "an interrupt"
-    finally:
-        pool.close()
+    with Clock("search", budget) if progress is None else nullcontext(progress) as told:
+        try:
+            if not _climb(ladder, possible, pool, FIRST * budget, end, partial(_told, ladder, told, clock, budget)):
+                stopped = f"the budget of {budget:g} s"
+        except KeyboardInterrupt:
+            stopped = "an interrupt"
+        finally:
+            pool.close()
     best = {kind: trial for kind in KINDS if (trial := ladder.best(kind)) is not None}
     chosen = ladder.choice()
     if chosen is None:
@@ -202,12 +205,11 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
     return found
 
 
-def _told(ladder: Ladder, progress: Callable[[str], None] | None, clock: float, trial: Trial) -> None:
+def _told(ladder: Ladder, progress: Callable[[str], None], clock: float, budget: float, trial: Trial) -> None:
     ladder.trials[trial.candidate.key] = trial  # also what an interrupt leaves
-    if progress is not None:
-        outcome = f"{trial.score:.1f} %" if np.isfinite(trial.score) else trial.reason
-        progress(f"{time.monotonic() - clock:.0f} s, {trial.candidate.kind}: {trial.candidate.formulation} "
-                 f"{trial.candidate.words}: {outcome}")
+    outcome = f"{trial.score:.1f} %" if np.isfinite(trial.score) else trial.reason
+    progress(f"{time.monotonic() - clock:.0f} of at most {budget:g} s, {trial.candidate.kind}: "
+             f"{trial.candidate.formulation} {trial.candidate.words}: {outcome}")
 
 
 def _nothing(ladder: Ladder) -> Exception:
