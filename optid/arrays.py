@@ -42,7 +42,7 @@ def as_samples(values: Any, what: str, names: Sequence[str] | None = None) -> np
     array = _as_numbers(values, what)
     if array.ndim == 1:
         array = array[:, None]
-    _check_shape(array, what)
+    check_shape(array, what)
     labels = [f"{what}, channel {name!r}" for name in names] if names and len(names) == array.shape[1] else None
     labels = labels or ([what] if array.shape[1] == 1 else [f"{what}, channel {c + 1}" for c in range(array.shape[1])])
     if array.dtype.kind in "iu":
@@ -170,7 +170,8 @@ def _as_numbers(values: Any, what: str) -> np.ndarray:
     return array
 
 
-def _check_shape(array: np.ndarray, what: str) -> None:
+def check_shape(array: np.ndarray, what: str) -> None:
+    """Refuse an array that is not (samples, channels), is empty, or has more channels than samples (`DataError`)."""
     if array.ndim != 2:
         raise DataError(f"{what} has shape {array.shape}; (samples,) or (samples, channels) is needed.")
     rows, channels = array.shape

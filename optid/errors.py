@@ -3,6 +3,9 @@
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+MOST_LISTED = 80
+"""Words that a message lists."""
+
 
 class OptidError(Exception):
     """Base class of everything optid raises on purpose."""
@@ -67,8 +70,10 @@ class DataWarning(UserWarning):
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return a sentence that names the known word nearest to the one written, or all known words."""
     words = sorted(known)
-    close = get_close_matches(name, words, n=1, cutoff=0.5)
-    return f"Did you mean {close[0]!r}?" if close else "Known: " + ", ".join(words) + "."
+    likely = words if len(words) <= 5000 else [word for word in words if word[:1] == name[:1]][:5000]  # for its time
+    close = get_close_matches(name[:80], likely, n=1, cutoff=0.5)
+    more = f", and {len(words) - MOST_LISTED} more" if len(words) > MOST_LISTED else ""
+    return f"Did you mean {close[0]!r}?" if close else "Known: " + ", ".join(words[:MOST_LISTED]) + more + "."
 
 
 def __dir__() -> list[str]:

@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from scipy.signal import decimate
 
 from optid.data.channels import MOST_LEVELS, count_levels
+from optid.data.readers import read
 from optid.data.record import Data, Transform
 from optid.errors import DataError, DataWarning
 
@@ -269,3 +270,68 @@ def test_decimate_refuses_gaps_and_short_records(record):
         whole.decimate(10)
     with pytest.raises(DataError, match="positive integer"):
         whole.decimate(1.5)  # pyright: ignore[reportArgumentType]
+
+
+# -- slices, frames, descriptions
+
+
+def two_runs():
+    u = np.arange(10.0)
+    return Data(u=[u, u + 10], y=[np.stack([u, -u], 1), np.stack([u + 1, u], 1)], dt=0.5, start=[0.0, 100.0],
+                inputs="valve", outputs=["flow", "head"], input_units="%", name="rig")
+
+
+def test_length_and_slices():
+    data = two_runs()
+    assert len(data) == 20 and len(data.select(experiments=0)) == 10
+    part = data[2:-1]
+    assert [e.n_samples for e in part.experiments] == [7, 7] and part.experiments[1].start == 101.0
+    np.testing.assert_array_equal(part.u[0][:, 0], np.arange(2.0, 9.0))
+    assert len(data[:100]) == 20 and len(data[:]) == 20
+    early = data[1.0:2.5]
+    assert early.n_experiments == 1 and early.time.tolist() == [1.0, 1.5, 2.0]
+    assert data[101.1:].time.tolist() == [101.5, 102.0, 102.5, 103.0, 103.5, 104.0, 104.5]
+    assert len(data[-np.inf:np.inf]) == 20
+    tenths = Data(u=np.zeros(40), y=np.ones(40), dt=0.1)
+    assert all(len(tenths[k * 0.1 : (k + 3) * 0.1]) == 3 for k in range(30))
+    for wrong in (slice(0, 9, 2), slice(1, 2.0), slice("a", None), slice(50.0, 60.0), slice(5, 5), slice(np.nan, None),
+                  3, "valve", slice(True, None)):
+        with pytest.raises(DataError):
+            data[wrong]
+    with pytest.raises(TypeError, match="not iterable"):
+        iter(data)
+
+
+def test_pandas_frames_go_out_and_come_back():
+    pd = pytest.importorskip("pandas")
+    first = two_runs().select(experiments=1)
+    frame = first.to_pandas()
+    assert list(frame.columns) == ["valve", "flow", "head"] and frame.index.name == "time"
+    again = read(frame, inputs="valve", outputs=["flow", "head"])
+    np.testing.assert_array_equal(again.y, first.y)
+    assert again.dt == 0.5 and again.experiments[0].start == 100.0
+    both = two_runs().to_pandas()
+    again = read(both.reset_index(), "valve", ["flow", "head"], experiment="experiment")
+    assert [e.start for e in again.experiments] == [0.0, 100.0] and again.dt == 0.5
+    assert isinstance(both.index, pd.MultiIndex)
+
+
+def test_a_description_has_every_figure():
+    u = np.tile([1.0, 2.0, np.nan, 4.0], 3)
+    shown = Data(u=u, y=np.arange(12.0), dt=0.5, name="rig", input_units="%", start=2.0).describe()
+    assert shown.channels[0].levels == 3 and shown.lengths == (12,) and shown.starts == (2.0,)
+    assert [line.split() for line in str(shown).splitlines()] == [
+        "rig: 12 samples every 0.5".split(), "from 2 to 7.5".split(),
+        "channel role unit low high mean std levels missing".split(),
+        "u input % 1 4 2.333 1.247 3 25.00%".split(), "y output 0 11 5.5 3.452 12 none".split()]
+    assert "experiment 2: 10 samples from 100 to 104.5" in str(two_runs().describe())
+
+
+def test_a_record_is_drawn():
+    figure = two_runs().plot()
+    assert [len(axes.lines) for axes in figure.axes] == [2, 2, 2] and figure.axes[0].get_ylabel() == "valve [%]"
+    long = np.zeros(100_003)
+    long[[40_000, 100_002]] = 7.0, 5.0
+    long[500:90_00] = np.nan
+    x, y = Data(u=long, y=long + 1).plot().axes[0].lines[0].get_data()
+    assert len(x) < 8200 and y[list(x).index(40_000)] == 7.0 and x[-1] == 100_002

@@ -1,4 +1,5 @@
 import sys
+import time
 from datetime import datetime, timedelta
 
 import numpy as np
@@ -7,7 +8,9 @@ import polars as pl
 import pytest
 from scipy.io import savemat
 
+import optid
 from optid.data.readers import open_stream, read
+from optid.data.reading import csvfile
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
 
@@ -57,9 +60,6 @@ def test_parquet_without_pyarrow(tmp_path, monkeypatch):
     np.testing.assert_array_equal(read(tmp_path / "r.parquet").y, [[3.0], [np.nan]])
     with pytest.raises(DataError, match=r'needs pyarrow: pip install "optid\[tables\]"'):
         open_stream(tmp_path / "r.parquet")
-    monkeypatch.setitem(sys.modules, "polars", None)
-    with pytest.raises(DataError, match=r'pip install "optid\[tables\]"'):
-        read(tmp_path / "r.parquet")
 
 
 def test_arrays_npz_and_npy(tmp_path):
@@ -92,7 +92,8 @@ def test_mat_files_of_both_kinds(tmp_path, monkeypatch):
     with pytest.raises(DataError, match="no column 'title'"):
         read(tmp_path / "new.mat", inputs="title")
     np.testing.assert_array_equal(read(tmp_path / "new.mat", outputs={"y": "log.y"}).y, Y)
-    monkeypatch.setitem(sys.modules, "h5py", None)
+    write(tmp_path, "raise ImportError('No module named h5py')", "h5py.py")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))  # the file is read by a process of its own
     with pytest.raises(DataError, match=r'7.3, which needs h5py: pip install "optid\[mat\]"'):
         read(tmp_path / "new.mat")
 
@@ -247,11 +248,67 @@ def test_bad_stamps(t, arguments, parts):
         ("u,y\n1,2\n", {"dt": -1}, ["dt = -1", "positive"]),
     ],
 )
-def test_bad_csv(tmp_path, text, arguments, parts):
+@pytest.mark.parametrize("small", [1 << 20, -1])  # read by the csv module; by polars until it refuses
+def test_bad_csv(tmp_path, monkeypatch, text, arguments, parts, small):
+    monkeypatch.setattr(csvfile, "SMALL", small)
     with pytest.raises(DataError) as error:
         read(write(tmp_path, text), **arguments)
     for part in parts:
         assert part in str(error.value)
+
+
+CELLS = ["1", "-2.5", "1e300", "3e-320", " 4", "5 ", "", "NA", " nan", "Null", "N/A", "inf", "1_0", "x", "0x1", '"7"',
+         '"8,5"', "1,2", "-", "+6", ".5", "9.", "\u0663", "1\r", "\r", "\n", "\0", "true", "1d3", "Infinity", "-NaN"]
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_polars_and_the_csv_module_read_the_same(tmp_path, monkeypatch, decimal):
+    """Random cells in a table of numbers: the same samples, or the same words about the same cell."""
+    r = np.random.default_rng(5)
+    monkeypatch.setattr(csvfile, "BLOCK", 40)
+    refused = 0
+    for _ in range(400):
+        cells = [[str(value) for value in row] for row in np.round(r.normal(size=(r.integers(1, 9), 3)), 3)]
+        if r.random() < 0.7:
+            cells[r.integers(len(cells))][r.integers(3)] = CELLS[r.integers(len(CELLS))]
+        text = "u,y,z\n" + "\n".join(",".join(row) for row in cells) + "\n" * r.integers(0, 3)
+        if decimal == ",":
+            text = text.replace(",", ";").replace(".", ",")
+        path = write(tmp_path, text)
+        found, outputs = [], ["y", "z"][: r.integers(1, 3)]
+        for small in (1 << 20, -1):
+            monkeypatch.setattr(csvfile, "SMALL", small)
+            try:
+                data = read(path, outputs=outputs, delimiter="," if decimal == "." else ";", decimal=decimal)
+                found.append((data.u.tobytes(), data.y.tobytes()))
+            except DataError as error:
+                found.append(str(error))
+        refused += isinstance(found[0], str)
+        assert found[0] == found[1], text
+    assert 50 < refused < 350
+
+
+def test_a_file_of_old_line_ends(tmp_path):
+    same(read(write(tmp_path, CSV.replace("\n", "\r"))))
+
+
+@pytest.mark.parametrize("delimiter", ["", ",,", "a", '"', "\n", None, 3])
+def test_bad_delimiter(tmp_path, delimiter):
+    with pytest.raises(DataError, match="one character"):
+        read(write(tmp_path, CSV), delimiter=delimiter)
+
+
+def test_a_hundred_thousand_columns(tmp_path):
+    names = ["u", "y", *(f"c{k}" for k in range(99_998))]
+    path = write(tmp_path, ",".join(names) + "\n" + (",".join(["0.5"] * 100_000) + "\n") * 9)
+    started = time.process_time()
+    data = read(path, outputs=["y", "c7", "c99997"])
+    assert data.n_samples == 9 and data.y[8, 2] == 0.5
+    with pytest.raises(DataError, match="no column 'voltage'.*and 99[0-9]* more"):
+        read(path, inputs="voltage")
+    with pytest.raises(DataError, match="row 3 after the header has 1 cells, the header has 100000"):
+        read(write(tmp_path, ",".join(names) + "\n" + (",".join(["0.5"] * 100_000) + "\n") * 2 + "1\n"))
+    assert time.process_time() - started < 15  # seconds where columns are searched one by one: over 100
 
 
 def test_bad_row_is_counted_across_blocks(tmp_path):
@@ -442,3 +499,59 @@ def test_bad_streams(tmp_path):
     np.save(tmp_path / "y.npy", np.ones((5, 2)))
     with pytest.raises(DataError, match="y.npy has 2 columns"):
         open_stream({"u": tmp_path / "u.npy", "y": tmp_path / "y.npy"})
+
+
+# -- time indices and foreign tables
+
+
+@pytest.mark.parametrize("index", [
+    pd.date_range("2024-05-01", periods=5, freq="20ms"), pd.date_range("2024-05-01", periods=5, freq="20ms", tz="CET"),
+    pd.timedelta_range(0, periods=5, freq="20ms"), pd.Index(0.02 * np.arange(5), name="time"),
+    pd.date_range("2024-05-01", periods=5, freq="20ms", name="stamp"),
+])
+def test_a_time_index_sets_the_sampling_time(index):
+    frame = pd.DataFrame({"u": np.arange(5.0), "y": np.arange(5.0)}, index=index)
+    data = read(frame)
+    assert data.dt == 0.02 and data.inputs == ("u",)
+    assert read(frame, dt=0.02).dt == 0.02 and read(frame, time=False).dt == 1.0 and read(frame, time=True).dt == 0.02
+    with pytest.raises(DataError, match="dt = 1, but the time stamps step by 0.02"):
+        read(frame, dt=1.0)
+    with pytest.raises(DataError, match="not uniform"):
+        read(frame.drop(frame.index[2]))
+    assert list(frame.columns) == ["u", "y"]  # the caller's frame is as it was
+    if index.name == "stamp":
+        assert read(frame, time="stamp").dt == 0.02
+        assert read(frame.reset_index()).dt == 0.02  # the only column of dates
+
+
+def test_an_index_without_time_is_ignored():
+    frame = pd.DataFrame({"u": np.arange(5.0), "y": np.arange(5.0)}, index=[3, 1, 4, 1, 5])
+    assert read(frame).dt == 1.0
+    dates = pl.DataFrame({"when": [datetime(2024, 1, 1) + timedelta(seconds=3 * k) for k in range(5)],
+                          "u": np.arange(5.0), "y": np.arange(5.0)})
+    assert read(dates).dt == 3.0
+    assert read(dates.with_columns(until=pl.col("when"))).dt == 1.0  # two columns of dates: neither is the clock
+
+
+def test_dates_of_a_parquet_file_written_by_pandas(tmp_path):
+    index = pd.date_range("2024-05-01", periods=5, freq="20ms")
+    pd.DataFrame({"u": np.arange(5.0), "y": np.arange(5.0)}, index=index).to_parquet(tmp_path / "r.parquet")
+    assert read(tmp_path / "r.parquet").dt == 0.02
+
+
+def test_arrow_and_xarray(tmp_path):
+    import pyarrow as pa
+
+    same(read(pa.table({"u1": U[:, 0], "u2": U[:, 1], "y": Y[:, 0]})))
+    xarray = pytest.importorskip("xarray")
+    time_of = pd.date_range("2024-05-01", periods=3, freq="2s")
+    same(read(xarray.Dataset({"u": (("time", "channel"), U), "y": ("time", Y[:, 0])}, {"time": time_of})), dt=2.0)
+
+
+def test_fit_names_the_way_to_a_record():
+    frame = pd.DataFrame({"u": U[:, 0], "y": Y[:, 0]})
+    for source in (frame, pl.DataFrame(frame), {"u": U, "y": Y}, U):
+        with pytest.raises(DataError, match=r"optid\.read\(df, "):
+            optid.fit(source)
+    with pytest.raises(DataError, match=r"fit\(optid.read\('r.csv', "):
+        optid.fit("r.csv")

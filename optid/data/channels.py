@@ -1,5 +1,6 @@
 """Channels: their names and units, what they look like, and the way back to raw units."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -157,8 +158,8 @@ def channel_fields(
         found[f"{kind}s"] = numbered_names(letter, count) if names is None else tuple(names)
         found[f"{kind}_units"] = tuple(str(unit) for unit in units)
     everything = found["inputs"] + found["outputs"]
-    for name in everything:
-        if everything.count(name) > 1:
+    for name, count in Counter(everything).items():
+        if count > 1:
             raise DataError(f"two channels are named {name!r}; give every channel a name of its own.")
     return found
 

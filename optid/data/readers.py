@@ -1,13 +1,14 @@
 """From files, frames and dictionaries to `Data`."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from optid.arrays import as_samples
+from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading.columns import (
     TIME_TOLERANCE,
@@ -21,7 +22,7 @@ from optid.data.reading.columns import (
     uniform_step,
 )
 from optid.data.reading.tables import Table, open_table
-from optid.data.record import Data
+from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError
 
@@ -46,14 +47,14 @@ def read(
     """Read a record; blank, NaN and NA cells are missing samples.
 
     Args:
-        source: path of a .csv, .txt, .tsv, .parquet, .mat (5 to 7.3), .npz or .npy file; a pandas or polars frame; a
-            mapping {name: (N,) or (N, channels) array}; an (N, channels) array; or a list of these, one per
-            experiment. The fields of a MATLAB structure are named "structure.field".
+        source: path of a .csv, .txt, .tsv, .parquet, .mat (5 to 7.3), .npz or .npy file; a pandas, polars or arrow
+            table; an xarray data set; a mapping {name: (N,) or (N, channels) array}; an (N, channels) array; or a list
+            of these, one per experiment. The fields of a MATLAB structure are named "structure.field".
         inputs: columns of the inputs by name or position, or {channel name: column}; u, or u1, u2, ..., when not given.
         outputs: columns of the outputs likewise; y, or y1, y2, ..., when not given.
         dt: sampling time; from the time stamps when not given, 1 without stamps.
-        time: column of time stamps (numbers, dates, ISO text; dates count in seconds); a column t or time when not
-            given; False ignores it.
+        time: column of time stamps (numbers, dates, ISO text; dates count in seconds); when not given a column t or
+            time, a time index of a frame, or the only column of dates of a frame or Parquet file; False ignores it.
         experiment: column whose value names the experiment; a new experiment starts where it changes.
         columns: names of the columns of a source that has none.
         input_units: one unit per input.
@@ -85,16 +86,11 @@ def read(
         if run.stamps is not None:
             step = agreed_step(uniform_step(run.stamps, time_tolerance, run.label), step, time_tolerance, run.label)
     first = sources[0]
-    return Data(
-        u=[run.u for run in runs],
-        y=[run.y for run in runs],
-        dt=1.0 if step is None else step,
-        inputs=runs[0].names[0],
-        outputs=runs[0].names[1],
-        input_units=input_units,
-        output_units=output_units,
-        name=name if name is not None else Path(first).stem if isinstance(first, str | Path) else "",
-        start=[0.0 if run.stamps is None else float(seconds(run.stamps[:1])[0]) for run in runs],
+    starts = [0.0 if run.stamps is None else float(seconds(run.stamps[:1])[0]) for run in runs]
+    return Data.of_experiments(
+        [Experiment(run.u, run.y, start) for run, start in zip(runs, starts)],
+        1.0 if step is None else step, *runs[0].names, input_units, output_units,
+        name if name is not None else Path(first).stem if isinstance(first, str | Path) else "",
     )
 
 
@@ -115,35 +111,47 @@ def _runs(
     label = table.label
     ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
     signals = [*ins.values(), *outs.values()]
-    clock = time_column(table.names, time, signals, label)
+    clock = time_column(table.names, time, signals, label, table.index)
     group = None if experiment is None else column_name(table.names, experiment, label)
-    as_is = [name for name in (clock, group) if name is not None]
-    loaded = table.load(list(dict.fromkeys([*signals, *as_is])), as_is)
+    loaded = table.load(list(dict.fromkeys([*signals, *(name for name in (clock, group) if name is not None)])),
+                        clock, group)
+    stamps = None if clock is None else as_stamps(loaded[clock], f"{label}, column {clock!r}")
+    groups = None if group is None else loaded[group]
+    loaded = {name: loaded[name] for name in signals}
+    y_names, y = _stacked(outs, loaded, label, kept=set(ins.values()))
     u_names, u = _stacked(ins, loaded, label)
-    y_names, y = _stacked(outs, loaded, label)
     if len(u) != len(y):
         raise DataError(f"{label}: u has {len(u)} samples and y has {len(y)}. Cut both to the common part.")
-    stamps = None if clock is None else as_stamps(loaded[clock], f"{label}, column {clock!r}")
     if stamps is not None and len(stamps) != len(u):
         raise DataError(f"{label}: {clock!r} has {len(stamps)} stamps for {len(u)} samples; time=False ignores it.")
     runs = []
-    for value, rows in _groups(None if group is None else loaded[group], len(u), label):
+    for value, rows in _groups(groups, len(u), label):
         part = label if value is None else f"{label}, experiment {value!r}"
+        check_shape(u[rows], f"{part}, inputs")
+        check_shape(y[rows], f"{part}, outputs")
         runs.append(_Run(part, (u_names, y_names), u[rows], y[rows], None if stamps is None else stamps[rows]))
     return runs
 
 
-def _stacked(pairs: dict[str, str], loaded: dict[str, Any], label: str) -> tuple[tuple[str, ...], np.ndarray]:
+def _stacked(pairs: dict[str, str], loaded: dict[str, Any], label: str, kept: Set[str] = frozenset()
+             ) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return names and samples (N, channels), read-only; all columns but those kept make room for their copies."""
     names: list[str] = []
     parts = []
+    uses = Counter(pairs.values())
     for name, column in pairs.items():
         part = as_samples(loaded[column], f"{label}, column {column!r}")
         parts.append(part)
         names += [name] if part.shape[1] == 1 else [f"{name}{c + 1}" for c in range(part.shape[1])]
+        uses[column] -= 1
+        if not uses[column] and column not in kept:
+            del loaded[column]
         if len(part) != len(parts[0]):
             raise DataError(f"{label}: {column!r} has {len(part)} samples, {next(iter(pairs.values()))!r} has "
                             f"{len(parts[0])}. Cut them to the common part.")
-    return tuple(names), np.hstack(parts)
+    samples = parts[0] if len(parts) == 1 else np.hstack(parts)
+    samples.flags.writeable = False
+    return tuple(names), samples
 
 
 def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any, slice]]:

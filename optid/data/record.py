@@ -10,7 +10,9 @@ import numpy as np
 from optid.arrays import as_samples, is_scalar_list
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, listed, sampling_time
+from optid.data.description import Description
 from optid.errors import DataError, nearest
+from optid.registry import render
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +106,24 @@ class Data(Ports):
                 experiments.append(Experiment(ue, ye, float(s)))
             except DataError as error:
                 raise DataError(f"experiment {k + 1}: {error}" if len(us) > 1 else str(error)) from None
-        m, l = us[0].shape[1], ys[0].shape[1]  # noqa: E741
+        self._complete(experiments, dt, inputs, outputs, input_units, output_units, name)
+
+    @classmethod
+    def of_experiments(
+        cls, experiments: Sequence[Experiment], dt: float, inputs: Sequence[str], outputs: Sequence[str],
+        input_units: Any = None, output_units: Any = None, name: str = "",
+    ) -> "Data":
+        """Return data of experiments with checked samples, without a copy; arguments as of the class."""
+        data = object.__new__(cls)
+        data._complete(experiments, dt, inputs, outputs, input_units, output_units, name)
+        return data
+
+    def _complete(self, experiments: Sequence[Experiment], dt: float, inputs: Any, outputs: Any, input_units: Any,
+                  output_units: Any, name: str) -> None:
+        m, l = experiments[0].u.shape[1], experiments[0].y.shape[1]  # noqa: E741
         names = channel_fields(m, l, inputs, outputs, input_units, output_units)
-        _filled(
-            self,
-            experiments=tuple(experiments),
-            dt=sampling_time(dt),
-            name=str(name),
-            transform=Transform.identity(m, l),
-            **names,
-        )
+        _filled(self, experiments=tuple(experiments), dt=sampling_time(dt), name=str(name),
+                transform=Transform.identity(m, l), **names)
         for channel, share in self.missing.items():
             if share == 1.0:
                 raise DataError(f"channel {channel!r}: every sample is missing. Check the column, or leave it out.")
@@ -197,6 +207,31 @@ class Data(Ports):
             lines.append("  detrended or scaled; reports are in raw units")
         return "\n".join(lines)
 
+    def describe(self) -> Description:
+        """Return range, mean, distinct levels and missing samples of each channel, and how it is sampled."""
+        return Description(self.name, self.dt, tuple(e.n_samples for e in self.experiments),
+                           tuple(e.start for e in self.experiments), self.channels)
+
+    def plot(self) -> Any:
+        """Return a matplotlib figure of every channel over time."""
+        return render(self, "figure")
+
+    def to_pandas(self) -> Any:
+        """Return a pandas frame with one column a channel; the index is the time, after the experiment where several.
+
+        Raises:
+            DataError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
+        times = [pd.Index(e.start + self.dt * np.arange(e.n_samples), name="time") for e in self.experiments]
+        frames = [pd.DataFrame(record, index, [*self.inputs, *self.outputs])
+                  for record, index in zip(self.records, times)]
+        return frames[0] if len(frames) == 1 else pd.concat(
+            frames, keys=range(1, len(frames) + 1), names=["experiment", "time"])
+
     # -- parts -----------------------------------------------------------------------------------------------------
 
     def split(self, at: float | int) -> tuple["Data", "Data"]:
@@ -234,6 +269,40 @@ class Data(Ports):
             if not 0 <= first < last <= e.n_samples:
                 raise DataError(f"window {first}:{last} is not inside experiment {k + 1} of {e.n_samples} samples.")
         return self._with(experiments=tuple(self._cut(e, first, last) for e in self.experiments))
+
+    def __len__(self) -> int:
+        return self.n_samples
+
+    __iter__ = None  # neither samples nor experiments are meant more than the other
+
+    def __getitem__(self, part: slice) -> "Data":
+        """Return data[first:last] by samples (integers, as of a list) or by time (floats), of every experiment.
+
+        Raises:
+            DataError: not a slice, a step, samples mixed with times, or a part without samples.
+        """
+        if not isinstance(part, slice) or part.step is not None:
+            raise DataError("data[first:last] takes samples (data[100:200]) or times (data[1.0:2.0]), and no step; "
+                            "use decimate for every k-th sample, .u and .y for arrays.")
+        ends = [end for end in (part.start, part.stop) if end is not None]
+        whole = all(isinstance(end, int | np.integer) and not isinstance(end, bool) for end in ends)
+        if not whole and not all(isinstance(end, float | np.floating) and end == end for end in ends):
+            raise DataError(f"data[{part.start!r}:{part.stop!r}]: two integers are samples, two floats are times.")
+        kept = []
+        for e in self.experiments:
+            limits = part
+            if not whole:  # the first sample not before each time; 1e-6 of a step for the rounding of the times
+                places = [None if end is None else min(max((end - e.start) / self.dt - 1e-6, 0.0), e.n_samples)
+                          for end in (part.start, part.stop)]
+                limits = slice(*(None if place is None else int(np.ceil(place)) for place in places))
+            first, last, _ = limits.indices(e.n_samples)
+            if first < last:
+                kept.append(self._cut(e, first, last))
+        if not kept:
+            raise DataError(f"data[{part.start}:{part.stop}] holds no samples; there are "
+                            f"{', '.join(str(e.n_samples) for e in self.experiments)} "
+                            f"from time {', '.join(f'{e.start:g}' for e in self.experiments)}.")
+        return self._with(experiments=tuple(kept))
 
     def select(
         self,
@@ -354,6 +423,17 @@ def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what:
 
 def _take(values: tuple, positions: Sequence[int]) -> tuple:
     return tuple(values[p] for p in positions)
+
+
+def not_a_record(data: Any, what: str) -> str:
+    """Return a message for a function called `what` that was given something else than a record."""
+    kind = type(data).__name__
+    if isinstance(data, str):
+        return f"{what} takes a record, not the name of a file: {what}(optid.read({data!r}, inputs=..., outputs=...))."
+    if hasattr(data, "columns") or hasattr(data, "data_vars") or isinstance(data, dict | np.ndarray | list):
+        return (f"{what} takes optid.Data, not {kind}: {what}(optid.read(df, inputs=[...], outputs=[...], dt=...)) for "
+                "a frame, dictionary or array df with one column a channel.")
+    return f"{what} takes optid.Data (or a stream), not {kind}; use optid.read(df, ...) or optid.Data(u=, y=, dt=)."
 
 
 def one_or_all(arrays: list[np.ndarray]) -> Any:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from optid.bases import Linear, fitted_bases
-from optid.data.record import Data
+from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
 from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError, nearest
 from optid.identify.parameters import Parameters, criteria, parameters
@@ -289,7 +289,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     """
     started = time.perf_counter()
     if not isinstance(data, Data | Stream):
-        raise DataError(f"fit takes optid.Data (or a stream), not {type(data).__name__}; use optid.Data(u=, y=, dt=)")
+        raise DataError(not_a_record(data, "fit"))
     name, pose = formulation(formulation_name)
     arguments = dict(structure)
     built = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)

@@ -19,6 +19,9 @@ TIME_TOLERANCE = 0.01
 
 TIME_NAMES = ("t", "time")
 
+MOST_LISTED = 40
+"""Columns that a message lists."""
+
 
 def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dict[str, str]:
     """Return {channel name: column} for the inputs (letter u) or the outputs (letter y).
@@ -69,20 +72,26 @@ def column_name(known: Sequence[str], wanted: str | int, label: str) -> str:
     return wanted
 
 
-def time_column(known: Sequence[str], time: str | int | bool | None, taken: Sequence[str], label: str) -> str | None:
-    """Return the column of time stamps: the one named, else a column t or time, None where there is none.
+def time_column(known: Sequence[str], time: str | int | bool | None, taken: Sequence[str], label: str,
+                index: str | None = None) -> str | None:
+    """Return the column of time stamps: the one named, else a column t or time or the index, None where there is none.
 
     Args:
         known: names of the columns of the source.
         time: a column; None looks for t or time, True requires it, False ignores it.
         taken: columns that are inputs or outputs already.
         label: name of the source, for the message.
+        index: name of a time index of the source, which need not be among its columns.
 
     Raises:
         DataError: no such column.
     """
+    if time == index and time is not None:
+        return index
     if time is None or time is True or time is False:
-        free = [c for c in known if c.lower() in TIME_NAMES and c not in taken]
+        free = [c for c in (*known, *([index] if index is not None else [])) if c not in taken
+                and (c.lower() in TIME_NAMES or c == index)]
+        free.sort(key=lambda c: c.lower() not in TIME_NAMES)
         if time and not free:
             raise DataError(f"{label} has no column t or time. {_listing(known)}")
         return free[0] if free and time is not False else None
@@ -195,4 +204,5 @@ def _unnamed(pairs: dict[str, str], known: Sequence[str], letter: str) -> dict[s
 
 
 def _listing(known: Sequence[str]) -> str:
-    return "Columns: " + ", ".join(known) + "."
+    more = f", and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
+    return "Columns: " + ", ".join(known[:MOST_LISTED]) + more + "."

@@ -1,12 +1,20 @@
-"""Comma separated files in blocks, through the csv module: quoting is right and every bad cell can be named."""
+"""Comma separated files: polars reads them in blocks, the csv module reads a block that polars refuses.
+
+Polars fills short rows in silence and knows no row of a bad cell. So each block is first checked to have the cells of
+the header in every row, and one that polars refuses goes through the csv module, which reads what is right in it
+(quotes, blanks around cells, any spelling of a missing sample) and names the row and the column of what is not.
+"""
 
 import csv
-from collections.abc import Iterator, Sequence
+import io
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence, Set
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -14,6 +22,21 @@ from optid.errors import DataError
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 """Cells that mean a missing sample, in any case and with blanks around them."""
+
+NULLS = ["NA", "N/A", "null", "NULL", "None", "nan", "NaN", "NAN"]
+"""Common spellings of `MISSING`, which polars takes at full speed."""
+
+SMALL = 1 << 18
+"""Bytes up to which the csv module reads a file in less time than polars needs to be imported."""
+
+BLOCK = 1 << 22
+"""Bytes read at a time."""
+
+ROWS = 65536
+"""Rows that the csv module converts at a time."""
+
+Columns = dict[str, np.ndarray]
+"""{column: (n,) samples}, or its text."""
 
 
 @dataclass(frozen=True)
@@ -23,51 +46,148 @@ class CsvFile:
     Attributes:
         path: the file.
         names: one name per column.
-        header: whether the first row holds the names.
+        offset: bytes before the first row of samples.
         delimiter: character between cells.
         decimal: decimal mark, "." or ",".
     """
 
     path: Path
     names: list[str]
-    header: bool
+    offset: int
     delimiter: str
     decimal: str
 
-    def blocks(self, wanted: Sequence[str], rows: int) -> Iterator[dict[str, tuple[str, ...]]]:
-        """Yield the cells of the wanted columns, at most `rows` rows at a time.
+    def columns(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Columns:
+        """Return the wanted columns whole; arguments and errors as of `blocks`.
 
         Raises:
-            DataError: a row of another width, a blank row inside the table, or text that is not UTF-8.
+            DataError: the table has no rows.
         """
-        pick = itemgetter(*(self.names.index(name) for name in wanted))
-        done = 0
-        with open(self.path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, delimiter=self.delimiter)
-            try:
-                if self.header:
-                    next(reader)
-                while block := list(islice(reader, rows)):
-                    if set(map(len, block)) != {len(self.names)}:
-                        block = self._without_tail(block, reader, done)
-                    done += len(block)
-                    cells = list(zip(*map(pick, block))) if len(wanted) > 1 else [tuple(map(pick, block))]
-                    if block:
-                        yield dict(zip(wanted, cells))
-            except (UnicodeDecodeError, csv.Error) as error:
-                raise DataError(f"{self.path.name}: not a text table after row {done} ({error}).") from error
+        parts: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
+        for block in self._blocks(wanted, clock, group):
+            for name, part in block.items():
+                parts[name].append(part)
+        if not parts[wanted[0]]:
+            raise DataError(f"{self.path.name} has a header but no rows.")
+        return {name: np.concatenate(parts.pop(name)) for name in wanted}
 
-    def numbers(self, cells: Sequence[str], column: str, first: int) -> np.ndarray:
-        """Return the cells of one column as (n,) float64, NaN where the cell says missing.
+    def blocks(self, wanted: Sequence[str], clock: str | None, group: str | None, rows: int) -> Iterator[Columns]:
+        """Yield the wanted columns as float64, NaN where a cell says missing, `rows` rows at a time.
 
         Args:
-            cells: the text of the cells.
-            column: name of the column, for the message.
-            first: number of rows before these cells.
+            wanted: names of columns.
+            clock: the one of them that is returned as text where it does not hold numbers.
+            group: the one of them that is returned as text.
+            rows: number of rows of every block but the last.
 
         Raises:
-            DataError: a cell that is not a number, named by column and row.
+            DataError: a cell that is not a number, a row of another width, a blank row inside the table, or text that
+                is not UTF-8.
         """
+        kept: list[Columns] = []
+        count = 0
+        for block in self._blocks(wanted, clock, group):
+            kept.append(block)
+            count += len(block[wanted[0]])
+            if count >= rows:
+                whole = {name: np.concatenate([part[name] for part in kept]) for name in wanted}
+                full = count - count % rows
+                for first in range(0, full, rows):
+                    yield {name: column[first : first + rows] for name, column in whole.items()}
+                count -= full
+                kept = [{name: column[full:] for name, column in whole.items()}] if count else []
+        if count:
+            yield {name: np.concatenate([part[name] for part in kept]) for name in wanted}
+
+    def _blocks(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Iterator[Columns]:
+        done = 0
+        text = {name for name in (clock, group) if name is not None}
+        attempts = [(text - {clock}, [])]
+        if group is None:
+            attempts.append((set(), NULLS))
+        if clock is not None:
+            attempts.append((text, []))
+        with open(self.path, "rb", buffering=0) as file:
+            file.seek(self.offset)
+            if self.path.stat().st_size > SMALL and self.delimiter.isascii():
+                for start, block in _whole_lines(file, self.offset):
+                    if not _is_plain(block):
+                        file.seek(start)
+                        break
+                    found: Iterable[Columns] = []
+                    for attempt in list(attempts):
+                        if table := self._parsed(block, wanted, *attempt):
+                            found = [table]
+                            attempts.remove(attempt)
+                            attempts.insert(0, attempt)  # the next block will be like this one
+                            break
+                    else:
+                        if not self._has_even_rows(block):
+                            file.seek(start)
+                            break
+                        found = self._exact(io.StringIO(block.decode(), newline=""), wanted, text, done)
+                    for columns in found:
+                        done += len(columns[wanted[0]])
+                        yield columns
+            with io.TextIOWrapper(io.BufferedReader(file), "utf-8", newline="") as lines:
+                yield from self._exact(lines, wanted, text, done)
+
+    def _parsed(self, block: bytes, wanted: Sequence[str], as_text: Set[str], nulls: list[str]) -> Columns | None:
+        """Return the columns of whole rows, None where polars refuses a cell or a row has other cells than the header.
+
+        Args:
+            block: rows in which nothing is quoted.
+            wanted: names of columns.
+            as_text: those of them that are not converted.
+            nulls: words besides nothing at all that mean a missing sample.
+        """
+        import polars as pl
+
+        places = [self._places[name] for name in wanted]
+        schema = dict.fromkeys(map(str, range(len(self.names))), pl.Float64)
+        schema |= {str(self._places[name]): pl.String for name in as_text}
+        try:
+            table = pl.read_csv(block, has_header=False, columns=sorted(set(places)), schema=schema, quote_char=None,
+                                separator=self.delimiter, decimal_comma=self.decimal == ",", null_values=nulls or None)
+        except pl.exceptions.PolarsError:
+            return None
+        # Polars refuses long rows where it reads all columns, and fills short ones, the last cell at least, with nulls.
+        if (table.width < len(self.names) or table[:, -1].null_count()) and not self._has_even_rows(block):
+            return None
+        series = [table[str(place)] for place in places]
+        return {name: column.fill_null("").to_numpy() if name in as_text else column.to_numpy()
+                for name, column in zip(wanted, series)}
+
+    def _has_even_rows(self, block: bytes) -> bool:
+        """Say whether every row has as many cells as the header."""
+        signs = np.frombuffer(block, np.uint8)
+        ends = signs == ord("\n")
+        marks = ends[np.flatnonzero(ends | (signs == ord(self.delimiter)))]  # whether each separator ends a row
+        width = len(self.names)
+        return width > 1 and marks.size % width == 0 and bool(
+            marks[width - 1 :: width].all() and np.count_nonzero(marks) == marks.size // width)
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        return {name: place for place, name in enumerate(self.names)}
+
+    def _exact(self, lines: Iterable[str], wanted: Sequence[str], as_is: Set[str], done: int) -> Iterator[Columns]:
+        """Read rows by the csv module, `done` rows after the header."""
+        pick = itemgetter(*(self._places[name] for name in wanted))
+        reader = csv.reader(lines, delimiter=self.delimiter)
+        try:
+            while block := list(islice(reader, ROWS)):
+                if set(map(len, block)) != {len(self.names)}:
+                    block = self._without_tail(block, reader, done)
+                cells = list(zip(*map(pick, block))) if len(wanted) > 1 else [tuple(map(pick, block))]
+                if block:
+                    yield {name: np.array(column, dtype=object) if name in as_is else self._numbers(column, name, done)
+                           for name, column in zip(wanted, cells)}
+                done += len(block)
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise DataError(f"{self.path.name}: not a text table after row {done} ({error}).") from error
+
+    def _numbers(self, cells: Sequence[str], column: str, first: int) -> np.ndarray:
         text = cells if self.decimal == "." else [cell.replace(self.decimal, ".") for cell in cells]
         try:
             if "_" in "".join(text):  # float() reads 1_000 as a number, a table does not
@@ -112,26 +232,68 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
         decimal: decimal mark.
 
     Raises:
-        DataError: empty file, no header, two columns of one name, not UTF-8.
+        DataError: empty file, no header, two columns of one name, not UTF-8, a delimiter that cannot be one.
     """
+    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter.isalnum() or delimiter in '"\r\n+-\0':
+        raise DataError(f"delimiter = {delimiter!r}: one character such as ',' or ';' or a tab is needed.")
     if decimal not in (".", ",") or decimal == delimiter:
         raise DataError(f"decimal = {decimal!r} with delimiter = {delimiter!r}: '.' or ',' and not the delimiter.")
+    with open(path, "rb") as file:
+        start = 3 if file.read(3) == b"\xef\xbb\xbf" else 0
+        file.seek(start)
+        line = file.readline()
+        while line.count(b'"') % 2 and (more := file.readline()):  # a line end inside a quoted name
+            line += more
+    if b'"' not in line and b"\r" in line.rstrip(b"\r\n"):  # lines that end with a carriage return alone
+        line = line[: line.index(b"\r") + 1]
     try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            first = next(csv.reader(file, delimiter=delimiter), None)
+        rows = csv.reader(io.StringIO(line.decode(), newline=""), delimiter=delimiter)
+        first = next(rows, None)
+        following = next(rows, None)
     except UnicodeDecodeError as error:
         raise DataError(f"{path.name} is not UTF-8 text: save it as CSV UTF-8. ({error})") from error
+    except csv.Error as error:
+        raise DataError(f"{path.name} is not a text table ({error}).") from error
     if not first:
         raise DataError(f"{path.name} is empty: a header row and at least one row of numbers are needed.")
+    if following is not None:
+        raise DataError(f"{path.name} has quoted names and carriage returns as line ends: save it with line feeds.")
     if columns is None and all(_is_number(cell) for cell in first):
-        raise DataError(f"{path.name} has no header row (it starts with {first}): name the columns, columns=[...].")
-    names = [cell.strip() for cell in (first if columns is None else columns)]
+        raise DataError(f"{path.name} has no header row (it starts with {first[:20]}): name the columns, "
+                        "columns=[...].")
+    names = [str(cell).strip() for cell in (first if columns is None else columns)]
     if len(names) != len(first):
         raise DataError(f"{path.name} has {len(first)} columns, columns= names {len(names)}.")
-    for name in names:
-        if name and names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if name and count > 1:
             raise DataError(f"{path.name} has two columns named {name!r}: rename one.")
-    return CsvFile(path, names, columns is None, delimiter, decimal)
+    return CsvFile(path, names, start + len(line) if columns is None else start, delimiter, decimal)
+
+
+def _whole_lines(file: BinaryIO | io.RawIOBase, start: int) -> Iterator[tuple[int, bytes]]:
+    """Yield (position, bytes) of blocks of whole lines."""
+    rest, size = b"", BLOCK
+    while more := file.read(size):
+        block = rest + more
+        end = block.rfind(b"\n") + 1
+        if end:
+            yield start, block[:end]
+        start, rest = start + end, block[end:]
+        size = BLOCK if end else 2 * size  # a line longer than a block
+    if rest.strip(b"\r\n"):
+        yield start, rest + b"\n"
+
+
+def _is_plain(block: bytes) -> bool:
+    """Say whether lines end in one way, with nothing quoted and nothing but UTF-8."""
+    if b'"' in block or b"\0" in block or (b"\r" in block and block.count(b"\r") != block.count(b"\r\n")):
+        return False
+    if not block.isascii():
+        try:
+            block.decode()
+        except UnicodeDecodeError:
+            return False
+    return True
 
 
 def _is_number(cell: str) -> bool:

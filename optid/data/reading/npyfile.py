@@ -1,13 +1,22 @@
-"""NumPy files in blocks, read and not mapped: mapped pages count as resident memory."""
+"""NumPy files, read and not mapped: mapped pages count as resident memory; headers are compared with the file first."""
 
+import math
+import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
+from typing import IO, Any
 
 import numpy as np
 
 from optid.errors import DataError
+
+BROKEN = (ValueError, OSError, EOFError, TypeError, SyntaxError, KeyError, IndexError, AttributeError, RecursionError,
+          TokenError, OverflowError, MemoryError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error)
+"""What numpy and zipfile raise on damaged files."""
 
 
 @dataclass(frozen=True)
@@ -59,12 +68,8 @@ def open_npy(path: Path) -> NpyFile:
     """
     with open(path, "rb") as file:
         try:
-            version = np.lib.format.read_magic(file)
-            if version not in ((1, 0), (2, 0)):
-                raise ValueError(f"npy version {version} is unknown")
-            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, by_column, dtype = header(file)
-        except (ValueError, EOFError) as error:
+            shape, by_column, dtype = _header(file)
+        except BROKEN as error:
             raise DataError(f"{path.name} is damaged, or not an npy file: {error}") from error
         offset = file.tell()
     if dtype.kind not in "iuf":
@@ -78,3 +83,67 @@ def open_npy(path: Path) -> NpyFile:
     if there < rows * width:
         raise DataError(f"{path.name} is truncated: its header says {rows * width} numbers, {there} are there.")
     return NpyFile(path, rows, width, dtype, bool(by_column) and width > 1, offset)
+
+
+def load_npy(path: Path, label: str) -> np.ndarray:
+    """Return the array of an npy file of plain numbers; `DataError` with the label otherwise."""
+    try:
+        with open(path, "rb") as file:
+            if file.read(2) == b"PK":
+                raise ValueError("it is an archive; name it .npz")
+            file.seek(0)
+            return _array(file, path.stat().st_size)
+    except BROKEN as error:
+        raise DataError(f"{label} is damaged, or not a NumPy file of plain numbers: {error}") from error
+
+
+def npz_names(path: Path) -> list[str]:
+    """Return the names of the arrays of an npz file; `DataError` where it is none."""
+    return list(_archive(path, ()))
+
+
+def npz_arrays(path: Path, names: Any) -> dict[str, Any]:
+    """Return the arrays of these names; `DataError` where one is damaged or holds no plain numbers."""
+    return {name: array for name, array in _archive(path, names).items() if name in names}
+
+
+def _archive(path: Path, wanted: Any) -> dict[str, Any]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            found: dict[str, Any] = {}
+            for info in archive.infolist():
+                name = info.filename.removesuffix(".npy")
+                found[name] = None
+                if name in wanted:
+                    with archive.open(info) as file:
+                        found[name] = _array(file, info.file_size)
+            return found
+    except BROKEN as error:
+        raise DataError(f"{path.name} is damaged, or not a NumPy file of plain numbers: {error}") from error
+
+
+def _array(file: IO[bytes], size: int) -> np.ndarray:
+    """Read an array of at most `size` bytes; refuse a header that promises more before memory is taken for it."""
+    shape, by_column, dtype = _header(file)
+    if dtype.hasobject:
+        raise ValueError("it holds objects")
+    count = math.prod(shape)
+    if dtype.itemsize == 0 or count * dtype.itemsize > size:
+        raise ValueError(f"its header says {count} numbers of {dtype.itemsize} bytes, the file has {size} bytes")
+    content = file.read(count * dtype.itemsize)
+    if len(content) < count * dtype.itemsize:
+        raise ValueError("it is truncated")
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if by_column else "C")
+
+
+def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"npy version {version} is unknown")
+    if version == (1, 0):
+        shape, by_column, dtype = np.lib.format.read_array_header_1_0(file)
+    else:
+        shape, by_column, dtype = np.lib.format.read_array_header_2_0(file)
+    if any(not isinstance(n, int) or n < 0 for n in shape):
+        raise ValueError(f"its header has shape {shape}")
+    return shape, by_column, dtype

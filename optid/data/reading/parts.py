@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from optid.data.reading.chunks import Block
-from optid.data.reading.tables import TABLES
 from optid.errors import DataError
+
+TABLES = 'pip install "optid[tables]"'
 
 SAMPLES = 1 << 20
 """Row groups of a Parquet file are taken together up to this many samples: smaller tasks do not pay."""

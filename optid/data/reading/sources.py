@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from optid.data.reading.chunks import Block
 from optid.data.reading.csvfile import open_csv
 from optid.data.reading.npyfile import NpyFile, open_npy
@@ -86,13 +84,7 @@ class _CsvBlocks:
     chunk: int
 
     def __call__(self, wanted: Sequence[str], clock: str | None) -> Iterator[Block]:
-        done = 0
-        for block in self.file.blocks(wanted, self.chunk):
-            yield {
-                name: np.array(cells) if name == clock else self.file.numbers(cells, name, done)
-                for name, cells in block.items()
-            }
-            done += len(block[wanted[0]])
+        return self.file.blocks(wanted, clock, None, self.chunk)
 
 
 @dataclass(frozen=True)
@@ -102,8 +94,9 @@ class _NpyBlocks:
     chunk: int
 
     def __call__(self, wanted: Sequence[str], _: str | None) -> Iterator[Block]:
+        places = {name: place for place, name in enumerate(self.names)}
         for block in self.file.blocks(self.chunk):
-            yield {name: block[:, self.names.index(name)] for name in wanted}
+            yield {name: block[:, places[name]] for name in wanted}
 
 
 @dataclass(frozen=True)

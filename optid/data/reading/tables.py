@@ -7,12 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import check_integers
 from optid.data.reading.csvfile import open_csv
+from optid.data.reading.frames import frame_names, index_name, load_frame, only_clock
+from optid.data.reading.npyfile import load_npy, npz_arrays, npz_names
 from optid.errors import DataError
-
-TABLES = 'pip install "optid[tables]"'
-MAT = 'pip install "optid[mat]"'
 
 
 @dataclass(frozen=True)
@@ -22,21 +20,24 @@ class Table:
     Attributes:
         label: name of the source, for messages.
         names: names of its columns or variables.
-        load: function of (columns wanted, those of them to leave as they are) returning {name: array}; numeric columns
-            are (N,) or (N, channels) of a real type, the columns to leave may hold text or dates.
+        load: function of (columns wanted, the clock among them, the column of experiments among them) returning
+            {name: array}; numeric columns are (N,) or (N, channels) of a real type, clock and experiments may be text
+            or dates.
+        index: name of a time index besides the columns, or of the only column of dates; None without one.
     """
 
     label: str
     names: list[str]
-    load: Callable[[Sequence[str], Sequence[str]], dict[str, Any]]
+    load: Callable[[Sequence[str], str | None, str | None], dict[str, Any]]
+    index: str | None = None
 
 
 def open_table(source: Any, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
     """Open a file, a frame, a dictionary of arrays or an array.
 
     Args:
-        source: path of a .csv, .txt, .tsv, .parquet, .mat, .npz or .npy file; pandas or polars frame; mapping
-            {name: array}; (N, channels) array.
+        source: path of a .csv, .txt, .tsv, .parquet, .mat, .npz or .npy file; pandas, polars or arrow table; xarray
+            data set; mapping {name: array}; (N, channels) array.
         columns: names of the columns of a source that has none (npy, array, CSV without a header).
         delimiter: character between the cells of a CSV file.
         decimal: decimal mark of a CSV file.
@@ -46,6 +47,8 @@ def open_table(source: Any, columns: Sequence[str] | None, delimiter: str, decim
     """
     if isinstance(source, str | Path):
         return _open_file(Path(source), columns, delimiter, decimal)
+    if hasattr(source, "data_vars") and hasattr(source, "coords"):  # an xarray data set
+        return _of_arrays("the data set", {name: variable.values for name, variable in source.variables.items()})
     if isinstance(source, Mapping):
         return _of_arrays("the dictionary", dict(source))
     if isinstance(source, np.ndarray):
@@ -59,8 +62,15 @@ def existing(path: Path) -> Path:
     Raises:
         DataError: no such file, a folder, or an empty file.
     """
-    if not path.is_file():
-        near = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:5] if path.parent.is_dir() else []
+    try:
+        is_file = path.is_file()
+    except (OSError, ValueError):  # a name too long, or with a null character
+        is_file = False
+    if not is_file:
+        try:
+            near = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:5] if path.parent.is_dir() else []
+        except (OSError, ValueError):
+            near = []
         raise DataError(f"no file {str(path)!r}." + (f" There: {', '.join(near)}." if near else ""))
     if path.stat().st_size == 0:
         raise DataError(f"{path.name} is empty (0 bytes).")
@@ -74,107 +84,59 @@ def _open_file(path: Path, columns: Sequence[str] | None, delimiter: str, decima
         ".txt": lambda: _csv_table(path, columns, delimiter, decimal),
         ".tsv": lambda: _csv_table(path, columns, "\t", decimal),
         ".parquet": lambda: _parquet_table(path),
-        ".mat": lambda: _of_arrays(path.name, _mat_variables(path)),
-        ".npz": lambda: _npz_table(path),
-        ".npy": lambda: _of_array(path.name, _numpy_file(path, None), columns),
+        ".mat": lambda: _mat_table(path),
+        ".npz": lambda: Table(path.name, npz_names(path), lambda wanted, clock, group: _raveled(
+            npz_arrays(path, wanted), clock, group)),
+        ".npy": lambda: _of_array(path.name, load_npy(path, path.name), columns),
     }
     if kind not in readers:
         raise DataError(f"{path.name}: unknown kind of file {kind!r}. Known: {', '.join(readers)}.")
     existing(path)
-    return readers[kind]()
+    try:
+        return readers[kind]()
+    except OSError as error:
+        raise DataError(f"{path.name} cannot be read: {error.strerror}.") from error
 
 
 def _csv_table(path: Path, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
     file = open_csv(path, columns, delimiter, decimal)
+    return Table(path.name, file.names, file.columns)
 
-    def load(wanted: Sequence[str], as_is: Sequence[str]) -> dict[str, Any]:
-        parts: dict[str, list] = {name: [] for name in wanted}
-        done = 0
-        for block in file.blocks(wanted, 65536):
-            for name, cells in block.items():
-                parts[name].append(np.array(cells) if name in as_is else file.numbers(cells, name, done))
-            done += len(next(iter(block.values())))
-        if not done:
-            raise DataError(f"{path.name} has a header but no rows.")
-        return {name: np.concatenate(part) for name, part in parts.items()}
 
-    return Table(path.name, file.names, load)
+def _mat_table(path: Path) -> Table:
+    from optid.data.reading.matlab import mat_names, mat_variables
+
+    names = mat_names(path)
+    if not names:
+        raise DataError(f"{path.name} holds no arrays of numbers.")
+    return Table(path.name, names, lambda wanted, clock, group: _raveled(mat_variables(path, wanted), clock, group))
 
 
 def _parquet_table(path: Path) -> Table:
-    try:
-        import pyarrow.parquet as engine
-    except ImportError:
-        return _parquet_by_polars(path)
-    try:
-        names = list(engine.read_schema(path).names)
-    except (ValueError, OSError) as error:  # pyarrow's own errors derive from these
-        raise DataError(f"{path.name} is not a Parquet file, or it is damaged: {error}") from error
-    return Table(path.name, names, lambda wanted, as_is: _load_frame(
-        path.name, engine.read_table(path, columns=list(wanted)), wanted, as_is))
+    from optid.data.reading.parquet import parquet_frame, parquet_schema
 
-
-def _parquet_by_polars(path: Path) -> Table:
-    try:
-        import polars
-    except ImportError:
-        raise DataError(f"{path.name}: reading Parquet needs pyarrow or polars: {TABLES}") from None
-    try:
-        names = list(polars.read_parquet_schema(path))
-    except polars.exceptions.PolarsError as error:
-        raise DataError(f"{path.name} is not a Parquet file, or it is damaged: {error}") from error
-    return Table(path.name, names, lambda wanted, as_is: _load_frame(
-        path.name, polars.read_parquet(path, columns=list(wanted)), wanted, as_is))
+    schema = parquet_schema(path)
+    return Table(path.name, list(schema), lambda wanted, clock, group: load_frame(
+        path.name, parquet_frame(path, wanted), wanted, clock, group), only_clock(schema))
 
 
 def _of_frame(label: str, frame: Any) -> Table:
-    import narwhals as nw
-
-    try:
-        names = [str(name) for name in nw.from_native(frame, eager_only=True).columns]
-    except TypeError:
-        raise DataError(
-            f"cannot read data from a {type(frame).__name__}: pass a path, a list of paths, a pandas or polars frame "
-            "(a lazy one after .collect()), a dictionary of arrays, or use Data(u=, y=)."
-        ) from None
-    return Table(label, names, lambda wanted, as_is: _load_frame(label, frame, wanted, as_is))
-
-
-def _load_frame(label: str, frame: Any, wanted: Sequence[str], as_is: Sequence[str]) -> dict[str, np.ndarray]:
-    import narwhals as nw
-
-    table = nw.from_native(frame, eager_only=True)
-    if len(table) == 0:
-        raise DataError(f"{label} has no rows.")
-    loaded = {}
-    for name in wanted:
-        column = table[name]
-        if name in as_is:
-            dates = isinstance(column.dtype, nw.Datetime) and column.null_count() == 0
-            # Through integers, because a time zone would make objects of the dates.
-            loaded[name] = column.dt.timestamp("ns").to_numpy().astype("M8[ns]") if dates else column.to_numpy()
-        elif not column.dtype.is_numeric():
-            raise DataError(
-                f"{label}: column {name!r} is of type {column.dtype}, numbers are needed. "
-                "Convert it first (pandas.to_numeric, polars cast)."
-            )
-        elif column.dtype.is_integer() and column.null_count() == 0:
-            loaded[name] = column.to_numpy()
-        else:
-            if column.dtype.is_integer() and column.null_count() < len(column):
-                check_integers(column.drop_nulls().to_numpy()[:, None], [f"{label}, column {name!r}"])
-            loaded[name] = column.cast(nw.Float64).to_numpy()
-    return loaded
+    names, table = frame_names(label, frame)
+    index = index_name(frame, names)
+    return Table(label, names, lambda wanted, clock, group: load_frame(label, table, wanted, clock, group),
+                 index or only_clock(table.schema))
 
 
 def _of_arrays(label: str, variables: Mapping[str, Any]) -> Table:
     if not variables:
         raise DataError(f"{label} holds no arrays.")
+    named = {str(name): value for name, value in variables.items()}
+    return Table(label, list(named), lambda wanted, clock, group: _raveled(
+        {name: named[name] for name in wanted}, clock, group))
 
-    def load(wanted: Sequence[str], as_is: Sequence[str]) -> dict[str, Any]:
-        return {name: np.ravel(variables[name]) if name in as_is else variables[name] for name in wanted}
 
-    return Table(label, [str(name) for name in variables], load)
+def _raveled(arrays: dict[str, Any], clock: str | None, group: str | None) -> dict[str, Any]:
+    return {name: np.ravel(array) if name in (clock, group) else array for name, array in arrays.items()}
 
 
 def _of_array(label: str, array: np.ndarray, columns: Sequence[str] | None) -> Table:
@@ -182,7 +144,8 @@ def _of_array(label: str, array: np.ndarray, columns: Sequence[str] | None) -> T
         raise DataError(f"{label} has shape {array.shape}; (samples, channels) is needed.")
     table = array[:, None] if array.ndim == 1 else array
     names = position_names(columns, table.shape[1], label)
-    return Table(label, names, lambda wanted, as_is: {name: table[:, names.index(name)] for name in wanted})
+    places = {name: place for place, name in enumerate(names)}
+    return Table(label, names, lambda wanted, clock, group: {name: table[:, places[name]] for name in wanted})
 
 
 def position_names(columns: Sequence[str] | None, width: int, label: str) -> list[str]:
@@ -194,69 +157,3 @@ def position_names(columns: Sequence[str] | None, width: int, label: str) -> lis
     if columns is not None and len(columns) != width:
         raise DataError(f"{label} has {width} columns, columns= names {len(columns)}.")
     return [str(c) for c in (range(width) if columns is None else columns)]
-
-
-def _npz_table(path: Path) -> Table:
-    def load(wanted: Sequence[str], as_is: Sequence[str]) -> dict[str, Any]:
-        arrays = _numpy_file(path, wanted)
-        return {name: np.ravel(arrays[name]) if name in as_is else arrays[name] for name in wanted}
-
-    return Table(path.name, list(_numpy_file(path, ())), load)
-
-
-def _numpy_file(path: Path, wanted: Sequence[str] | None) -> Any:
-    """Return the array of an npy file, or the wanted arrays of an npz file, None for those that are not wanted."""
-    from zipfile import BadZipFile
-
-    try:
-        with open(path, "rb") as file:  # opened here, so that it is closed when numpy gives up
-            content = np.load(file, allow_pickle=False)
-            if wanted is None and isinstance(content, np.ndarray):
-                return content
-            if wanted is None:
-                raise ValueError("it is an archive; name it .npz")
-            return {name: content[name] if name in wanted else None for name in content.files}
-    except (ValueError, OSError, EOFError, BadZipFile, AttributeError) as error:
-        raise DataError(f"{path.name} is damaged, or not a NumPy file of plain numbers: {error}") from error
-
-
-def _mat_variables(path: Path) -> dict[str, np.ndarray]:
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
-    try:
-        # With mat_dtype a double that MATLAB packed into bytes comes back as a double.
-        content = loadmat(path, mat_dtype=True)
-    except NotImplementedError:
-        return _hdf_variables(path)
-    except (ValueError, TypeError, OSError, MatReadError) as error:
-        raise DataError(f"{path.name} is damaged, or not a MAT file: {error}") from error
-    variables = {}
-    for name, value in content.items():
-        if not isinstance(value, np.ndarray) or name.startswith("__"):
-            continue
-        if value.dtype.names and value.size == 1:
-            variables |= {f"{name}.{part}": value.flat[0][part] for part in value.dtype.names}
-        else:
-            variables[name] = value
-    return variables
-
-
-def _hdf_variables(path: Path) -> dict[str, np.ndarray]:
-    try:
-        import h5py
-    except ImportError:
-        raise DataError(f"{path.name} is a MAT file of version 7.3, which needs h5py: {MAT}") from None
-    variables: dict[str, np.ndarray] = {}
-
-    def visit(name: str, item: Any) -> None:
-        is_text = item.attrs.get("MATLAB_class", b"") in (b"char", b"cell")
-        if isinstance(item, h5py.Dataset) and not name.startswith("#") and not is_text and item.dtype.kind in "iuf":
-            variables[name.replace("/", ".")] = item[()].T  # HDF5 stores MATLAB's columns as rows
-
-    try:
-        with h5py.File(path) as file:
-            file.visititems(visit)
-    except OSError as error:
-        raise DataError(f"{path.name} is damaged, or not a MAT file: {error}") from error
-    return variables

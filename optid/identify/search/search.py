@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import check_integer, one_of
-from optid.data.record import Data
+from optid.data.record import Data, not_a_record
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
@@ -102,8 +102,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     """
     clock = time.monotonic()
     if not isinstance(data, Data):
-        raise DataError(f"identify takes optid.Data, not {type(data).__name__}: a search fits a record many times, in "
-                        "memory")
+        raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
     if not budget > 0:
         raise StructureError(f"budget is a number of seconds above 0; got {budget!r}")
     for word in classes:

@@ -1,0 +1,92 @@
+"""Columns of pandas, polars and arrow tables, through narwhals; a time index counts as a column."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import check_integers
+from optid.data.reading.columns import TIME_NAMES
+from optid.errors import DataError
+
+
+def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
+    """Return the names of the columns and the table with its time index, if it has one, as another column.
+
+    Raises:
+        DataError: not a table in memory, or two columns of one name.
+    """
+    import narwhals as nw
+
+    try:
+        table = nw.from_native(frame, eager_only=True)
+        names = [str(name) for name in table.columns]
+    except TypeError:
+        raise DataError(
+            f"cannot read data from a {type(frame).__name__}: pass a path, a list of paths, a pandas or polars frame "
+            "(a lazy one after .collect()), a dictionary of arrays, or use Data(u=, y=)."
+        ) from None
+    except (ValueError, nw.exceptions.NarwhalsError) as error:
+        raise DataError(f"{label} cannot be read: {error}") from error
+    if len(set(names)) < len(names):
+        double = next(name for k, name in enumerate(names) if name in names[:k])
+        raise DataError(f"{label} has two columns named {double!r}: rename one.")
+    if names != list(table.columns):  # names that are no text
+        frame = frame.rename(columns=dict(zip(table.columns, names)))
+        table = nw.from_native(frame, eager_only=True)
+    index = index_name(frame, names)
+    if index is not None:
+        values = frame.index
+        # A series of the same index joins the frame row by row, whatever the index holds twice.
+        table = nw.from_native(frame.assign(**{index: values.to_series(index=values).array}), eager_only=True)
+    return names, table
+
+
+def index_name(frame: Any, names: Sequence[str]) -> str | None:
+    """Return the name by which the time index of a pandas frame is read; None where its index is no time."""
+    index = getattr(frame, "index", None)
+    kind = getattr(getattr(index, "dtype", None), "kind", "")
+    name = getattr(index, "name", None)
+    if kind not in ("M", "m") and not (str(name).lower() in TIME_NAMES and kind in ("i", "u", "f")):
+        return None
+    called = "index" if name is None else str(name)
+    return called if called not in names else f"{called} (index)"
+
+
+def only_clock(schema: Mapping[str, Any]) -> str | None:
+    """Return the only column of dates or durations, None where there is none or more than one."""
+    clocks = [str(name) for name, kind in schema.items() if str(kind).partition("(")[0] in ("Datetime", "Duration")]
+    return clocks[0] if len(clocks) == 1 else None
+
+
+def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None, group: str | None
+               ) -> dict[str, np.ndarray]:
+    """Return columns as (N,) arrays of a real type; clock and group may be text or dates.
+
+    Raises:
+        DataError: no rows, a column that does not hold numbers, or integers beyond the digits of float64.
+    """
+    import narwhals as nw
+
+    table = nw.from_native(frame, eager_only=True)
+    if len(table) == 0:
+        raise DataError(f"{label} has no rows.")
+    loaded = {}
+    for name in wanted:
+        column = table[name]
+        if name in (clock, group):
+            dates = isinstance(column.dtype, nw.Datetime) and column.null_count() == 0
+            # Through integers, because a time zone would make objects of the dates.
+            loaded[name] = column.dt.timestamp("ns").to_numpy().astype("M8[ns]") if dates else column.to_numpy()
+        elif not column.dtype.is_numeric():
+            raise DataError(
+                f"{label}: column {name!r} is of type {column.dtype}, numbers are needed. "
+                "Convert it first (pandas.to_numeric, polars cast)."
+            )
+        elif column.dtype.is_integer() and column.null_count() == 0:
+            loaded[name] = column.to_numpy()
+        else:
+            if column.dtype.is_integer() and column.null_count() < len(column):
+                check_integers(column.drop_nulls().to_numpy()[:, None], [f"{label}, column {name!r}"])
+            loaded[name] = column.cast(nw.Float64).to_numpy()
+    return loaded
