@@ -1,4 +1,4 @@
-"""kill -9 at random moments of a 300-cell study, also inside a write, then resume; other ends of a run.
+"""kill -9 at random moments of a 1,500-cell study, also inside a write, then resume; other ends of a run.
 
     python benchmarks/studies/kill.py [--kills 20] [--seed 0] [--workers 2]
 
@@ -31,8 +31,8 @@ from optid.studies.grid import cells
 from optid.studies.storage.store import finished, read_rows
 
 STUDY = """
-name = "three hundred cells"
-seeds = 50
+name = "fifteen hundred cells"
+seeds = 250
 solvers = ["gauss_newton", "ipopt", "uno"]
 [[data]]
 name = "dead zone"
@@ -177,7 +177,7 @@ def full_disk(file: Path, wanted: set, workers: int) -> bool:
     """Run on a disk with room for some of the rows; then there is room."""
     disk = file.with_name("disk")
     disk.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", disk], capture_output=True)
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", disk], capture_output=True)
     try:
         def limit() -> None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -190,7 +190,7 @@ def full_disk(file: Path, wanted: set, workers: int) -> bool:
         print("full disk:", " ".join(done.stderr.replace("│", " ").split())[:300])
         for name in disk.glob("full.sqlite*"):  # the pending writes with it
             shutil.copyfile(name, roomy.with_name(name.name.replace("full", "roomy")))
-        where = "a tmpfs of 400 kB" if mounted.returncode == 0 else "a limit of the file size"
+        where = "a tmpfs of 1 MB" if mounted.returncode == 0 else "a limit of the file size"
         return completed(f"full disk ({where}, exit code {done.returncode})", file, roomy, workers, seen,
                          wanted) and 0 < len(seen) < len(wanted) and done.returncode != 0
     finally:

@@ -130,7 +130,7 @@ class Study:
             path: of the file; relative data files are looked for beside it.
 
         Raises:
-            StudyError: every problem with its line and column; data that cannot be read count as such.
+            StudyError: every problem with its key; data that cannot be read count as such.
         """
         from optid.studies.definition.study_file import read_study
 

@@ -1,8 +1,11 @@
 """From what a user writes, in a file or in Python, to the entries of a study; every problem is noted, none stops it."""
 
 import inspect
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import PurePath
 from typing import Any
 
@@ -13,12 +16,11 @@ from optid.errors import OptidError, nearest
 from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
-from optid.studies.definition.positions import Path
-from optid.studies.definition.problems import Problems, one_or_several, shown
-from optid.studies.sources.systems import SYSTEMS
+from optid.studies.definition.problems import Path, Problems, items, one_or_several, shown
+from optid.studies.sources.systems import SYSTEMS, simulate
 
 AUTO, ALL = "auto", "all"
-MOST_SEEDS = 1_000_000
+MOST_SEEDS, MOST_FORMULATIONS = 1_000_000, 10_000
 """A study has no more cells than that."""
 
 READING = ("inputs", "outputs", "dt", "time", "experiment", "columns", "delimiter", "decimal")
@@ -34,7 +36,7 @@ _SETTINGS = tuple(p.name for p in inspect.signature(solve).parameters.values() i
 
 _KINDS: tuple[tuple[type | tuple[type, ...], str, str], ...] = (
     (bool, "bool", "true or false"),
-    (int, "int float", "a whole number"),
+    (int, "int float", "an integer"),
     (float, "float", "a number"),
     (str, "str", "a text"),
     ((list, tuple), "Sequence list tuple", "a list"),
@@ -51,7 +53,7 @@ def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
     """
     for key in raw:
         if key not in _TOP:
-            problems.add((key,), _unknown(key, _TOP), value=False)
+            problems.add((key,), _unknown(key, _TOP))
     found: dict[str, Any] = {}
     if "name" in raw:
         found["name"] = problems.text(("name",), raw["name"])
@@ -59,7 +61,7 @@ def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
         if key in raw:
             found[key] = problems.number((key,), raw[key], what, 0.0)
     if "holdout" in raw:
-        found["holdout"] = problems.number(("holdout",), raw["holdout"], "a share from 0 and below 1", 0.0, 1.0,
+        found["holdout"] = problems.number(("holdout",), raw["holdout"], "a share of at least 0 and below 1", 0.0, 1.0,
                                            closed=True)
     if "repetitions" in raw:
         found["repetitions"] = problems.whole(("repetitions",), raw["repetitions"], 1)
@@ -70,10 +72,9 @@ def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
     if "seeds" in raw:
         found["seeds"] = _seeds(raw["seeds"], problems)
     data = tuple(_data(("data", i), entry, problems) for i, entry in enumerate(_tables("data", raw, problems)))
-    names = [entry.name for entry in data]
     found["data"] = data
-    found["formulations"] = tuple(_formulation(("formulation", i), entry, names, problems)
-                                  for i, entry in enumerate(_tables("formulation", raw, problems)))
+    found["formulations"] = tuple(one for i, entry in enumerate(_tables("formulation", raw, problems))
+                                  for one in _formulations(("formulation", i), entry, data, problems))
     found["solvers"] = tuple(_solvers(raw, problems))
     for axis, key in (("data", "data"), ("formulations", "formulation"), ("solvers", "solver")):
         _distinct(key, found[axis], raw, problems)
@@ -84,12 +85,12 @@ def _tables(key: str, raw: Mapping[str, Any], problems: Problems) -> list[Mappin
     entries = raw.get(key, [])
     if not entries and key != "solver":
         if not problems.concern(key):
-            problems.add((), f"there is no [[{key}]]: a study needs at least one", value=False)
+            problems.add((), f"there is no [[{key}]]: a study needs at least one")
         return []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table of its own, [[{key}]]"
         listed = ", or at the top solvers = \"auto\"" if key == "solver" else ""
-        problems.add((key,), f"{key} is written as {how}{listed}", value=not isinstance(entries, Mapping))
+        problems.add((key,), f"{key} is written as {how}{listed}")
         return []
     return entries
 
@@ -99,11 +100,10 @@ def _data(path: Path, raw: Mapping[str, Any], problems: Problems) -> DataEntry:
     in_memory = isinstance(record, Data)
     for key in raw:
         if key not in _DATA and not (key == "record" and in_memory):
-            problems.add((*path, key), _unknown(key, _DATA), value=False)
+            problems.add((*path, key), _unknown(key, _DATA))
     sources = [key for key in ("file", "system") if key in raw] + ["record"] * in_memory
     if len(sources) != 1:
-        problems.add(path, f"[[data]] needs {'a file or a system' if not sources else 'only one of file and system'}",
-                     value=False)
+        problems.add(path, f"[[data]] needs {'a file or a system' if not sources else 'only one of file and system'}")
     files = problems.texts((*path, "file"), raw["file"]) if "file" in raw else ()
     system = problems.text((*path, "system"), raw["system"]) if "system" in raw else None
     if system is not None and system not in SYSTEMS:
@@ -111,11 +111,10 @@ def _data(path: Path, raw: Mapping[str, Any], problems: Problems) -> DataEntry:
     for key in ("samples", "noise") if system is None and sources else READING if "file" not in raw else ():
         if key in raw:
             which = "a simulated system" if key in ("samples", "noise") else "a file"
-            problems.add((*path, key), f"{key} is for {which}, which this entry is not", value=False)
-    samples = [problems.whole((*path, "samples", i), value, 1)
-               for i, value in enumerate(one_or_several(raw.get("samples", [])))]
-    noise = [problems.number((*path, "noise", i), value, "a number from 0, relative to the noise-free output", 0.0,
-                             closed=True) for i, value in enumerate(one_or_several(raw.get("noise", [])))]
+            problems.add((*path, key), f"{key} is for {which}, which this entry is not")
+    samples = [problems.whole(at, value, 1) for at, value in items((*path, "samples"), raw.get("samples", []))]
+    noise = [problems.number(at, value, "a number of at least 0, relative to the noise-free output", 0.0, closed=True)
+             for at, value in items((*path, "noise"), raw.get("noise", []))]
     default = system or (PurePath(files[0]).stem if files else getattr(record, "name", "") or "record")
     return DataEntry(
         _label(path, raw, default, problems), files, system, record if in_memory else None,
@@ -140,12 +139,63 @@ def _reading(path: Path, value: Any, problems: Problems) -> Any:
     return problems.text(path, value)
 
 
+def _formulations(path: Path, raw: Mapping[str, Any], data: Sequence[DataEntry], problems: Problems
+                  ) -> list[FormulationEntry]:
+    """The formulations of one entry: one, or the grid over its arguments that are lists of values."""
+    known, name, names = registered(FORMULATIONS), raw.get("formulation"), [entry.name for entry in data]
+    axes: dict[str, list[Any]] = {}
+    if isinstance(name, str) and name in known:
+        try:
+            parameters = inspect.signature(known[name].load(), eval_str=True).parameters
+        except Exception:  # told below
+            parameters = {}
+        used = [entry for entry in data if entry.name in one_or_several(raw.get("data", names))]
+        axes = {key: list(value) for key, value in raw.items()
+                if key in parameters and isinstance(value, list | tuple) and value
+                and _is_axis(parameters[key].annotation, value, used)}
+    if (count := math.prod(map(len, axes.values()))) > MOST_FORMULATIONS:
+        problems.add(path, f"{', '.join(axes)} form a grid of {count:,} formulations; at most {MOST_FORMULATIONS:,} "
+                     "are taken")
+        return []
+    found = []
+    for values in product(*axes.values()):
+        point = dict(zip(axes, values))
+        one = _formulation(path, {**raw, **point}, names, problems)
+        found.append(replace(one, name=", ".join([one.name, *(
+            f"{key} = {'+'.join(map(str, one_or_several(value))) or 'none'}" for key, value in point.items())])))
+    return found
+
+
+def _is_axis(annotation: Any, value: Sequence[Any], data: Sequence[DataEntry]) -> bool:
+    """Whether a list holds several values of an argument: the argument takes no list, or a list of lists is given.
+
+    Arguments that take one value or one per input are per input where the data have several inputs.
+    """
+    if all(isinstance(one, list | tuple) for one in value):
+        return True
+    text = annotation if isinstance(annotation, str) else str(annotation)
+    outside = set(re.findall(r"\w+", re.sub(r"\[[^]]*]", "", getattr(annotation, "__name__", "") or text)))
+    if "Sequence" in outside or outside & {"list", "tuple", "Any"}:
+        scalar = bool(outside & {"int", "float", "str"})
+        return scalar and len(value) > 1 and bool(data) and all(_has_one_input(entry) for entry in data)
+    return bool(outside & {"int", "float", "str", "bool"})
+
+
+def _has_one_input(entry: DataEntry) -> bool:
+    """Whether the record of an entry is known to have a single input."""
+    if entry.record is not None:
+        return entry.record.m == 1
+    if entry.system is not None:
+        return entry.system in SYSTEMS and simulate(entry.system, 10)[0].m == 1
+    return "inputs" in entry.options and len(entry.options["inputs"]) == 1
+
+
 def _formulation(path: Path, raw: Mapping[str, Any], data: Sequence[str], problems: Problems) -> FormulationEntry:
     name = problems.text((*path, "formulation"), raw["formulation"]) if "formulation" in raw else None
     known = registered(FORMULATIONS)
     options = {key: value for key, value in raw.items() if key not in _FORMULATION}
     if "formulation" not in raw:
-        problems.add(path, "[[formulation]] needs formulation = \"NAME\" (optid formulations lists them)", value=False)
+        problems.add(path, "[[formulation]] needs formulation = \"NAME\" (optid formulations lists them)")
     elif name is not None and name not in known:
         problems.add((*path, "formulation"), f"no formulation is called {name!r}. {nearest(name, known)}")
     elif name is not None:
@@ -187,21 +237,20 @@ def _arguments(path: Path, name: str, function: Callable[..., Any], options: Map
     if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         return
     if constrained and "constraints" not in takes:
-        problems.add((*path, "constraints"), f"formulation {name!r} takes no constraints", value=False)
+        problems.add((*path, "constraints"), f"formulation {name!r} takes no constraints")
     for key, value in options.items():
         if key not in takes:
             known = [*takes, *_FORMULATION]
-            problems.add((*path, key), f"formulation {name!r} takes no argument {key!r}. {nearest(key, known)}",
-                         value=False)
+            problems.add((*path, key), f"formulation {name!r} takes no argument {key!r}. {nearest(key, known)}")
             continue
         if (wanted := _misfit(takes[key].annotation, value)) is not None:
-            problems.add((*path, key), f"{key} is {wanted}; {shown(value)} is not")
+            problems.add((*path, key), f"must be {wanted}; {shown(value)} is not")
         elif "basis" in key:
-            for i, text in enumerate(one_or_several(value)):
-                _basis((*path, key, i), text, problems)
+            for at, text in items((*path, key), value):
+                _basis(at, text, problems)
     missing = [key for key, p in takes.items() if p.default is p.empty and key not in options]
     if missing:
-        problems.add(path, f"formulation {name!r} needs {', '.join(missing)}", value=False)
+        problems.add(path, f"formulation {name!r} needs {', '.join(missing)}")
 
 
 def _misfit(annotation: Any, value: Any) -> str | None:
@@ -222,7 +271,7 @@ def _misfit(annotation: Any, value: Any) -> str | None:
 
 def _basis(path: Path, text: Any, problems: Problems) -> None:
     if not isinstance(text, str):
-        problems.add(path, f"a basis is a text such as \"triangular:10\"; {shown(text)} is not")
+        problems.add(path, f"must be a text such as \"triangular:10\"; {shown(text)} is not")
         return
     if text == "none":  # an output that is not fed back
         return
@@ -243,8 +292,7 @@ def _solvers(raw: Mapping[str, Any], problems: Problems) -> list[SolverEntry]:
     for i, entry in enumerate(_tables("solver", raw, problems)):
         found.append(_solver_entry(("solver", i), entry, problems))
     if "solvers" not in raw and not raw.get("solver") and not problems.concern("solver"):
-        problems.add((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]",
-                     value=False)
+        problems.add((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")
     return found
 
 
@@ -252,21 +300,20 @@ def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> Sol
     for key in raw:
         if key not in _SOLVER:
             problems.add((*path, key), _unknown(key, _SOLVER) + " Native options of the solver go into "
-                         "options = { ... }.", value=False)
+                         "options = { ... }.")
     word = problems.text((*path, "solver"), raw["solver"]) if "solver" in raw else None
     if "solver" not in raw:
-        problems.add(path, "[[solver]] needs solver = \"NAME\" (optid solvers lists them)", value=False)
+        problems.add(path, "[[solver]] needs solver = \"NAME\" (optid solvers lists them)")
     name = word and _solver((*path, "solver"), word, problems)
     options = raw.get("options", {})
     if not isinstance(options, Mapping):
-        problems.add((*path, "options"), f"options is a table, {{ key = value }}; {shown(options)} is not")
+        problems.add((*path, "options"), f"must be a table, {{ key = value }}; {shown(options)} is not")
         options = {}
     for key in options:
         if key in _SETTINGS:
             where = f"write {key} = ... beside solver" if key == "accuracy" else "it is a key of the study" \
                 if key in _TOP else "the study sets it for every solver"
-            problems.add((*path, "options", key), f"options are the solver's own, and {key!r} is none: {where}",
-                         value=False)
+            problems.add((*path, "options", key), f"options are the solver's own, and {key!r} is none: {where}")
     problems.writable((*path, "options"), options)
     accuracy = _accuracies((*path, "accuracy"), raw["accuracy"], problems) if "accuracy" in raw else ()
     return SolverEntry(_label(path, raw, word or "solver", problems), name or "", accuracy, dict(options))
@@ -281,9 +328,8 @@ def _solver(path: Path, word: str, problems: Problems, *more: str) -> str:
 
 
 def _accuracies(path: Path, value: Any, problems: Problems) -> tuple[float, ...]:
-    several = one_or_several(value)
-    numbers = [problems.number((*path, i), one, "a number between 0 and 1", 0.0, 1.0) for i, one in enumerate(several)]
-    if not several:
+    numbers = [problems.number(at, one, "a number between 0 and 1", 0.0, 1.0) for at, one in items(path, value)]
+    if not numbers and not one_or_several(value):
         problems.add(path, "accuracy is empty; give at least one number")
     return problems.once(path, numbers)
 
@@ -312,8 +358,7 @@ def _distinct(key: str, entries: Sequence[Any], raw: Mapping[str, Any], problems
     for i, entry in enumerate(entries):
         if entry.name in seen:
             path: Path = ("solvers", i) if i < listed else (key, i - listed)
-            problems.add(path, f"two entries are called {entry.name!r}; give this one another name = \"...\"",
-                         value=False)
+            problems.add(path, f"two entries are called {entry.name!r}; give this one another name = \"...\"")
         seen.add(entry.name)
 
 

@@ -10,7 +10,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from optid.errors import StudyError
-from optid.studies.definition.positions import Path, Positions
+
+
+class Label(str):
+    """The name of an entry in a path, in place of its number."""
+
+
+Path = tuple[str | int, ...]
+"""Keys that lead to a value; positions in lists are counted from 0, entries may stand with their labels."""
 
 T = TypeVar("T")
 
@@ -19,45 +26,40 @@ LARGEST = 2**62  # whole numbers from here on have no place in the database
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong.
-
-    Attributes:
-        path: keys that lead to it; positions in lists are counted from 0.
-        text: what is wrong and what would be right.
-        value: whether it is the value that is wrong, rather than the key.
-    """
+    """One thing that is wrong: the keys that lead to it, and what would be right."""
 
     path: Path
     text: str
-    value: bool = False
 
 
 class Problems(list[Problem]):
     """All of them, in the order in which they are found."""
 
-    def add(self, path: Path, text: str, value: bool = True) -> None:
+    def add(self, path: Path, text: str) -> None:
         """Note one problem."""
-        self.append(Problem(path, text, value))
+        self.append(Problem(path, text))
 
     def concern(self, key: str) -> bool:
         """Return whether something is wrong below a key at the top."""
         return any(problem.path[:1] == (key,) for problem in self)
 
-    def told(self, label: str, positions: Positions | None = None) -> None:
-        """Raise what was found, with line and column where the text is known.
+    def told(self, label: str) -> None:
+        """Raise what was found, what is wrong at several keys once with their number.
 
         Raises:
             StudyError: one line per problem.
         """
         if not self:
             return
-        if positions is None:
-            lines = [f"{written(problem.path)}: {problem.text}" if problem.path else problem.text for problem in self]
-        else:
-            places = sorted(((positions.of(problem.path, problem.value), problem.text) for problem in self),
-                            key=lambda found: found[0])
-            lines = [f"line {line}, column {column}: {text}" for (line, column), text in places]
-        lines = list(dict.fromkeys(lines))
+        places: dict[str, list[str]] = {}
+        for problem in self:
+            found = places.setdefault(problem.text, [])
+            if (place := written(problem.path)) not in found:
+                found.append(place)
+        lines = []
+        for text, found in places.items():
+            where = found[0] + (f" and {len(found) - 1} more" if len(found) > 1 else "")
+            lines.append(f"{where}: {text}" if where else text)
         count = f"{len(lines)} problems" if len(lines) > 1 else "a problem"
         raise StudyError(f"{label} has {count}:" + "".join(f"\n  {line}" for line in lines))
 
@@ -67,7 +69,7 @@ class Problems(list[Problem]):
         """Return a text that is not empty, or note a problem."""
         if isinstance(value, str) and value.strip():
             return value
-        self.add(path, f"{path[-1]} is a text; {shown(value)} is not")
+        self.add(path, f"must be a text; {shown(value)} is not")
         return None
 
     def texts(self, path: Path, value: Any) -> tuple[str, ...]:
@@ -76,14 +78,14 @@ class Problems(list[Problem]):
             return (value,)
         if isinstance(value, list | tuple) and all(isinstance(entry, str) and entry.strip() for entry in value):
             return tuple(value)
-        self.add(path, f"{path[-1]} is a text or a list of texts; {shown(value)} is not")
+        self.add(path, f"must be a text or a list of texts; {shown(value)} is not")
         return ()
 
     def flag(self, path: Path, value: Any) -> bool | None:
         """Return true or false, or note a problem."""
         if isinstance(value, bool):
             return value
-        self.add(path, f"{path[-1]} is true or false; {shown(value)} is not")
+        self.add(path, f"must be true or false; {shown(value)} is not")
         return None
 
     def number(self, path: Path, value: Any, what: str, low: float, high: float = np.inf, *, closed: bool = False
@@ -92,7 +94,7 @@ class Problems(list[Problem]):
         fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
         if fits and (low < value < high or (closed and value == low)):
             return float(value)
-        self.add(path, f"{_last_word(path)} is {what}; {shown(value)} is not")
+        self.add(path, f"must be {what}; {shown(value)} is not")
         return None
 
     def whole(self, path: Path, value: Any, low: int) -> int | None:
@@ -100,10 +102,11 @@ class Problems(list[Problem]):
         if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
             if value < LARGEST:
                 return int(value)
-            self.add(path, f"{_last_word(path)} is too large: it must be below 2**62; {shown(value)} is not")
+            self.add(path, f"must be below 2**62; {shown(value)} is not")
             return None
         whole = isinstance(value, float) and value.is_integer() and value >= low
-        self.add(path, f"{_last_word(path)} is a whole number from {low}; "
+        what = "a positive integer" if low == 1 else f"an integer of at least {low}"
+        self.add(path, f"must be {what}; "
                  + (f"write {value:.0f} instead of {value}" if whole else f"{shown(value)} is not"))
         return None
 
@@ -137,6 +140,12 @@ def one_or_several(value: Any) -> Sequence[Any]:
     return list(value) if isinstance(value, list | tuple | range | np.ndarray) else [value]
 
 
+def items(path: Path, value: Any) -> list[tuple[Path, Any]]:
+    """Return the entries of a list with their paths; anything else with the path itself."""
+    several = isinstance(value, list | tuple | range | np.ndarray)
+    return [((*path, i) if several else path, one) for i, one in enumerate(one_or_several(value))]
+
+
 def shown(value: Any) -> str:
     """Write a value as people call it."""
     if isinstance(value, str):
@@ -152,11 +161,13 @@ def shown(value: Any) -> str:
 
 
 def written(path: Path) -> str:
-    """Write a path as Python does: data[0].noise, formulations[1].na."""
-    axes = {"formulation": "formulations", "solver": "solvers"}
+    """Write a path as in a study file: data[0].noise, formulation['relaxed'].na."""
     text = ""
-    for part in (axes.get(str(path[0]), path[0]), *path[1:]):
-        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else part
+    for part in path:
+        if isinstance(part, int | Label):
+            text += f"[{part!r}]"
+        else:
+            text += f".{part}" if text else part
     return text
 
 

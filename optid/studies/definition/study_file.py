@@ -1,4 +1,4 @@
-"""Study files: TOML, with the line and column of everything that is wrong."""
+"""Study files: TOML, with the key of everything that is wrong."""
 
 import re
 import tomllib
@@ -7,7 +7,6 @@ from pathlib import Path
 from optid.errors import StudyError
 from optid.studies.definition.description import Study
 from optid.studies.definition.entries import read
-from optid.studies.definition.positions import locate
 from optid.studies.definition.problems import Problems
 from optid.studies.definition.trial import Records, note_impossible, note_unreadable, note_wrong_options
 
@@ -36,10 +35,9 @@ def read_study(path: Path) -> Study:
     except OSError as error:
         raise StudyError(f"study file {path} cannot be read: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
-        before = path.read_bytes()[: error.start]
-        line, column = before.count(b"\n") + 1, error.start - before.rfind(b"\n")
-        raise StudyError(f"{path} has a problem:\n  line {line}, column {column}: this is not UTF-8, in which a study "
-                         "file is written") from None
+        line = path.read_bytes()[: error.start].count(b"\n") + 1
+        raise StudyError(f"{path} has a problem:\n  line {line}: this is not UTF-8, in which a study file is written"
+                         ) from None
     return parse_study(text.removeprefix("\ufeff"), path.parent, str(path), title=path.stem)
 
 
@@ -55,18 +53,19 @@ def parse_study(text: str, folder: Path, label: str, title: str = "study") -> St
     text = text.replace("\r\n", "\n")
     try:
         raw = tomllib.loads(text)
+    except RecursionError:
+        raise StudyError(f"{label} has a problem:\n  lists or tables are nested too deeply to be a study") from None
     except ValueError as error:  # what is not TOML, and a whole number of so many digits that Python does not read it
         raise StudyError(f"{label} has a problem:\n  {_syntax(str(error), text)}") from None
-    positions, problems = locate(text), Problems()
+    problems = Problems()
     found = {"name": title, **read(raw, problems)}
     records = Records(folder)
     if "data" in raw:
         note_unreadable(found["data"], records, problems, wrong={problem.path[:2] for problem in problems})
     if not problems:
         note_impossible(found["data"], found["formulations"], records, problems)
-        note_wrong_options(found["data"], found["formulations"], found["solvers"], records, problems,
-                           len(found["solvers"]) - len(raw.get("solver", [])))
-    problems.told(label, positions)
+        note_wrong_options(found["data"], found["formulations"], found["solvers"], records, problems)
+    problems.told(label)
     study = Study(**found, folder=folder)
     object.__setattr__(study, "data_checked", True)
     return study

@@ -14,7 +14,7 @@ from optid.registry import formulation as look_up
 from optid.registry import named_constraint
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
-from optid.studies.definition.problems import Problems
+from optid.studies.definition.problems import Label, Problems
 from optid.studies.sources.systems import simulate, system
 
 SHORT = 300
@@ -118,13 +118,13 @@ def note_impossible(data: Sequence[DataEntry], formulations: Sequence[Formulatio
         records: where data are read.
         problems: collects what is wrong.
     """
-    for i, entry in enumerate(formulations):
+    for entry in formulations:
         records_of = [one for one in data if not entry.data or one.name in entry.data]
         if not all(_refused(entry, records.beginning(one)) for one in records_of):
             continue
         reasons = [_refused(entry, records.beginning(one, np.inf)) for one in records_of]  # was it too short?
         if reasons and all(reasons):
-            problems.add(("formulation", i), f"{entry.name!r} cannot be posed: {reasons[0]}", value=False)
+            problems.add(("formulation", Label(entry.name)), f"it cannot be posed: {reasons[0]}")
 
 
 def _refused(entry: FormulationEntry, record: Data) -> str:
@@ -149,7 +149,7 @@ def _posed(entry: FormulationEntry, record: Data) -> Any:
 
 
 def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry],
-                       solvers: Sequence[SolverEntry], records: Records, problems: Problems, listed: int = 0) -> None:
+                       solvers: Sequence[SolverEntry], records: Records, problems: Problems) -> None:
     """Note the options with which a solver fails on a short record that it solves without them.
 
     Args:
@@ -158,16 +158,15 @@ def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[Formula
         solvers: entries of the study.
         records: where data are read.
         problems: collects what is wrong.
-        listed: so many solvers come first that are no [[solver]] of the file.
     """
-    for i, entry in enumerate(solvers):
+    for entry in solvers:
         if not entry.options:
             continue
         programme = next(_solved_without(entry.solver, data, formulations, records), None)
         if programme is None or not (all_fail := _failure(programme, entry.solver, entry.options)):
             continue
         alone = {key: _failure(programme, entry.solver, {key: value}) for key, value in entry.options.items()}
-        path = ("solver", i - listed, "options")
+        path = ("solver", Label(entry.name), "options")
         for key, why in alone.items():
             if why:
                 problems.add((*path, key), f"{key} makes {entry.solver} fail where it succeeds without: {why}")
