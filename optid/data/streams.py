@@ -141,7 +141,7 @@ class Stream(Ports):
         return self.reduced(surveyed, partial(joined, self._channels), available_threads(None))
 
 
-def open_stream(
+def open_stream(  # noqa: D417 - the others stand with `read`
     source: Any,
     inputs: Wanted = None,
     outputs: Wanted = None,
@@ -160,7 +160,9 @@ def open_stream(
 ) -> Stream:
     """Open a record that need not fit into memory; nothing but headers is read yet.
 
-    Arguments as in `optid.data.readers.read`, besides:
+    The arguments that are not listed are those of `optid.data.readers.read`.
+
+    Args:
         source: path of a .csv, .txt, .parquet or .npy file; {channel: path of an .npy file (N,)}; a folder whose
             .parquet files, in the order of their names (2 before 10), are one experiment; a Dask data frame, a Dask
             array (N, channels) or {channel: Dask array (N,)}; or a list of these, one per experiment. An npy file holds

@@ -351,8 +351,8 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     findings = findings + examine_figures(figures)
     prices = price_constraints(outcome.program, outcome.solution)
     earlier = price_earlier_steps(outcome.constrained, outcome.program)
-    log.info("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
-             time.perf_counter() - started)
+    log.debug("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
+              time.perf_counter() - started)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
                time.perf_counter() - started, {**settings, "solver": solver})
 

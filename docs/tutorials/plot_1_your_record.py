@@ -1,0 +1,34 @@
+"""
+Your own record
+===============
+
+From columns of numbers to a model that you can trust.
+"""
+
+# %%
+# A record is inputs, outputs and a sampling time; NaN means missing. Here a tank whose valve saturates.
+import numpy as np
+
+import optid
+
+rng = np.random.default_rng(1)
+valve = np.repeat(rng.uniform(0, 1, 160), 5)
+level = np.zeros(valve.size)
+for k in range(1, valve.size):
+    level[k] = 0.9 * level[k - 1] + 0.4 * np.tanh(2 * valve[k - 1]) + 0.01 * rng.standard_normal()
+data = optid.Data(valve, level, 1.0, ["valve"], ["level"], ["-"], ["m"], name="tank")
+data
+
+# %%
+# Keep the last part for validation, and let optid look for the structure.
+train, test = data.split(0.7)
+found = optid.identify(train, budget=10, workers=1)
+found
+
+# %%
+# Validate on the part that was held out.
+found.fit.validate(test)
+
+# %%
+# A figure for a paper; ``found.report("tank.html", test)`` writes the interactive page.
+figure = found.plot(test)
