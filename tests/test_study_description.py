@@ -215,7 +215,8 @@ def test_a_study_without_a_title_is_called_as_its_file(tmp_path):
 
 @pytest.mark.parametrize("text, key, words", [
     (SMALL.replace("nb = 1", "nb = -1", 1), "formulation['arx']", "nb of input 'current' must be a positive integer"),
-    (SMALL.replace("nb = 1", 'nb = 1\nconstraints = "saturation:5,1"', 1), "formulation['arx + saturation:5,1']", "cannot be posed: "),
+    (SMALL.replace("nb = 1", 'nb = 1\nconstraints = "saturation:5,1"', 1),
+     "formulation['arx + saturation:5,1']", "cannot be posed: "),
     (SMALL.replace("[[data]]", "[data]"), "data", "written as [[data]], with two brackets"),
     (SMALL.replace("[[data]]", "[[datas]]"), "datas", "Did you mean 'data'"),
     (SMALL.replace('solvers = ["clarabel", "gauss_newton"]', 'solver = "clarabel"'), "solver", 'solvers = "auto"'),
@@ -236,7 +237,8 @@ options = {{ max_iter = {}, {} }}
 
 @pytest.mark.parametrize("written, key, words", [
     (("50", "max_itr = 3"), "max_itr", "max_itr makes clarabel fail where it succeeds without: TypeError"),
-    (('"many"', "equilibrate_enable = true"), "max_iter", "max_iter makes clarabel fail where it succeeds without: TypeError"),
+    (('"many"', "equilibrate_enable = true"), "max_iter",
+     "max_iter makes clarabel fail where it succeeds without: TypeError"),
 ])
 def test_options_that_a_solver_does_not_take_are_named(written, key, words):
     (told,) = problems(OPTIONS.format(*written))
@@ -289,11 +291,12 @@ def test_a_broken_formulation_of_a_third_party_is_told(monkeypatch):
     monkeypatch.setattr("optid.studies.definition.entries.registered",
                         lambda group: known if group == FORMULATIONS else {})
     found = problems(SMALL.replace('"arx"', '"mine"').replace('constraints = ["monotone:increasing"]', ""))
-    assert found == ["formulation[0].formulation: formulation 'mine' cannot be loaded: ModuleNotFoundError: No module named "
+    assert found == ["formulation[0].formulation: formulation 'mine' cannot be loaded: ModuleNotFoundError: "
+                     "No module named "
                      "'no_such_package'"]
 
 
-# -- grids of arguments -------------------------------------------------------------------------------------------------
+# -- grids of arguments ------------------------------------------------------------------------------------------------
 
 
 def names_of(text):

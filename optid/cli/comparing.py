@@ -162,7 +162,8 @@ def _as_options(text: str) -> str:
     lines = [line.strip() for line in text.splitlines()[1:]] or [text]
     found = []
     for line in lines:
-        line = re.sub(r"^(?:\w+\[[^]]*\]\.)?(\w+)(?:\[\d+\])?: must", lambda m: f"--{m[1].replace('_', '-')} must", line)
+        line = re.sub(r"^(?:\w+\[[^]]*\]\.)?(\w+)(?:\[\d+\])?: must",
+                      lambda m: f"--{m[1].replace('_', '-')} must", line)
         line = re.sub(r"^(?:data|formulation|solvers?)\[[^]]*\](?:\.\w+)*(?:\[\d+\])?: ", "", line)
         found.append(line)
     return "\n".join(found)

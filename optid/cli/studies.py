@@ -149,6 +149,26 @@ def export(
 
 
 @study.command(cls=Command)
+def problems(
+    db: Database,
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder for the problems.")],
+    title: OneStudy = None,
+) -> None:
+    """Write every convex programme of a study in standard form (.npz, MPS), and a script that solves them.
+
+    Example: optid study problems study.sqlite --out problems
+    """
+    from optid.studies.problem_set import write_problems
+
+    lines = write_problems(db, out, title)
+    kinds: dict[str, int] = {}
+    for line in lines:
+        kinds[line["kind"]] = kinds.get(line["kind"], 0) + 1
+    listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "none is convex"
+    say(f"{len(lines)} problems written to {out} ({listed}); solve_problems.py there solves them without optid")
+
+
+@study.command(cls=Command)
 def systems() -> None:
     """List the simulated systems that a study file may name."""
     from optid.studies.sources.systems import SYSTEMS

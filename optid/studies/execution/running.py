@@ -3,13 +3,14 @@
 import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from optid.errors import DatabaseError, StudyError, nearest
 from optid.studies.definition.description import Study
 from optid.studies.execution.cell import known, lost_row
-from optid.studies.grid import Cell, cells, check_unchanged, left
+from optid.studies.grid import Cell, cells, check_unchanged, left, located
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
 from optid.studies.storage.store import LABELS, Store
 
@@ -197,7 +198,7 @@ def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> lis
 
 def _description(study: Study) -> str:
     try:
-        return study.to_toml()
+        return replace(study, data=[located(entry, study.folder) for entry in study.data]).to_toml()
     except StudyError:  # records in memory, and other values that TOML does not hold, have no text
         return ""
 

@@ -1,0 +1,198 @@
+"""The convex programmes of a study in standard form, for solvers without optid: a benchmark set.
+
+Every programme is ``minimise x'Px / 2 + q'x + offset subject to A x + s = b, s in K`` with K a product of zero,
+non-negative, second-order and semidefinite cones, in this order. Semidefinite blocks are upper triangles by columns,
+off-diagonal entries times sqrt(2), as Clarabel takes them. Linear and quadratic programmes are written as MPS, too.
+"""
+
+import csv
+import shutil
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from optid.errors import OptidError, StudyError
+from optid.program.program import Program
+from optid.program.solution import Solution, Status
+from optid.registry import formulation, named_constraint
+from optid.solving.solve import run
+from optid.studies.definition.description import Study
+from optid.studies.grid import Cell, cells
+from optid.studies.sources.records import load
+from optid.studies.storage.store import Store
+
+ACCURACY = 1e-9
+"""At which objectives are verified."""
+
+
+@dataclass(frozen=True, eq=False)
+class StandardForm:
+    """One programme; see the module for its meaning.
+
+    Attributes:
+        P: (n, n) upper triangle, sparse.
+        q: (n,).
+        A: (m, n), sparse.
+        b: (m,).
+        cones: numbers of rows of zero and non-negative cones, sizes of second-order cones, orders of semidefinite ones.
+        offset: constant of the objective.
+    """
+
+    P: Any
+    q: np.ndarray
+    A: Any
+    b: np.ndarray
+    cones: tuple[int, int, tuple[int, ...], tuple[int, ...]]
+    offset: float
+
+    @property
+    def kind(self) -> str:
+        """LP, QP, SOCP or SDP."""
+        return "SDP" if self.cones[3] else "SOCP" if self.cones[2] else "QP" if self.P.nnz else "LP"
+
+
+def write_problems(database: str | Path, folder: str | Path, study: str | None = None) -> list[dict[str, Any]]:
+    """Write every convex programme that the cells of a study pose, and a script that solves them.
+
+    Programmes of procedures that depend on the solutions of earlier ones are those after optid's own solutions.
+
+    Args:
+        database: of the study.
+        folder: made where it is not there; ``problems.csv`` lists the programmes with their verified objectives.
+        study: title, for a database that holds several.
+
+    Returns:
+        The lines of ``problems.csv``.
+
+    Raises:
+        StudyError: the database holds no text of the study, as for records in memory.
+        DatabaseError: the database cannot be read.
+        OSError: the folder cannot be written.
+    """
+    with Store(database) as store:
+        texts = {name: text for name, text in store.descriptions().items() if study in (None, name)}
+    if not any(texts.values()):
+        raise StudyError(f"{database} has no text of a study to pose its problems from"
+                         + (f": it has {', '.join(map(repr, texts))}" if texts else ""))
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    lines: list[dict[str, Any]] = []
+    for text in filter(None, texts.values()):
+        for cell in _problems(Study.from_text(text)):
+            for program, solution in _programmes(cell):
+                if line := _written(folder, len(lines), cell, program, solution):
+                    lines.append(line)
+    with (folder / "problems.csv").open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, ["name", "kind", "variables", "rows", "objective", "data", "formulation"])
+        table.writeheader()
+        table.writerows(lines)
+    with files("optid.studies").joinpath("solve_problems.py").open("rb") as source, \
+            (folder / "solve_problems.py").open("wb") as target:
+        shutil.copyfileobj(source, target)
+    return lines
+
+
+def _problems(study: Study) -> Iterator[Cell]:
+    """One cell of every record and formulation."""
+    seen = set()
+    for cell in cells(study):
+        problem = (cell.data, cell.samples, cell.noise, cell.seed, cell.formulation)
+        if problem not in seen:
+            seen.add(problem)
+            yield cell
+
+
+def _programmes(cell: Cell) -> list[tuple[Program, Solution]]:
+    """The programmes that a cell poses, with optid's solutions; none where it cannot be posed."""
+    found: list[tuple[Program, Solution]] = []
+
+    def recorded(problem: Any) -> Any:
+        answer = None
+        while True:
+            try:
+                program = problem.send(answer)
+            except StopIteration as stop:
+                return stop.value
+            answer = yield program
+            found.append((program, answer))
+
+    constraints = tuple(named_constraint(text) for text in cell.constraints)
+    more = {"constraints": constraints} if constraints else {}
+    settings = {"accuracy": ACCURACY, "time_limit": cell.time_limit, "prove": False}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            problem = formulation(cell.formulation_name)[1](load(cell).data, **cell.options, **more)
+            if not isinstance(problem, Program):
+                run(recorded(problem), **settings)
+            else:
+                found.append((problem, run(problem, **settings).solution))
+    except (OptidError, ArithmeticError, np.linalg.LinAlgError):  # the study has a row that says why
+        pass
+    return found
+
+
+def standard_form(program: Program) -> StandardForm | None:
+    """Return the standard form of a programme; None where it is not convex, or of cones other than those here."""
+    if program.kind == "NLP":
+        return None
+    data, _, _ = program.problem.get_problem_data("CLARABEL")
+    dims = data["dims"]
+    offset = float(data["param_prob"].apply_parameters()[-3])  # of (P,) q, offset, A, b
+    if dims.exp or dims.p3d or getattr(dims, "pnd", None):
+        return None
+    n = len(data["c"])
+    matrix, right, zero, nonneg = sp.csc_array(data["A"]), np.asarray(data["b"]), int(dims.zero), int(dims.nonneg)
+    for name, sign in (("lower_bounds", -1.0), ("upper_bounds", 1.0)):
+        bounds = data.get(name)
+        if bounds is not None and len(kept := np.flatnonzero(np.isfinite(bounds))):
+            rows = sp.csc_array((np.full(len(kept), sign), (range(len(kept)), kept)), shape=(len(kept), n))
+            cut = zero + nonneg
+            matrix = sp.csc_array(sp.vstack([matrix[:cut], rows, matrix[cut:]]))
+            right = np.concatenate([right[:cut], sign * np.asarray(bounds)[kept], right[cut:]])
+            nonneg += len(kept)
+    weights = sp.csc_array(sp.triu(data["P"])) if data.get("P") is not None else sp.csc_array((n, n))
+    weights.eliminate_zeros()
+    return StandardForm(weights, np.asarray(data["c"]), matrix, right,
+                        (zero, nonneg, tuple(map(int, dims.soc)), tuple(map(int, dims.psd))), offset)
+
+
+def _written(folder: Path, number: int, cell: Cell, program: Program, solution: Solution) -> dict[str, Any] | None:
+    """Write one programme, and return its line; None where it is not convex or its objective could not be verified."""
+    form = standard_form(program) if solution.status in (Status.OPTIMAL, Status.LOCAL) else None
+    if form is None:
+        return None
+    name, objective = f"{number:04d}", solution.objective / program.unit
+    np.savez_compressed(
+        folder / f"{name}.npz", P_data=form.P.data, P_indices=form.P.indices, P_indptr=form.P.indptr, q=form.q,
+        A_data=form.A.data, A_indices=form.A.indices, A_indptr=form.A.indptr, b=form.b, zero=form.cones[0],
+        nonneg=form.cones[1], soc=np.array(form.cones[2], dtype=int), psd=np.array(form.cones[3], dtype=int),
+        offset=form.offset, objective=objective)
+    if form.kind in ("LP", "QP"):
+        (folder / f"{name}.mps").write_text(mps(form, name), encoding="ascii")
+    return {"name": name, "kind": form.kind, "variables": len(form.q), "rows": len(form.b),
+            "objective": repr(objective), "data": cell.data, "formulation": cell.formulation}
+
+
+def mps(form: StandardForm, name: str) -> str:
+    """Return a linear or quadratic programme as free MPS text, all variables free."""
+    columns, weights = sp.csc_array(form.A), sp.coo_array(form.P)
+    lines = [f"NAME {name}", "ROWS", " N objective"]
+    lines += [f" {'E' if row < form.cones[0] else 'L'} r{row}" for row in range(len(form.b))]
+    lines.append("COLUMNS")
+    for j, cost in enumerate(form.q):
+        lines.append(f" x{j} objective {float(cost)!r}")
+        begin, end = columns.indptr[j], columns.indptr[j + 1]
+        lines += [f" x{j} r{i} {float(v)!r}" for i, v in zip(columns.indices[begin:end], columns.data[begin:end])]
+    lines += ["RHS", f" rhs objective {-form.offset!r}"]
+    lines += [f" rhs r{i} {float(v)!r}" for i, v in enumerate(form.b) if v]
+    lines += ["BOUNDS", *(f" FR bound x{j}" for j in range(len(form.q)))]
+    if form.P.nnz:
+        lines += ["QUADOBJ", *(f" x{i} x{j} {float(v)!r}" for i, j, v in zip(*weights.coords, weights.data))]
+    return "\n".join([*lines, "ENDATA", ""])
