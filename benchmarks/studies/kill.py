@@ -1,4 +1,4 @@
-"""kill -9 at random moments of a 1,500-cell study, also inside a write, then resume; other ends of a run.
+"""kill -9 at random moments of a 600-cell study, also inside a write, then resume; other ends of a run.
 
     python benchmarks/studies/kill.py [--kills 20] [--seed 0] [--workers 2]
 
@@ -31,13 +31,13 @@ from optid.studies.grid import cells
 from optid.studies.storage.store import finished, read_rows
 
 STUDY = """
-name = "fifteen hundred cells"
-seeds = 250
+name = "six hundred cells"
+seeds = 100
 solvers = ["gauss_newton", "ipopt", "uno"]
 [[data]]
 name = "dead zone"
 system = "dead_zone"
-samples = [200]
+samples = [10000]
 noise = [0.1, 0.3]
 [[formulation]]
 name = "exact"
@@ -140,7 +140,7 @@ def killed(file: Path, wanted: set, kills: int, workers: int, rng: np.random.Gen
     print(f"{len(wanted)} cells; kill after so many new rows: rows, inside a write, readable")
     for attempt in range(kills):
         process = started(file, db, workers)
-        number = int(rng.integers(0, 2 * len(wanted) // (kills + 2)))
+        number = int(rng.integers(0, len(wanted) // (kills + 5)))
         until_new_rows(process, db, number)
         inside = attempt % 2 == 1
         until_a_write(process, db) if inside else time.sleep(float(rng.uniform(0.0, 0.05)))

@@ -12,7 +12,7 @@ from rich.text import Text
 from typer.core import TyperGroup
 
 from optid.cli.results import command_line
-from optid.cli.terminal import Command, output, say
+from optid.cli.terminal import Command, SafeConsole, output, say
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
                     help="Compare formulations and solvers on your data: run a study, report it, export its rows.")
@@ -112,7 +112,7 @@ def report(
     Example: optid study report study.sqlite -o study.html
     """
     from optid.cli.arguments import check_folders
-    from optid.cli.study_summary import print_former, print_reasons
+    from optid.cli.study_summary import print_former, print_models, print_reasons
     from optid.studies.page import write_page
     from optid.studies.storage.store import rows_of_one
     from optid.studies.verdicts.verdict import conclude
@@ -120,6 +120,7 @@ def report(
     check_folders(page)
     verdict = conclude(rows_of_one(db, title), accuracy=accuracy, time=clock)
     say(str(verdict))
+    print_models(verdict)
     print_reasons(verdict.table)
     print_former(db, title)
     if page is not None:
@@ -206,12 +207,11 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
         described: the study, to say which of its former rows are set aside.
     """
     from rich import progress
-    from rich.console import Console
 
     from optid.studies.execution.running import told_former
     from optid.studies.storage.store import Store
 
-    console = Console(stderr=True)
+    console = SafeConsole(stderr=True)
     bar = progress.Progress(
         progress.TextColumn("{task.description}"), progress.BarColumn(), progress.MofNCompleteColumn(),
         progress.TimeElapsedColumn(), progress.TimeRemainingColumn(), console=console, transient=True,
@@ -284,7 +284,9 @@ def _summary(db: Path, name: str) -> bool:
     rows = {column: values[every["study"] == name] for column, values in every.items()}
     summary.print_outcomes(name, rows)
     summary.print_reasons(rows)
-    headline = conclude(rows).headline
+    verdict = conclude(rows)
+    summary.print_models(verdict)
+    headline = verdict.headline
     say(Text.assemble((f"{headline.word}: ", "bold"), headline.text))
     words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
     words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []

@@ -77,6 +77,25 @@ def print_reasons(rows: Mapping[str, Any]) -> None:
         say(Text(f"and {len(ordered) - LISTED} more reasons, which the page and the database have", "dim"))
 
 
+def print_models(verdict: Any) -> None:
+    """Print the figures of the formulations, where a study of one solver compares them.
+
+    Args:
+        verdict: of the study.
+    """
+    if len(verdict.overall.standings) != 1 or len(verdict.quality.formulations) < 2:
+        return
+    from optid.studies.page import quality_table
+
+    found = quality_table(verdict.quality)
+    table = Table(title=found.title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    for number, name in enumerate(found.head):
+        table.add_column(name, justify="left" if number < 2 else "right", overflow="fold")
+    for row in found.rows:
+        table.add_row(*map(Text, row))
+    output().print(table)
+
+
 def nothing_solved(rows: Mapping[str, Any]) -> bool:
     """Return whether no cell has an answer: a verified point, or the verified word that there is none."""
     answers = rows["reached"] | np.isin(rows["status_verified"], (str(Status.INFEASIBLE), str(Status.UNBOUNDED)))

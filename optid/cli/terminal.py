@@ -9,6 +9,7 @@ from typing import Any
 
 import typer
 from rich.console import Console
+from rich.segment import Segment
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
@@ -97,9 +98,22 @@ def exit_code(error: BaseException) -> int:
     return 2 if isinstance(error, OptidError | OSError) else 1
 
 
+class SafeConsole(Console):
+    """A console that shows control characters of texts instead of obeying them: names and messages come from files."""
+
+    def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
+        """Yield the segments with a visible character in place of each control character."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(_CONTROL.sub("\ufffd", segment.text), segment.style)
+
+
+_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+"""Control characters but tab and newline, and those that turn the direction of writing."""
+
+
 def output() -> Console:
     """Return the console of results."""
-    return Console(highlight=False)
+    return SafeConsole(highlight=False)
 
 
 def say(text: str | Text) -> None:
@@ -139,7 +153,7 @@ def note(text: str) -> None:
 
 
 def _tell(word: str, style: str, text: str) -> None:
-    console = Console(stderr=True, highlight=False)
+    console = SafeConsole(stderr=True, highlight=False)
     console.print(Text.assemble((f"{word}: ", style), text), soft_wrap=not console.is_terminal)
 
 
@@ -170,7 +184,7 @@ class Waiting:
     def __init__(self) -> None:
         from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-        console = Console(stderr=True)
+        console = SafeConsole(stderr=True)
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),

@@ -84,7 +84,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "folded": len(verdict.sections) > FOLDED,
         "statements": verdict.statements,
         "claims": _claims(verdict),
-        "quality": _quality_table(verdict.quality) if verdict.quality.records else None,
+        "quality": quality_table(verdict.quality) if verdict.quality.records else None,
         "few_reasons": 0 < len(verdict.failures) <= FEW_REASONS,
         "formulations": [section.name for section in verdict.sections],
         "requested": f"{verdict.accuracy:.0e}",
@@ -178,8 +178,8 @@ def _claims(verdict: Verdict) -> Table | None:
     return Table("Claims that were false", ("solver", "formulation", "runs", "claimed", "but"), rows, note)
 
 
-def _quality_table(quality: Quality) -> Table:
-    """Mean figures of the models of every formulation, and those on each data set where these are few."""
+def quality_table(quality: Quality) -> Table:
+    """Return the mean figures of the models of every formulation, and those on each data set where these are few."""
     head = ("records solved", "simulation fit", "one-step fit", "parameter error", "nonlinearity error")
     apart = len(quality.sets) > 1 and (len(quality.sets) + 1) * len(quality.formulations) <= LISTED
     rows = []

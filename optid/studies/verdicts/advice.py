@@ -2,8 +2,8 @@
 
 from optid.show.wording import seconds
 from optid.studies.verdicts.averages import Paired, paired_ratio
-from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, ONLY_ONE, TIE, listed
-from optid.studies.verdicts.model_advice import UNDECIDED, choice_of_formulation
+from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, listed
+from optid.studies.verdicts.model_advice import choice_of_formulation
 from optid.studies.verdicts.quality import Quality
 from optid.studies.verdicts.ranks import Ranking
 from optid.studies.verdicts.standings import Section, Standing
@@ -235,9 +235,7 @@ def headline(overall: Section, sections: list[Section], quality: Quality) -> Sta
     """
     choice, n = overall.choice, len(overall.found.data)
     if len(overall.standings) == 1:
-        models = choice_of_formulation(quality)
-        decided = quality.choice.kind in (FIRST, TIE, DEPENDS) and models is not None and models.word != UNDECIDED
-        return models if models is not None and decided else choice_of_solver(overall)
+        return choice_of_formulation(quality) or choice_of_solver(overall)
     if len(sections) < 2 or not overall.standings:
         return choice_of_solver(overall)
     leaders = {choice.first, *choice.tied}

@@ -13,7 +13,7 @@ from optid.studies.storage.rows import ERROR, REFUSED
 from optid.studies.verdicts.advice import carries_over, choice_of_solver, headline, no_solution
 from optid.studies.verdicts.agreement import Agreement, agreement_matrix
 from optid.studies.verdicts.choice import listed
-from optid.studies.verdicts.model_advice import choice_of_formulation
+from optid.studies.verdicts.model_advice import UNDECIDED, choice_of_formulation
 from optid.studies.verdicts.outcomes import (
     CONTRADICTED,
     OTHER_ACCURACY,
@@ -153,7 +153,8 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
         return []
     models, solvers = choice_of_formulation(quality), choice_of_solver(overall)
     if head == models:
-        said = [solvers, carries_over(quality.ranking, "formulation")]
+        decided = not head.word.startswith(UNDECIDED)
+        said = [solvers, carries_over(quality.ranking, "formulation") if decided else None]
     else:
         said = [models]
         if found.solved.any() and len(overall.standings) > 1 and (len(sections) == 1 or head == solvers):
