@@ -3,6 +3,7 @@
 import csv as comma
 from pathlib import Path
 
+import numpy as np
 import pytest
 from study_rows import FAILED, row
 from typer.testing import CliRunner
@@ -358,3 +359,25 @@ def test_a_place_that_takes_no_files_is_told_before_any_work(folder, monkeypatch
     told = run("study", "report", "none.sqlite", "-o", "page.html").stderr
     assert f"page.html cannot be written: folder {folder} is read-only here; give a file in another folder" in told
     arguments.check_folders(folder / "rig.csv")
+
+
+def test_names_from_files_reach_the_terminal_without_their_control_characters(capfd):
+    from optid.cli.study_summary import print_reasons
+    from optid.cli.terminal import note, say
+
+    hostile = "\x1b]0;title\x07\x1b[31mred\x9b2J\u202egnp"
+    say(hostile)
+    note(hostile)
+    print_reasons({"outcome": np.array(["error"], object), "status_verified": np.array([""], object),
+                   "reached": np.array([False]), "solver": np.array([hostile], object),
+                   "reason": np.array([hostile], object)})
+    out, err = capfd.readouterr()
+    assert "red" in out and out.count("gnp") == 3 and "red" in err
+    assert not set("\x1b\x07\x9b\u202e") & set(out + err)
+
+
+def test_a_study_of_one_solver_concludes_about_formulations_and_shows_their_table(folder):
+    Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("seeds = 2", "seeds = 1"))
+    found = run("study", "run", "rigs.toml", "-w", 1)
+    assert found.exit_code == 0 and "Models: cannot tell" in found.stdout and "needs at least 6" in found.stdout
+    assert "simulation fit" in found.stdout
