@@ -145,6 +145,20 @@ def test_the_theme_is_switched_by_a_button(pages, browser):
     assert browser.run("getComputedStyle(document.body).backgroundColor") != light
 
 
+def test_a_notebook_shows_at_most_one_screen(pages, browser, tmp_path):
+    fit = example_fit("thruster")
+    horizons = optid.fit_by_horizon(fit.model, fit.data)
+    shown_results = {"fit": fit, "several": mimo_fit(), "validation": fit.validate(), "parameters": fit.params,
+                     "feedback": feedback_fit(), "model": fit.model, "horizons": horizons}
+    browser.window(1000, 900)
+    for name, result in shown_results.items():
+        page = tmp_path / f"{name}.html"
+        page.write_text(f"<!DOCTYPE html><meta charset=utf-8><body>{result._repr_html_()}</body>", encoding="utf-8")
+        browser.open(page, ready="document.readyState == 'complete' && document.body")
+        assert browser.run("document.body.getBoundingClientRect().height") < 900, name
+        assert browser.run("document.querySelectorAll('script').length") == 0
+
+
 def test_ten_thousand_samples_stay_light_and_quick(browser, tmp_path):
     rng = np.random.default_rng(2)
     u, y = rng.standard_normal(10_000), np.zeros(10_000)

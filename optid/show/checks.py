@@ -87,14 +87,14 @@ def comparison_table(found: "Comparison") -> Table:
         for o, output in enumerate(found.data.outputs):
             own = [t for t in checked.cross_correlations.values() if t.output == output]
             fits = [percent(found.fits[word][i, o]) for word in found.fits]
-            white = "yes" if checked.autocorrelations[output].passed else "no"
+            white = "PASS" if checked.autocorrelations[output].passed else "FAIL"
             label = name if len(found.data.outputs) == 1 else f"{name}: {output}"
-            rows.append((label, *fits, white, "yes" if all(t.passed for t in own) else "no"))
+            rows.append((label, *fits, white, "PASS" if all(t.passed for t in own) else "FAIL"))
     what = "model" if len(found.data.outputs) == 1 else "model: output"
     note = "Fits over the samples that all models predict."
     if len(found.names) > 1 and "simulation" in found.fits:
         note += f" Best simulation: {found.best()}."
-    head = (what, *found.fits, "white", "independent")
+    head = (what, *found.fits, "whiteness", "independence")
     return Table(f"Fit on {found.data.name or 'the record'}", head, rows, note)
 
 
