@@ -173,7 +173,7 @@ def test_other_files_are_refused(path):
 @pytest.mark.parametrize("name, content, words", [
     ("valve.csv", b"time,u,y\n1,2,3\n" * 1000, "valve.csv is a file of another kind, .*give the one that `optid study"),
     ("study.toml", b'name = "small"\n' * 30, "study.toml is a file of another kind"),
-    ("short.sqlite", b"\n", "is a file of another kind"),
+    ("short.sqlite", b"\n", "not a database of studies .it has no tables"),
     ("old.duckdb", b"\0" * 8 + b"DUCK" + b"\0" * 99,
      "kept rows in DuckDB. Export it with that version .`optid study export old.duckdb rows.parquet`"),
 ])
@@ -236,6 +236,21 @@ def test_a_run_under_way_can_be_read_and_leaves_one_file(path):
             assert len(finished(path)) == k + 1
     read_rows(path)
     assert [file.name for file in path.parent.iterdir()] == ["study.sqlite"]
+
+
+def test_a_second_connection_of_the_writer_gives_up_none_of_its_locks(path):
+    """Else a reader in another process takes the pending writes for its own, and what is written later is lost."""
+    import subprocess
+    import sys
+
+    reader = f"from optid.studies.storage.store import finished; print(len(finished({str(path)!r})))"
+    made = rows(6)
+    with Store(path, write=True) as store:
+        for k, row in enumerate(made):
+            store.append([row])
+            finished(path)  # here
+            there = subprocess.run([sys.executable, "-c", reader], capture_output=True, text=True, check=True)
+            assert int(there.stdout) == k + 1
 
 
 def test_two_processes_write_into_one_database(path):

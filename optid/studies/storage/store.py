@@ -50,9 +50,14 @@ class Store:
             raise DatabaseError(f"{self.path} cannot be written: No such file or directory: {self.path.parent}")
         if write and not self.path.exists():
             self._make()
-        _check_kind(self.path)
+        if self.path.is_dir():
+            raise DatabaseError(f"{self.path} cannot be opened: Is a directory")
         with self._named("opened"):
-            self._connection = _connected(self.path, write)
+            try:
+                self._connection = _connected(self.path, write)
+            except sqlite3.DatabaseError:
+                _check_kind(self.path)
+                raise
             try:
                 self._check()
             except BaseException:
@@ -277,7 +282,11 @@ class Store:
 
 
 def _check_kind(path: Path) -> None:
-    """Refuse a file of another kind in words, before SQLite does."""
+    """Refuse a file of another kind in words, where SQLite has refused it.
+
+    A database that is open in this process must not be opened as a file beside SQLite: to close that would give up the
+    locks of the whole process (POSIX), and another process would remove the writes that are pending.
+    """
     try:
         with path.open("rb") as file:
             head = file.read(16)
