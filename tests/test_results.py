@@ -84,6 +84,12 @@ def test_the_methods_do_what_the_functions_do(tmp_path):
     assert "<html" in fit.report(tmp_path / "r.html").read_text(encoding="utf-8")
 
 
+def test_a_comparison_draws_every_simulation():
+    fit = linear_fit()
+    figure = optid.compare_models({"one": fit.model, "two": fit.model}, fit.data).plot()
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["measured", "one", "two"]
+
+
 def test_information_criteria_are_those_of_a_gaussian_likelihood():
     fit = optid.fit(_noisy(), "arx", na=2, nb=1, nk=1)
     errors = fit.residuals[np.isfinite(fit.residuals)]

@@ -1,4 +1,4 @@
-"""Figures of several models on one record: their simulations, fits against the horizon, and poles."""
+"""The figure of several models on one record: measured and simulated outputs."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -33,42 +33,4 @@ def simulations(found: "Comparison") -> Figure:
     axes[0].set_title("Simulations" + (f", experiment {k + 1}" if record.n_experiments > 1 else ""))
     axes[-1].set_xlabel("time")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=1)
-    return figure
-
-
-@styled
-def horizons(found: "Comparison") -> Figure:
-    """Draw the fit of every model against how far ahead it predicts, one panel per output."""
-    outputs = found.data.outputs
-    figure = Figure(figsize=(9.0, 3.0 + 0.25 * len(found.names)), layout="constrained")
-    axes = figure.subplots(1, len(outputs), squeeze=False)[0]
-    for o, (ax, name) in enumerate(zip(axes, outputs)):
-        for label, curve, (colour, dash) in zip(found.names, found.curves, LINES * len(found.names)):
-            text = plain(label)
-            ax.plot(curve.horizons, curve.fits[:, o], dash, marker="o", markersize=3.5, color=colour, label=text)
-            if np.isfinite(curve.simulation[o]):
-                ax.axhline(curve.simulation[o], color=colour, linewidth=0.8, linestyle=(0, (1, 2)))
-        ax.set_xscale("log")
-        ax.set(xlabel="samples ahead", ylabel="fit (%)" if o == 0 else "")
-        ax.set_title(with_unit(name, ""))
-        ax.xaxis.set_major_formatter("{x:g}")
-        low = min(float(np.nanmin(curve.fits[:, o])) for curve in found.curves)
-        ax.set_ylim(bottom=max(low - 5, -100))
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=1)
-    return figure
-
-
-@styled
-def poles(found: "Comparison") -> Figure:
-    """Draw the poles of every model in the unit circle."""
-    figure = Figure(figsize=(6.4, 4.0 + 0.25 * len(found.names)), layout="constrained")
-    ax = figure.subplots()
-    panels.draw_poles(ax, np.zeros(0))
-    marks = "x+o^sd"
-    for i, (label, model, (colour, _)) in enumerate(zip(found.names, found.models, LINES * len(found.names))):
-        text = plain(label)
-        values: Any = np.asarray(model.poles)
-        hollow: dict[str, Any] = {"markerfacecolor": "none", "linestyle": ""}
-        ax.plot(values.real, values.imag, marks[i % len(marks)], color=colour, label=text, **hollow)
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower left", ncols=1)
     return figure
