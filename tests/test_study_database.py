@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from study_rows import rows
 
-from optid.errors import DatabaseError
+from optid.errors import DatabaseError, DataError, OptidError
 from optid.studies.storage.export import export
 from optid.studies.storage.rows import COLUMNS, NAMES
 from optid.studies.storage.store import Store, append, finished, read_rows, rows_of_one
@@ -284,6 +284,17 @@ def test_an_export_reads_like_its_database(path, tmp_path):
     append(path, rows(300))
     export(path, tmp_path / "rows.parquet")
     assert str(conclude(tmp_path / "rows.parquet")) == str(conclude(path))
+    good = (tmp_path / "rows.parquet").read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        damaged = bytearray(good)
+        for at in rng.integers(0, len(good), 40):
+            damaged[at] = rng.integers(256)
+        (tmp_path / "bad.parquet").write_bytes(damaged)
+        try:
+            conclude(tmp_path / "bad.parquet")
+        except OptidError as error:
+            assert "bad.parquet" in str(error) or isinstance(error, DataError)
     (tmp_path / "bad.parquet").write_bytes(b"PAR1" + b"no table" * 9)
     with pytest.raises(DatabaseError, match="bad.parquet cannot be read"):
         rows_of_one(tmp_path / "bad.parquet")

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.errors import DatabaseError, LookupFailed, OptidError, StudyError, nearest
+from optid.errors import DatabaseError, LookupFailed, StudyError, nearest
 from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, complete
 
 PATIENCE = 30.0  # seconds to wait for another writer
@@ -414,8 +414,11 @@ def _exported(path: Path) -> dict[str, np.ndarray]:
 
     try:
         frame = polars.read_parquet(path)
-        return {name: frame[name].to_numpy() for name in frame.columns if name in (*NAMES, "study")}
-    except OptidError:
-        raise
-    except Exception as error:
+        rows = {name: frame[name].to_numpy() for name in frame.columns if name in NAMES}
+    except BaseException as error:  # polars panics on some damaged files, with an exception of its own base
+        if isinstance(error, KeyboardInterrupt):
+            raise
         raise DatabaseError(f"{path} cannot be read: {str(error).partition(chr(10))[0]}") from None
+    if "study" not in rows:
+        raise DatabaseError(f"{path} is no export of a study: it has no column 'study'")
+    return rows

@@ -99,5 +99,5 @@ def parse_poles(text: str) -> np.ndarray | None:
     """Return the complex poles of a row, or None where there are none to read."""
     try:
         return np.array([complex(*pair) for pair in json.loads(text)], dtype=complex)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RecursionError):
         return None
