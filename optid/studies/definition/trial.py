@@ -124,7 +124,7 @@ def note_impossible(data: Sequence[DataEntry], formulations: Sequence[Formulatio
             continue
         reasons = [_refused(entry, records.beginning(one, np.inf)) for one in records_of]  # was it too short?
         if reasons and all(reasons):
-            problems.add(("formulation", Label(entry.name)), f"it cannot be posed: {reasons[0]}")
+            problems.add(("formulation", Label(entry.name)), f"the formulation cannot be posed: {reasons[0]}")
 
 
 def _refused(entry: FormulationEntry, record: Data) -> str:
