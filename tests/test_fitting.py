@@ -187,7 +187,7 @@ def test_nonconvex_constraints_are_refused_by_convex_formulations():
 
 
 @pytest.mark.parametrize("data, error, words", [
-    (np.ones(9), DataError, r"fit takes optid.Data .*not ndarray"),
+    (np.ones(9), DataError, r"takes optid.Data, not ndarray: fit"),
     (record(count=24), RankError, "21 rows for 27 parameters.*longer record"),
 ])
 def test_records_that_will_not_do(data, error, words):
