@@ -31,7 +31,7 @@ import optid
 from optid.studies import Study
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.execution import running
-from optid.studies.storage import database
+from optid.studies.storage import store
 from optid.studies.storage.rows import BY_NAME, NAMES
 
 BASIS = "triangular:6"
@@ -74,7 +74,7 @@ class Killer:
 
 def rows_of(study: Study, db: Path, **settings: Any) -> dict[tuple[str, int], dict[str, Any]]:
     running.run(study, db, **settings)
-    rows = database.read_rows(db)
+    rows = store.read_rows(db)
     table = [dict(zip(rows, values)) for values in zip(*rows.values())]
     found = {(str(row["key"]), int(row["repetition"])): row for row in table}
     assert len(found) == len(table), "a cell has two rows"
