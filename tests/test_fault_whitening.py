@@ -127,9 +127,9 @@ def test_bad_input():
 
 def drawn(uncertainty, seed):
     """A model of the distribution."""
-    from optid.faults.nuisance import _parameters
+    from optid.faults.nuisance import parameters
 
-    theta, _, back = _parameters(uncertainty.model)
+    theta, _, back = parameters(uncertainty.model)
     return back(theta + uncertainty.root @ np.random.default_rng(seed).standard_normal(uncertainty.root.shape[1]))
 
 

@@ -199,7 +199,7 @@ def test_losses_and_stuck_actuators_are_searched_along_the_input_of_the_window()
     u = levels(40, 3)
     lossy = dictionary(small(), kinds=["bias", "loss", "stuck"])
     space = signature_space(lossy, 40, u=u)
-    assert space.skipped == () and "actuator:u1 loss" in space.labels
+    assert space.skipped == ("sensor:y1 loss", "sensor:y2 loss") and "actuator:u1 loss" in space.labels
     windows = np.random.default_rng(0).normal(size=(3, 40, 2))
     fast = space.statistics(windows)
     for c, label in enumerate(space.labels):

@@ -30,7 +30,7 @@ from optid import Data
 from optid.errors import DataWarning
 from optid.faults import Candidate, Dictionary, dictionary, inject, model_uncertainty, predictor, scan, whiten
 from optid.faults import thresholds as calibrated
-from optid.faults.nuisance import ModelUncertainty, _inflated, _parameters
+from optid.faults.nuisance import ModelUncertainty, _inflated, parameters
 from optid.identify.noise import with_noise
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
 
@@ -78,12 +78,12 @@ def regression(plant: HammersteinSS, data: Data, load: np.ndarray) -> tuple[Dict
     # the parameters of the state-space form are linear in theta but for products of phi with d and c
     best, root = model(theta), np.linalg.inv(np.linalg.cholesky(X.T @ X)).T
     spread = np.linalg.cholesky(covariance)
-    center, columns = _parameters(best)[0], []
+    center, columns = parameters(best)[0], []
     for o in range(l):
         for axis in root.T:
             move = np.outer(axis, spread[:, o])
             size = 1e-4 / np.abs(move).max()
-            columns.append((_parameters(model(theta + size * move))[0] - center) / size)
+            columns.append((parameters(model(theta + size * move))[0] - center) / size)
     steady = predictor(best)
     uncertain = ModelUncertainty(replace(best, K=steady.K), steady, np.column_stack(columns), rows.size * l)
     with warnings.catch_warnings():

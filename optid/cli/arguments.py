@@ -214,19 +214,40 @@ def pairs(words: Sequence[str] | None, option: str) -> dict[str, Any]:
     return found
 
 
-def directions(words: Sequence[str] | None, option: str) -> dict[str, list[float]]:
-    """Read NAME=E1,E2,... words: directions in the state equation by name.
+def directions(words: Sequence[str] | None, option: str, model: Any = None) -> dict[str, Any]:
+    """Read NAME=E1,E2,... words: directions in the state equation by name, or NAME=y1:-1,y2:0.5 by outputs.
+
+    Args:
+        words: as given.
+        option: that they were given to.
+        model: whose outputs are named.
 
     Raises:
-        StructureError: a word that is something else.
+        LookupFailed: no such output.
+        StructureError: a word that is something else, a direction of the wrong size.
     """
-    found = {}
+    found: dict[str, Any] = {}
     for word in words or []:
         name, equals, numbers = word.partition("=")
+        parts = [part.rpartition(":") for part in numbers.split(",")]
         try:
-            found[name] = [float(number) for number in numbers.split(",")]
+            values = [float(value) for _, _, value in parts]
         except ValueError:
             equals = ""
-        if not (name and equals):
-            raise StructureError(f"{option} {word}: write NAME=E1,E2,..., one number per state")
+        named = [output for output, _, _ in parts if output]
+        if not (name and equals) or (named and (len(named) < len(parts) or model is None)):
+            raise StructureError(
+                f"{option} {word}: write NAME=E1,E2,..., one number per state, or NAME=OUTPUT:CHANGE,..."
+            )
+        if named:
+            from optid.faults.directions import direction_of
+
+            found[name] = direction_of(model, dict(zip(named, values)))
+            continue
+        if model is not None and len(values) != model.nx:
+            raise StructureError(
+                f"{option} {word}: {len(values)} numbers for {model.nx} states. Give one per state, or say what it "
+                f"does to the outputs: {name}={model.outputs[0]}:-1"
+            )
+        found[name] = values
     return found

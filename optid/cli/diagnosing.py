@@ -5,7 +5,19 @@ from typing import Annotated, Any
 
 import typer
 
-from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Example, Load, Picture, Report, StateJump, reads_a_record
+from optid.cli.options import (
+    MODEL,
+    RECORD,
+    RESULT,
+    SOLVER,
+    Disturbance,
+    Example,
+    Load,
+    Picture,
+    Report,
+    StateJump,
+    reads_a_record,
+)
 from optid.cli.results import command_line, conclude, save_picture
 from optid.cli.terminal import FILES, Waiting, hearing
 
@@ -48,6 +60,14 @@ def diagnose(
         ),
     ] = None,
     load: Load = None,
+    disturbance: Disturbance = None,
+    zero: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--zero", metavar="INPUT=VALUE...", rich_help_panel=MODEL,
+            help="Where an actuator does nothing, for shares lost. [dim]not known[/]",
+        ),
+    ] = None,
     state_jump: StateJump = True,
     max_faults: Annotated[
         int, typer.Option("--max-faults", rich_help_panel=MODEL, help="Faults that may be in the record.")
@@ -103,13 +123,18 @@ def diagnose(
         origin = _origin(identified, how)
         waiting.step("signatures")
         found = dictionary(
-            plant, kinds=words.listed(kinds) or list(KINDS), process=words.directions(load, "--load"),
-            state_jump=state_jump,
+            plant, kinds=words.listed(kinds) or list(KINDS), process=words.directions(load, "--process", plant),
+            state_jump=state_jump, disturbances=words.listed(disturbance) or (),
+            zeros=_zeros(zero),
         )
         waiting.step("searching")
+        uncertainty: Any = "ignore"
+        if origin is not None:
+            silent = bool(found.predictor.silent)
+            uncertainty = model_uncertainty(found.model, origin, decoupled=found.predictor if silent else None)
         answer = judge(
             plant, record, found, false_alarm=false_alarm, max_faults=max_faults, method=method, coverage=coverage,
-            model_uncertainty="ignore" if origin is None else model_uncertainty(plant, origin), robust=robust,
+            model_uncertainty=uncertainty, robust=robust,
             healthy=sound, rescale=rescale, seed=seed, solver=solver,
         )
         if out is not None:
@@ -128,6 +153,22 @@ def diagnose(
             "it was identified from) takes its uncertainty into account."
         )
     conclude(str(answer), heard, diagnosis=out, report=report, picture=picture)
+
+
+def _zeros(given: list[str] | None) -> dict[str, float]:
+    from optid.cli import arguments as words
+    from optid.errors import StructureError
+
+    found = {}
+    for word in words.listed(given) or []:
+        name, equals, value = word.partition("=")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            equals = ""
+        if not (name and equals):
+            raise StructureError(f"--zero {word}: write INPUT=VALUE, the input at which the actuator does nothing")
+    return found
 
 
 def _origin(identified: list[Path] | None, how: dict[str, Any]) -> Any:

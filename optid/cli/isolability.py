@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from optid.cli.options import MODEL, Load, Picture, StateJump
+from optid.cli.options import MODEL, Disturbance, Load, Picture, StateJump
 from optid.cli.results import conclude, save_picture
 from optid.cli.terminal import Waiting, hearing
 
@@ -30,6 +30,7 @@ def isolability(
         typer.Option("--kinds", "-k", metavar="NAME...", rich_help_panel=MODEL, help="bias, drift. [dim]bias[/]"),
     ] = None,
     load: Load = None,
+    disturbance: Disturbance = None,
     state_jump: StateJump = True,
     draws: Annotated[
         int, typer.Option("--draws", rich_help_panel=MODEL, help="Simulated windows per fault.")
@@ -55,8 +56,8 @@ def isolability(
         found = dictionary(
             plant,
             kinds=words.listed(kinds) or ["bias"],
-            process=words.directions(load, "--load"),
-            state_jump=state_jump,
+            process=words.directions(load, "--process", plant),
+            state_jump=state_jump, disturbances=words.listed(disturbance) or (),
         )
         waiting.step("simulating faults")
         study = found.isolability(

@@ -92,9 +92,19 @@ Load = Annotated[
     list[str] | None,
     typer.Option(
         "--load",
+        "--process",
         metavar="NAME=E1,E2,...",
         rich_help_panel=MODEL,
-        help="Direction of a disturbance in the state equation, one number per state.",
+        help="Direction of a process fault: one number per state, or what it does to outputs, as leak=y1:-1.",
+    ),
+]
+Disturbance = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--disturbance",
+        metavar="NAME",
+        rich_help_panel=MODEL,
+        help="An input, an output or a --process direction that may do anything without being a fault.",
     ),
 ]
 StateJump = Annotated[

@@ -11,6 +11,8 @@ _HOME = {
     "rank.hard_over": ["hard_over_test", "HardOver"],
     "whitening": ["whiten", "health", "predictor"],
     "nuisance": ["model_uncertainty"],
+    "decoupling": ["decoupled"],
+    "directions": ["direction_of"],
     "screening": ["flat_lines", "check_channels"],
     "signatures": ["dictionary", "Dictionary", "Candidate"],
     "isolability": ["Isolability"],

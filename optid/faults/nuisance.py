@@ -19,6 +19,7 @@ largest factor that the record allows.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +27,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data, Experiment
 from optid.errors import DataError
+from optid.faults.ranges import outside, unknown_effects
 from optid.faults.whitening import Predictor, predictor
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
@@ -61,10 +63,12 @@ class Nuisance:
     Attributes:
         U: (N l, q) orthonormal.
         s: (q,).
+        unknown: number of axes along which nothing is known beside the initial state.
     """
 
     U: Array
     s: Array
+    unknown: int = 0
 
     def __call__(self, r: Array) -> Array:
         """Whiten (N, l) or (N, l, d)."""
@@ -91,6 +95,17 @@ class ModelUncertainty:
     readings: int
     inflation: float = 1.0
 
+    @cached_property
+    def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
+        """Two models beside the model along every column of root, and what their difference is multiplied by."""
+        theta, steps, back = parameters(self.model)
+        largest = np.abs(self.root / steps[:, None]).max(axis=0, initial=0.0)
+        largest[largest == 0] = 1.0
+        found = []
+        for column, size in zip(self.root.T, largest):
+            found.append((back(theta + column / size), back(theta - column / size), float(size / 2)))
+        return found
+
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
         """Return what the uncertainty leaves in the whitened innovations of a record.
 
@@ -105,11 +120,20 @@ class ModelUncertainty:
         if free_start:
             sizes = np.linalg.norm(by_start, axis=0)
             columns.append(DIFFUSE * by_start / np.where(sizes > 0, sizes, 1.0))
+        unknown = 0
+        if outside(self.model, part.u):
+            free = self.predictor.respond(*unknown_effects(self.model, part.u), present)
+            flat = self.predictor.whitened(free, present).reshape(present.size, -1)
+            sizes = np.linalg.norm(flat, axis=0)
+            columns.append(DIFFUSE * flat[:, sizes > 0] / sizes[sizes > 0])
+            unknown = int(np.linalg.matrix_rank(columns[-1])) if sizes.any() else 0
         U, s, _ = np.linalg.svd(np.hstack(columns), full_matrices=False)
-        return Nuisance(U, s)
+        return Nuisance(U, s, unknown)
 
 
-def model_uncertainty(model: "HammersteinSS", data: Data, *, healthy: Data | None = None) -> ModelUncertainty:
+def model_uncertainty(
+    model: "HammersteinSS", data: Data, *, healthy: Data | None = None, decoupled: Predictor | None = None,
+) -> ModelUncertainty:
     """Return the covariance of the parameters of a model, from the record it was identified from.
 
     All entries of the matrices that are not zero throughout, the gain, the offsets and the coefficients of the
@@ -120,17 +144,18 @@ def model_uncertainty(model: "HammersteinSS", data: Data, *, healthy: Data | Non
         data: the record it was identified from.
         healthy: a later healthy record, which was not used to identify it. The covariance is multiplied by the upper
             bound (`CONFIDENCE`) of the factor that this record asks for, never by less than one.
+        decoupled: a predictor that does not feel declared disturbances, in place of that of the model.
 
     Raises:
         DataError: fewer than two readings for each direction of the parameters that changes the predictions.
         StructureError: no noise covariances.
     """
     raw = in_units_of(model, data)
-    steady = _forgetting(model, sum(len(part.y) for part in raw.experiments))
+    steady = _forgetting(model, sum(len(part.y) for part in raw.experiments)) if decoupled is None else decoupled
     gained = replace(model, K=steady.K)
     given = gained.initial_state(raw, "predict")
     starts = given if isinstance(given, tuple) else (given,)
-    count = len(_parameters(gained)[0])
+    count = len(parameters(gained)[0])
     information, readings, energy = np.zeros((count, count)), 0, 0.0
     for part, x0 in zip(raw.experiments, starts):
         present = ~np.isnan(part.y)
@@ -139,7 +164,7 @@ def model_uncertainty(model: "HammersteinSS", data: Data, *, healthy: Data | Non
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
         rest = by_parameter - basis @ (basis.T @ by_parameter)
         information += rest.T @ rest
-        readings += int(present.sum()) - basis.shape[1]
+        readings += int(present.sum()) - basis.shape[1] - steady.silent * int(present.all(axis=1).sum())
         errors = np.where(present, part.y - simulation.run(_job(gained, part), x0), 0.0)
         white = steady.whitened(errors, present).ravel()
         energy += float(np.sum((white - basis @ (basis.T @ white)) ** 2))
@@ -214,10 +239,10 @@ def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertain
         steady: its predictor.
     """
     gained = replace(model, K=steady.K)
-    return ModelUncertainty(gained, steady, np.zeros((len(_parameters(gained)[0]), 0)), 0)
+    return ModelUncertainty(gained, steady, np.zeros((len(parameters(gained)[0]), 0)), 0)
 
 
-def _parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], "HammersteinSS"]]:
+def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], "HammersteinSS"]]:
     """Return the parameters, a step for each, and the way back."""
     used = [name for name in MATRICES if np.any(getattr(model, name))]
     functions = [*model.nonlinearities, *model.feedback]
@@ -241,7 +266,7 @@ def _sensitivities(
     model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array
 ) -> tuple[Array, Array]:
     """Derivatives (N l, q) and (N l, n) of the whitened innovations along the columns of root and by the start."""
-    theta, steps, back = _parameters(model)
+    theta, steps, back = parameters(model)
     scaled = root / steps[:, None]
     largest = np.abs(scaled).max(axis=0, initial=0.0)
     largest[largest == 0] = 1.0

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
+from optid.faults.decoupling import decoupled
 from optid.faults.faults import Fault, channel_of, place_of
 from optid.faults.scheduled import with_schedules
 from optid.faults.whitening import Predictor, predictor
@@ -34,7 +35,7 @@ KINDS = {
     "drift": ("actuator", "sensor", "process"),
     "jump": ("state",),
     "spike": ("sensor",),
-    "loss": ("actuator",),
+    "loss": ("actuator", "sensor"),
     "stuck": ("actuator",),
     "frozen": ("sensor",),
     "noise": ("sensor", "process"),
@@ -71,6 +72,8 @@ class Candidate:
         places: names of the parts that these faults are in.
         bounded_deflection: whether the trace dies out: waiting does not help.
         schedule: the matrices A(k) and B(k) of a scheduled change.
+        constants: whether constants are added to what a loss leaves.
+        zero: the input at which the actuator of a loss does nothing; None where that of f is meant.
     """
 
     name: str
@@ -82,6 +85,8 @@ class Candidate:
     places: tuple[str, ...] = ()
     bounded_deflection: bool = False
     schedule: Fault | None = None
+    constants: bool = False
+    zero: float | None = None
 
     @property
     def own_label(self) -> str:
@@ -101,7 +106,9 @@ class Candidate:
     @property
     def dimension(self) -> int:
         """Number of magnitudes to estimate."""
-        return 1 if self.kind == "loss" else 1 + len(self.columns) if self.kind == "stuck" else self.into_state.shape[1]
+        if self.kind in ("loss", "stuck"):
+            return 1 + len(self.columns) * (self.kind == "stuck" or self.constants)
+        return self.into_state.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,12 +218,14 @@ class Dictionary:
         if inputs.shape[1] != self.model.m:
             raise DataError(f"u has {inputs.shape[1]} channels; the model has {self.model.m}.")
         f = self.model.expanded(inputs)[:, list(c.columns)]
+        if c.zero is not None and c.kind == "loss":
+            f = f - self.model.expanded(np.full((1, self.model.m), c.zero))[:, list(c.columns)]
         on = (since >= 0).astype(float)[:, None]
         before = np.vstack([np.zeros((1, f.shape[1])), f[:-1]])  # what drives x(k) is the input before
         begun = on.copy()
         begun[:1] = 0.0
         into_state, into_output = [-(on * before) @ c.into_state.T], [-(on * f) @ c.into_output.T]
-        if c.kind == "stuck":
+        if c.kind == "stuck" or c.constants:
             for b, d in zip(c.into_state.T, c.into_output.T):
                 into_state.append(begun * b)
                 into_output.append(on * d)
@@ -242,7 +251,8 @@ class Dictionary:
 def dictionary(
     model: "HammersteinSS", *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
     kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None, state_jump: bool = True,
-    schedules: Mapping[str, Fault] | None = None, unknown: bool = True,
+    schedules: Mapping[str, Fault] | None = None, unknown: bool = True, zeros: Mapping[str, float] | None = None,
+    disturbances: Sequence[str] = (),
 ) -> Dictionary:
     """List the faults that are thought possible, merge those that look the same, leave out those nobody sees.
 
@@ -254,7 +264,12 @@ def dictionary(
         process: directions (n,) of disturbances in the state equation, by name.
         state_jump: whether the state may jump, in any direction.
         schedules: known changes of A and B by name, see `optid.faults.scheduled`.
-        unknown: whether "none of these" is an answer.
+        unknown: whether "none of these" is an answer. A constant disturbance of unknown direction is then one, too.
+        zeros: {input: the value at which its actuator does nothing}. A loss is the share (1 - gamma) of what the
+            actuator does beyond that; without it any constant may be added.
+        disturbances: names, as in `Fault`, of what may do anything at any time without being a fault: inputs, outputs,
+            directions of `process`. The predictor does not feel them (`optid.faults.decoupling`), and a direction that
+            is declared a disturbance is no fault.
 
     Raises:
         LookupFailed: an unknown kind or channel.
@@ -267,14 +282,20 @@ def dictionary(
     for kind in wanted:
         if kind not in KINDS:
             raise LookupFailed(f"no fault of kind {kind!r}. {nearest(kind, KINDS)}")
+    declared = [disturbances] if isinstance(disturbances, str) else list(disturbances)
     steady = predictor(model)
+    if declared:
+        model, steady = decoupled(model, declared, process)
+    apart = {name.partition(":")[2] or name for name in declared}
     names = [f"actuator:{c}" for c in _chosen(actuators, model.inputs)]
     names += [f"sensor:{c}" for c in _chosen(sensors, model.outputs)]
-    names += [f"process:{c}" for c in process or {}]
-    raw = [_candidate(model, name, kind, process) for kind in wanted if kind != "jump" for name in names
+    names = [name for name in names if name.partition(":")[2] not in apart]
+    names += [f"process:{c}" for c in process or {} if c not in apart]
+    at_rest = {_chosen([name], model.inputs)[0]: float(value) for name, value in (zeros or {}).items()}
+    raw = [_candidate(model, name, kind, process, at_rest) for kind in wanted if kind != "jump" for name in names
            if name.partition(":")[0] in KINDS[kind]]
     if state_jump or "jump" in wanted:
-        raw.append(_candidate(model, "state", "jump", None))
+        raw.append(_candidate(model, "state", "jump", None, {}))
     found, excluded = [], {}
     for candidate in raw:
         kept = _seen(model, steady, candidate, excluded)
@@ -296,13 +317,17 @@ def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
     return chosen
 
 
-def _candidate(model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None) -> Candidate:
+def _candidate(
+    model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None, zeros: Mapping[str, float]
+) -> Candidate:
     into_state, into_output = place_of(model, name, None, process)
     columns: tuple[int, ...] = ()
-    if kind in ("loss", "stuck"):
+    zero = None
+    if kind in ("loss", "stuck") and name.startswith("actuator"):
+        zero = zeros.get(name.partition(":")[2])
         c = channel_of(model.inputs, name)
         columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
-    new = Candidate(name, kind, into_state, into_output, columns)
+    new = Candidate(name, kind, into_state, into_output, columns, zero=zero)
     return replace(new, members=(new.own_label,), places=(name,))
 
 

@@ -44,6 +44,7 @@ class Predictor:
         K: (n, l) gain.
         covariance: (l, l) of the innovations.
         root: (l, l) lower triangular; root times an innovation has unit covariance.
+        silent: number of axes of the innovations that are left out, because declared disturbances reach them.
     """
 
     A: Array
@@ -52,6 +53,7 @@ class Predictor:
     K: Array
     covariance: Array
     root: Array
+    silent: int = 0
 
     @property
     def F(self) -> Array:  # noqa: N802 - the field's letter

@@ -38,6 +38,6 @@ def untestable(found: "Scan") -> dict[str, str]:
                     f"no excitation: a complete loss would have a deflection of {deflection:.2g} beside a constant "
                     f"offset, {LEAST:g} is needed (smallest Gram eigenvalue {max(value, 0.0):.2g})"
                 )
-        elif candidate.kind not in ("frozen", "noise") and np.isnan(found.statistic[c]).all():
+        elif candidate.kind not in ("frozen", "noise", "loss") and np.isnan(found.statistic[c]).all():
             result[candidate.label] = "nothing of it is seen in this record"
     return result

@@ -28,7 +28,9 @@ def left_over(whitened: Whitened, rest: Array, magnitudes: int, further: float =
     """
     from scipy.special import chdtrc
 
-    readings = max(int(whitened.present.sum()) - magnitudes, 1)
+    silent = whitened.predictor.silent * int(whitened.present.all(axis=1).sum())
+    unknown = 0 if whitened.nuisance is None else whitened.nuisance.unknown
+    readings = max(int(whitened.present.sum()) - silent - unknown - magnitudes, 1)
     energy = float(np.sum(rest**2))
     frequency, share, line = _spectrum(rest, whitened.present)
     tests = {"energy": float(chdtrc(readings, energy)), "period": line, "burst": _burst(rest, whitened.present),
@@ -100,6 +102,6 @@ def _burst(rest: Array, present: np.ndarray) -> float:
 def _direction(whitened: Whitened, rest: Array) -> Array:
     """Unit vector in units of the outputs along which most of the rest lies, its largest part positive."""
     _, _, axes = np.linalg.svd(rest, full_matrices=False)
-    vector = np.linalg.solve(whitened.predictor.root, axes[0])
+    vector = np.linalg.pinv(whitened.predictor.root, rcond=1e-12) @ axes[0]
     vector = vector / np.linalg.norm(vector)
     return np.asarray(vector * np.sign(vector[np.argmax(np.abs(vector))]))

@@ -46,6 +46,7 @@ class Estimate:
             interval of a share lost may reach above one, and does where all is lost.
         covariance: (d, d) of the size, with the spread over the onsets.
         deflection: sigma per sample times root of samples.
+        effect: {output: change that it makes in the end} of a lasting disturbance whose direction was estimated.
     """
 
     label: str
@@ -59,6 +60,7 @@ class Estimate:
     size_interval: Array
     covariance: Array
     deflection: float
+    effect: Mapping[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
         """Say what, since when and how large, with the intervals."""
@@ -78,6 +80,7 @@ class Estimate:
             "onset": self.onset, "onset_interval": list(self.onset_interval), "onset_censored": self.onset_censored,
             "size": _listed(self.size), "size_interval": _listed(self.size_interval),
             "covariance": _listed(self.covariance), "deflection": _listed(self.deflection),
+            "effect": {name: _listed(value) for name, value in self.effect.items()},
         }
 
     @classmethod
@@ -94,6 +97,7 @@ class Estimate:
             str(content["label"]), str(content["name"]), str(content["kind"]), candidate, int(content["onset"]),
             (int(low), int(high)), bool(content["onset_censored"]), _array(content["size"]),
             _array(content["size_interval"]), _array(content["covariance"]), float(_array(content["deflection"])),
+            {str(name): float(_array(value)) for name, value in content.get("effect", {}).items()},
         )
 
 

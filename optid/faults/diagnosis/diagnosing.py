@@ -104,8 +104,12 @@ def diagnose(
     plant = plant_of(model)
     record = record_of(plant.model, data)
     found = _dictionary(plant.model, faults)
-    steady = steady_predictor(plant.model, healthy, rescale)
-    uncertainty, remark = uncertainty_of(plant, model_uncertainty)
+    steady, decoupled = steady_predictor(plant.model, healthy, rescale), None
+    if found.predictor.silent:
+        plant, decoupled = plant._replace(model=found.model), found.predictor
+    uncertainty, remark = uncertainty_of(plant, model_uncertainty, decoupled)
+    if decoupled is not None:
+        steady = decoupled if uncertainty is None else uncertainty.predictor
     if steady is None and uncertainty is not None:
         steady = uncertainty.predictor  # whose covariance counts the degrees of freedom that the fit took
     if steady is not None:

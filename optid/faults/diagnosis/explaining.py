@@ -7,7 +7,9 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.consistency.leftover import UNFIT, further_fault, left_over
+from optid.faults.diagnosis.alternatives import UNLISTED, parted
 from optid.faults.diagnosis.answers import Remaining
+from optid.faults.diagnosis.counting import recounted
 from optid.faults.diagnosis.looking import Seen
 from optid.faults.diagnosis.posterior import Explained, Explanation, probabilities, several, single, smallest_set
 from optid.faults.search.pair_search import pairs
@@ -61,9 +63,22 @@ class Ranking(NamedTuple):
 
 
 def singles(seen: Seen) -> list[Explanation]:
-    """Return every candidate that is tested, over its onsets."""
-    found = [] if seen.search is None else [single(seen.search, candidate) for candidate in seen.tested]
-    return [explanation for explanation in found if explanation is not None] + seen.courses
+    """Return every candidate that is tested, and what is thought possible beside them, over their onsets."""
+    listed = seen.dictionary.candidates
+    result: list[Explanation] = []
+    if seen.search is not None:
+        for candidate in seen.tested:
+            found = single(seen.search, candidate)
+            if found is not None:
+                result += parted(recounted(found, seen.search, seen.uncertainty), seen.search, listed)
+    if seen.beside is not None:
+        lost = {label.removesuffix(" loss") for label in seen.lost}
+        for candidate in seen.beside.dictionary.candidates:
+            found = None if candidate.name in lost else single(seen.beside, candidate)
+            if found is not None:
+                found = found._replace(logs=found.logs + np.log(UNLISTED), entry=candidate)
+                result += parted(recounted(found, seen.beside, seen.uncertainty), seen.beside, listed)
+    return result + seen.gains_of_sensors + seen.courses
 
 
 def doubles(seen: Seen) -> tuple[list[Explanation], bool]:
@@ -101,23 +116,41 @@ def ranked(seen: Seen, explanations: Sequence[Explanation], rare: float, coverag
     if not explanations:
         return Ranking((), np.inf, exhaustive)
     logs = np.array([e.log_evidence + np.log(rare) * (len(e.candidates) - 1) for e in explanations])
-    posterior, sorted_logs = probabilities(logs), np.sort(logs)
-    odds = float(2 * (sorted_logs[-1] - sorted_logs[-2])) if logs.size > 1 else np.inf
-    chosen = smallest_set(posterior, coverage)
+    posterior = probabilities(logs)
+    for first, others in _alike(explanations, posterior).items():
+        posterior[first] = posterior[others].sum()
+        logs[first] = np.logaddexp.reduce(logs[others])
+        logs[[i for i in others if i != first]] = -np.inf
+        posterior[[i for i in others if i != first]] = 0.0
+    largest = np.sort(logs[np.isfinite(logs)])
+    odds = float(2 * (largest[-1] - largest[-2])) if largest.size > 1 else np.inf
+    chosen = [i for i in smallest_set(posterior, coverage) if posterior[i] > 0]
     return Ranking(tuple(_fit(seen, explanations[i], float(posterior[i])) for i in chosen), odds, exhaustive)
+
+
+def _alike(explanations: Sequence[Explanation], posterior: Array) -> dict[int, list[int]]:
+    """Explanations of one name: the most probable, and all of them."""
+    named: dict[tuple[str, ...], list[int]] = {}
+    for i, found in enumerate(explanations):
+        named.setdefault(tuple(c.label for c in found.candidates), []).append(i)
+    return {max(group, key=lambda i: posterior[i]): group for group in named.values() if len(group) > 1}
 
 
 def _fit(seen: Seen, explanation: Explanation, probability: float) -> Fit:
     best = explanation.best
     made = _made(seen, explanation)
+    rest = made.rest if explanation.error is None else explanation.error(made.rest)
     further, penalty = 1.0, 0.0
     if seen.search is not None and seen.limits is not None:
         search, limits = seen.search, seen.limits
-        gains = search.sweep.statistic(search.sweep.correlations(made.rest)) - limits.q[:, None]
+        gains = search.sweep.statistic(search.sweep.correlations(rest)) - limits.q[:, None]
         gains[np.isnan(seen.gains)] = np.nan
         further = further_fault(gains, limits.false_alarm)
-        penalty = float(np.nansum([limits.q[search.index(c)] for c in explanation.candidates]))
-    left = left_over(seen.whitened, made.rest, seen.nx + made.magnitudes, further)
+        listed = [] if explanation.entry is not None and explanation.entry not in search.dictionary.candidates else (
+            [explanation.entry] if explanation.entry is not None else explanation.candidates)
+        penalty = float(np.nansum([limits.q[search.index(c)] for c in listed])) if listed else float(
+            np.nanmax(limits.q))
+    left = left_over(seen.whitened, rest, seen.nx + made.magnitudes, further)
     return Fit(explanation, probability, float(explanation.energies[best] - penalty), made.fitted, left)
 
 
@@ -125,8 +158,9 @@ def _made(seen: Seen, explanation: Explanation) -> Explained:
     best = explanation.best
     if explanation.course is not None:
         return explanation.course(int(explanation.onsets[best, 0]))
-    assert seen.search is not None
+    source = seen.search if explanation.entry is None else seen.beside
+    assert source is not None
     pairs_of = zip(explanation.candidates, explanation.onsets[best])
-    traces = [seen.search.signature(candidate, int(onset)) for candidate, onset in pairs_of]
+    traces = [source.signature(candidate, int(onset)) for candidate, onset in pairs_of]
     fitted = np.concatenate(traces, axis=2) @ explanation.sizes[best]
     return Explained(fitted, seen.whitened.r - fitted, explanation.sizes.shape[1])

@@ -8,6 +8,7 @@ import numpy as np
 
 from optid.data.record import Data, Experiment
 from optid.faults.consistency.standstill import frozen
+from optid.faults.diagnosis.alternatives import final_effect
 from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate
 from optid.faults.diagnosis.courses import LONGEST
 from optid.faults.diagnosis.evidence import Evidence
@@ -17,6 +18,7 @@ from optid.faults.diagnosis.looking import Seen, look
 from optid.faults.diagnosis.methods import Way, by_bounds, by_programme
 from optid.faults.diagnosis.outliers import with_spikes
 from optid.faults.diagnosis.records import without_flat_lines
+from optid.faults.ranges import outside
 from optid.faults.screening import check_channels
 from optid.faults.signatures import Dictionary
 
@@ -52,7 +54,8 @@ class Job:
         still = without_flat_lines(self.record, self.number)
         stuck = frozen(still, self.record, self.found, 2 * model.nx)
         seen = look(self.record, still.part, self.found, asked, self.noise)
-        notes = [self.remark, *(f"{line}." for line in still.lines), _outliers(seen, model.outputs)]
+        notes = [self.remark, *(f"{line}." for line in still.lines), _outliers(seen, model.outputs),
+                 *map(str, outside(model, still.part.u))]
         p_value = seen.p_value(asked, self.found.unknown)
         seen, way, alarm = self.way(seen, still.part, p_value <= asked.false_alarm)
         ranking = way.ranking
@@ -149,6 +152,14 @@ class Job:
     def untold(self, seen: Seen) -> dict[str, str]:
         """Return the candidates that no search covers, and why."""
         found = self.found
+        gains = [c.label for c in found.candidates if c.kind == "loss" and not c.columns]
+        if gains and (found.model.feedback or np.any(found.model.L)):
+            why = "the model feeds readings back into its state, so that a wrong one changes the plant"
+            return dict.fromkeys(gains, why) | self._too_long(seen)
+        return self._too_long(seen)
+
+    def _too_long(self, seen: Seen) -> dict[str, str]:
+        found = self.found
         if seen.whitened.r.size > LONGEST:
             why = f"the record has more than {LONGEST} readings, too many for this kind: cut it"
             return {c.label: why for c in found.candidates if c.kind in ("frozen", "noise")}
@@ -163,6 +174,7 @@ class Job:
         result = []
         for fit in fits:
             faults = estimates(fit.explanation, asked.coverage, len(fit.fitted), 2 * model.nx)
+            faults = tuple(replace(one, effect=final_effect(model, one.name, one.size)) for one in faults)
             merged = tuple(sorted((*stuck, *faults), key=lambda fault: fault.onset))
             result.append(Answer(merged, fit.probability, fit.gain))
         return tuple(result)

@@ -12,10 +12,13 @@ from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.excitation import untestable
 from optid.faults.consistency.leftover import alarm_probability, left_over
+from optid.faults.diagnosis.alternatives import extended
 from optid.faults.diagnosis.courses import courses, without_signature
 from optid.faults.diagnosis.outliers import cleaned
 from optid.faults.diagnosis.posterior import Explanation
 from optid.faults.diagnosis.records import enough, one_record
+from optid.faults.diagnosis.sensor_gains import sensor_gains
+from optid.faults.nuisance import ModelUncertainty
 from optid.faults.search.calibration import EXCEEDING, Thresholds, thresholds
 from optid.faults.search.scanning import Scan, scan
 from optid.faults.signatures import Candidate, Dictionary
@@ -52,6 +55,7 @@ class Seen:
         lost: {label: why} of candidates that are not testable.
         healthy: what is left of the record if nothing is wrong.
         outliers: (sample, output) of readings that were taken out.
+        uncertainty: of the identified model; None where it is exact.
     """
 
     dictionary: Dictionary
@@ -63,6 +67,7 @@ class Seen:
     lost: dict[str, str]
     healthy: "Remaining"
     outliers: tuple[tuple[int, int], ...]
+    uncertainty: ModelUncertainty | None = None
 
     @property
     def tested(self) -> list[Candidate]:
@@ -94,6 +99,17 @@ class Seen:
             log = np.logaddexp.reduce([c.log_evidence for c in self.courses]) - np.log(len(self.courses))
             values.append(float(np.exp(-log)) / COURSE_SHARE)
         return min(values)
+
+    @cached_property
+    def beside(self) -> Scan | None:
+        """The search for what is thought possible beside the dictionary; None where that is nothing."""
+        more = extended(self.dictionary)
+        return None if more is None else scan(more, self.whitened, self.part.u)
+
+    @cached_property
+    def gains_of_sensors(self) -> list[Explanation]:
+        """Sensors that may have lost a share of their reading."""
+        return sensor_gains(self.dictionary, self.whitened, self.part)
 
     @cached_property
     def courses(self) -> list[Explanation]:
@@ -138,7 +154,7 @@ def look(
         gains = search.gains(limits)
         gains[[label in lost for label in found.labels]] = np.nan
     healthy = left_over(white, white.r, found.model.nx)
-    return Seen(found, part, white, search, limits, gains, lost, healthy, outliers)
+    return Seen(found, part, white, search, limits, gains, lost, healthy, outliers, noise.get("uncertainty"))
 
 
 def _limits(found: Dictionary, white: Whitened, u: Array, asked: "Question") -> Thresholds:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from optid.arrays import Array
+from optid.faults.nuisance import Nuisance
 from optid.faults.signatures import Candidate
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ class Explanation(NamedTuple):
         covariances: (K, d, d) for the onsets of the row.
         energies: (K,) energy explained, or twice the gain in log-likelihood.
         course: of candidates without a signature, what they make of the window for an onset.
+        error: of the trace, which an identified model knows only so well.
+        entry: the candidate of the search behind candidates that are special cases of it.
     """
 
     candidates: tuple[Candidate, ...]
@@ -62,6 +65,8 @@ class Explanation(NamedTuple):
     covariances: Array
     energies: Array
     course: Callable[[int], Explained] | None = None
+    error: Nuisance | None = None
+    entry: Candidate | None = None
 
     @property
     def log_evidence(self) -> float:
@@ -112,7 +117,8 @@ def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
     found = [scan.estimate(candidate, int(k)) for k in kept]
     sizes, covariances = np.array([m.nu for m in found]), np.array([m.covariance for m in found])
     return Explanation(
-        (candidate,), kept[:, None], logs + _bounded((candidate,), sizes, covariances), sizes, covariances, row[kept]
+        (candidate,), kept[:, None], logs + bounded_shares((candidate,), sizes, covariances), sizes, covariances,
+        row[kept],
     )
 
 
@@ -157,7 +163,7 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
             if first is second:  # counted once
                 apart &= ranges[j][rows[j]] < ranges[i][rows[i]]
     logs = np.where(apart, logs, -np.inf) if apart.any() else logs
-    logs = logs + _bounded(candidates, sizes, covariances)
+    logs = logs + bounded_shares(candidates, sizes, covariances)
     kept = logs > logs.max() - NEGLIGIBLE
     where = np.stack([there[row] for there, row in zip(ranges, rows)], axis=1)
     return Explanation(
@@ -176,8 +182,8 @@ def _solved(gram: Array, correlation: Array) -> tuple[Array, Array, Array, np.nd
     return covariances, sizes, np.einsum("ki,ki->k", sizes, correlation), there.sum(axis=1)
 
 
-def _bounded(candidates: Sequence[Candidate], sizes: Array, covariances: Array) -> Array:
-    """Logarithm (K,) of what it changes that a share lost lies between 0 and 1."""
+def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: Array) -> Array:
+    """Return the logarithm (K,) of what it changes that a share lost lies between 0 and 1."""
     from scipy.special import ndtr
 
     change = np.zeros(len(sizes))

@@ -105,17 +105,25 @@ def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Pre
     return found if rescale else None
 
 
-def uncertainty_of(plant: Plant, wanted: Any) -> tuple[ModelUncertainty | None, str]:
+def uncertainty_of(
+    plant: Plant, wanted: Any, decoupled: Predictor | None = None
+) -> tuple[ModelUncertainty | None, str]:
     """Return the uncertainty of the model that counts, and what is to be said of it.
 
     Args:
         plant: the model, and the record behind it.
         wanted: None (counted where a fit was given), "use", "ignore", or a `ModelUncertainty`.
+        decoupled: the predictor that does not feel declared disturbances.
 
     Raises:
         StructureError: "use" without a record or a covariance.
     """
     if isinstance(wanted, ModelUncertainty):
+        if decoupled is not None and not wanted.predictor.silent:
+            raise StructureError(
+                "This uncertainty is of a predictor that feels the declared disturbances: pass the fit in place of the "
+                "model, or model_uncertainty(faults.model, data, decoupled=faults.predictor)."
+            )
         return wanted, ""
     if wanted not in (None, "use", "ignore"):
         raise StructureError(f"model_uncertainty={wanted!r}: 'use', 'ignore' or a ModelUncertainty is needed.")
@@ -127,7 +135,8 @@ def uncertainty_of(plant: Plant, wanted: Any) -> tuple[ModelUncertainty | None, 
             "optid.faults.model_uncertainty(model, data) with the record it was identified from. 'ignore' takes the "
             "model as exact."
         )
-    return model_uncertainty(plant.model, plant.data), "The uncertainty of the identified model counts as noise."
+    found = model_uncertainty(plant.model, plant.data, decoupled=decoupled)
+    return found, "The uncertainty of the identified model counts as noise."
 
 
 @dataclass(frozen=True, eq=False)

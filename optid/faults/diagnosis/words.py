@@ -19,7 +19,8 @@ WORDS = {
 
 def estimate_line(fault: "Estimate") -> str:
     """Say in one or more lines what a fault is, since when and how large."""
-    return "\n".join([fault.label, *("  " + line for line in (onset_words(fault), *size_words(fault)))])
+    lines = onset_words(fault), *size_words(fault), *effect_words(fault)
+    return "\n".join([fault.label, *("  " + line for line in lines)])
 
 
 def onset_words(fault: "Estimate") -> str:
@@ -47,6 +48,13 @@ def size_words(fault: "Estimate") -> list[str]:
         else:
             lines.append(f"{word} between {low:.3g} and {high:.3g}")
     return lines
+
+
+def effect_words(fault: "Estimate") -> list[str]:
+    """Say what a disturbance of estimated direction does to the outputs."""
+    if not fault.effect:
+        return []
+    return ["moves " + ", ".join(f"{name} by {change:.3g}" for name, change in fault.effect.items()) + " in the end"]
 
 
 def magnitude_names(fault: "Estimate") -> list[str]:

@@ -41,6 +41,7 @@ class Target:
         limiting: {actuator: by how much the distance falls per unit of v by which its bound moves}, the most limiting
             first; empty where the reference is reached.
         solution: of the programme behind it; None on the NLP route.
+        idle: why nothing can be done, where no actuator is left; "" otherwise.
     """
 
     reference: Array
@@ -52,12 +53,15 @@ class Target:
     reachable: bool
     limiting: dict[str, float]
     solution: "Solution | None" = field(default=None, repr=False)
+    idle: str = ""
 
     def __str__(self) -> str:
         """Say whether it is reached, how near one gets, and what is in the way."""
         wanted, got = (", ".join(f"{value:.4g}" for value in point) for point in (self.reference, self.y))
         if self.reachable:
             return f"({wanted}) is reached with inputs ({', '.join(f'{value:.4g}' for value in self.u)})"
+        if self.idle:
+            return f"({wanted}) is not reachable: {self.idle}; the outputs rest at ({got}) whatever the inputs are"
         words = ", ".join(f"{name} ({price:.3g} per unit)" for name, price in self.limiting.items())
         limit = f"; limited by {words}" if words else ""
         return f"({wanted}) cannot be reached: nearest is ({got}), weighted distance {self.distance:.4g}{limit}"
@@ -99,6 +103,8 @@ class Allocation:
             StructureError: a reference of the wrong size or not finite, or a solver that finds no point.
         """
         r = self._reference(reference)
+        if not self.moving:
+            return self._idle(r)
         if self.route == "nlp":
             return self._resting(r)
         from optid.registry import fault_formulation
@@ -117,6 +123,21 @@ class Allocation:
         reachable = distance <= REACHED * np.sqrt(self.problem.scale)
         limiting = {} if reachable else self._limiting(v, y - r, distance)
         return Target(r, y, self.inputs(v), v, x, distance, reachable, limiting, solution)
+
+    @property
+    def idle(self) -> str:
+        """Why nothing can be controlled, where no actuator moves; "" otherwise."""
+        return "" if self.moving else f"nothing acts on {', '.join(self.model.outputs)}"
+
+    def _idle(self, r: Array) -> Target:
+        """Where the outputs come to rest by themselves, every actuator where it stands."""
+        u = (self.low + self.high) / 2
+        x, y = self.model.equilibrium(u)
+        distance = float(np.linalg.norm(self.weights * (y - r)))
+        scale = float(np.linalg.norm(self.weights * (np.abs(r) + np.abs(y)))) or 1.0
+        reached = distance <= REACHED * scale
+        limiting = {} if reached else {f"actuator:{name}": float("nan") for name in self.model.inputs}
+        return Target(r, y, u, self.model.expanded(u[None, :])[0], x, distance, reached, limiting, None, self.idle)
 
     def _limiting(self, v: Array, miss: Array, distance: float) -> dict[str, float]:
         """Actuators at a bound beyond which the outputs would come nearer, with the multipliers of the distance."""
@@ -208,6 +229,12 @@ class Allocation:
         """Return a predictive controller for this plant; see `optid.faults.repair.control.Controller`."""
         from optid.faults.repair.control import Controller
 
+        if self.idle:
+            rest = ", ".join(f"{value:.4g}" for value in self.model.equilibrium((self.low + self.high) / 2)[1])
+            raise StructureError(
+                f"not reachable: {self.idle}, so that there is nothing to control. The outputs rest at ({rest}); "
+                "attainable(reference) says how far that is from a reference, and the observer goes on watching."
+            )
         return Controller(self, horizon, effort=effort, rates=rates, route=route or self.route)
 
     def __str__(self) -> str:

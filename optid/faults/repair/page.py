@@ -7,6 +7,7 @@ import numpy as np
 
 from optid import __version__
 from optid.faults.repair.reformulation import Reformulation
+from optid.faults.repair.schedule import fit_words
 from optid.faults.repair.words import HEADS, member_lines
 from optid.show.page import figure, template, versions
 from optid.show.wording import Table, number
@@ -84,7 +85,7 @@ def _cards(found: Reformulation) -> list[dict[str, str]]:
         cards.append(("samples after the fault", str(found.schedule.samples)))
         low, high = found.fit_interval
         if np.isfinite(low):
-            cards.append(("expected simulation fit", f"{low:.1f} to {high:.1f} %"))
+            cards.append(("expected simulation fit", fit_words(low, high)))
     cards += [(f"predicted RMSE of {name}", number(found.observer.rmse[name], 3)) for name in found.observer.lost]
     if found.allocation is not None:
         cards.append(("actuators that move", ", ".join(found.allocation.moving) or "none"))

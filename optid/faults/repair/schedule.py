@@ -108,13 +108,25 @@ class Schedule:
             lines.append(f"  binding: {', '.join(self.active)}")
         if np.isfinite(self.fit_interval[0]):
             low, high = self.fit_interval
-            lines.append(f"  expected simulation fit {low:.1f} to {high:.1f} %")
+            lines.append(f"  expected simulation fit {fit_words(low, high)}")
         lines += [f"  {name}: {np.array2string(size, precision=4)}" for name, size in self.offsets.items()]
         return "\n".join([*lines, *(str(values) for values in self.values)])
 
     def _proof(self) -> str:
         assert self.solution is not None
         return f"gap {self.solution.gap:.1e}" if self.solution.proof else "no proof of global optimality"
+
+
+def fit_words(low: float, high: float) -> str:
+    """Return an interval of a fit in words; a fit below zero is worse than the mean of the outputs, by how much or not.
+
+    Args:
+        low: lower end, %.
+        high: upper end, %.
+    """
+    if high <= 0:
+        return "none: what is left of the outputs is smaller than the uncertainty of the refit"
+    return f"{max(low, 0.0):.1f} to {high:.1f} %"
 
 
 def refit(

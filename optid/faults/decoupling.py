@@ -1,0 +1,108 @@
+"""Declared disturbances of any course: predictors whose innovations do not feel them.
+
+A disturbance d of which nothing is known is white noise of unlimited variance for the one who has to guess it, so that
+the steady Kalman predictor of a model with the noise Q + s^2 E E', R + s^2 F F', S + s^2 E F' is, for large s, the
+optimal filter that decouples d (E in the state equation, F in the output equation). Its innovations grow with s along
+as many axes as disturbances can be told apart at the outputs; these axes carry nothing else and are taken out of the
+whitening. On the others thresholds and false alarms are those of a plant without d, whatever its course.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from optid.arrays import Array
+from optid.errors import LookupFailed, StructureError
+from optid.faults.faults import place_of
+from optid.faults.whitening import Predictor, predictor
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+UNLIMITED = 1e5
+"""Standard deviation of a disturbance, in those of the innovations that it reaches."""
+
+GENERIC = np.exp(0.7j) * 1.3
+"""A point of the plane at which the rank of the transfer from the disturbances to the outputs is taken."""
+
+
+def disturbance_columns(
+    model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
+) -> tuple[Array, Array]:
+    """Return where disturbances enter: E (n, d) of the state equation and F (l, d) of the output equation.
+
+    Args:
+        model: the plant.
+        disturbances: names as in `Fault`: "actuator:u1", "sensor:y1", "process:load"; the part before the colon may be
+            left out where one channel or direction has the name.
+        process: directions (n,) in the state equation by name.
+
+    Raises:
+        LookupFailed: no such channel or direction.
+        StructureError: a direction of another shape.
+    """
+    parts = []
+    for name in disturbances:
+        kinds = {"actuator": model.inputs, "sensor": model.outputs, "process": tuple(process or {})}
+        here = [kind for kind, names in kinds.items() if name in names]
+        if ":" in name:
+            parts.append(place_of(model, name, None, process))
+        elif len(here) == 1:
+            parts.append(place_of(model, f"{here[0]}:{name}", None, process))
+        else:
+            known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
+            raise LookupFailed(f"disturbance {name!r}: {'none' if not here else 'several'} of {known} has this name.")
+    return np.hstack([part[0] for part in parts]), np.hstack([part[1] for part in parts])
+
+
+def decoupled(
+    model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
+) -> tuple["HammersteinSS", Predictor]:
+    """Return a model whose noise holds disturbances of any course, and its predictor, which does not feel them.
+
+    Args:
+        model: with noise covariances.
+        disturbances: see `disturbance_columns`.
+        process: directions by name.
+
+    Raises:
+        LookupFailed: no such channel or direction.
+        StructureError: disturbances that cover all outputs: nothing is left to judge; or none that an output sees.
+    """
+    steady = predictor(model)
+    E, F = disturbance_columns(model, disturbances, process)
+    A, into = model.A + model.L @ model.C, E + model.L @ F  # what reaches the reading is fed back
+    transfer = model.C @ np.linalg.solve(GENERIC * np.eye(model.nx) - A, into) + F
+    seen = steady.root @ transfer
+    sizes = np.linalg.norm(seen, axis=0)
+    if not np.all(sizes > 0):
+        raise StructureError(f"No output ever sees one of the disturbances {', '.join(disturbances)}: leave it out.")
+    silent = int(np.linalg.matrix_rank(seen / sizes, tol=1e-8))
+    if silent >= model.l:
+        raise StructureError(
+            f"The disturbances {', '.join(disturbances)} of any course cover all outputs ({', '.join(model.outputs)}): "
+            "nothing is left to judge. Declare fewer of them, or add a sensor."
+        )
+    assert model.noise is not None
+    E, F, noise = UNLIMITED * E / sizes, UNLIMITED * F / sizes, model.noise
+    louder = replace(model, noise=replace(noise, Q=noise.Q + E @ E.T, R=noise.R + F @ F.T, S=noise.S + E @ F.T))
+    return louder, silenced(predictor(louder), steady, silent)
+
+
+def silenced(loud: Predictor, steady: Predictor, silent: int) -> Predictor:
+    """Return a predictor whose whitening leaves out the axes that are largest beside another one.
+
+    Args:
+        loud: the predictor.
+        steady: the one without disturbances.
+        silent: number of axes.
+    """
+    _, axes = np.linalg.eigh(steady.root @ loud.covariance @ steady.root.T)
+    kept = axes[:, : len(axes) - silent].T @ steady.root  # combinations of the outputs that do not feel them
+    small = kept @ loud.covariance @ kept.T
+    white = np.linalg.solve(np.linalg.cholesky(small), kept)
+    r = np.linalg.qr(np.vstack([white, np.zeros((silent, white.shape[1]))])[:, ::-1], mode="r")  # triangular again
+    return replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)

@@ -1,0 +1,137 @@
+"""Explanations that a search for the dictionary alone would miss or confuse.
+
+A broken actuator does (1 - gamma) f(u) + c. It is *stuck* where gamma = 1, and has *lost* a share where 0 < gamma < 1;
+c is free unless the input is known at which the actuator does nothing, because an identified f is known up to a
+constant only. Both are parts of one family, and which of them it is follows from how probable gamma = 1 is beside all
+other shares (the ratio of Savage and Dickey), not from an order.
+
+A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary. It is thought
+possible beside all entries: a named fault has to explain the record as well as the best direction does, for the number
+of magnitudes that this takes.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.faults.diagnosis.posterior import MODEL_ERROR, SPREADS, Explained, Explanation
+from optid.faults.faults import place_of
+from optid.faults.search.scanning import Scan
+from optid.faults.signatures import Candidate, Dictionary
+
+if TYPE_CHECKING:
+    from optid.models import HammersteinSS
+
+UNLISTED = 0.1
+"""Prior of a fault that the dictionary does not hold, beside one that it does."""
+
+UNKNOWN_DIRECTION = "process"
+"""Name of a disturbance whose direction is estimated."""
+
+INTEGRATES = 1e10
+"""Condition above which a plant integrates, so that a constant disturbance has no final effect."""
+
+EXACT = 1e-12
+"""Variance of a share lost that is known."""
+
+
+def extended(found: Dictionary) -> Dictionary | None:
+    """Return the candidates that are thought possible beside those of a dictionary; None for none.
+
+    They are actuators with a loss whose zero is not stated and that are not looked for as stuck, and, where "none of
+    these" is an answer, the constant disturbance of unknown direction.
+    """
+    stuck = {c.name for c in found.candidates if c.kind == "stuck"}
+    more = [
+        replace(c, kind="stuck") for c in found.candidates
+        if c.kind == "loss" and c.columns and c.zero is None and c.name not in stuck
+    ]
+    alone = found.model.l == 1 and any(c.kind == "frozen" for c in found.candidates)  # any course explains a record
+    if found.unknown and not alone and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
+        into_state, into_output = place_of(found.model, UNKNOWN_DIRECTION)
+        more.append(Candidate(
+            UNKNOWN_DIRECTION, "bias", into_state, into_output, members=(UNKNOWN_DIRECTION,),
+            places=(UNKNOWN_DIRECTION,),
+        ))
+    sines = np.full((len(more), len(more)), np.nan)
+    return replace(found, candidates=tuple(more), excluded={}, sines=sines) if more else None
+
+
+def parted(found: Explanation, scan: Scan, listed: Sequence[Candidate]) -> list[Explanation]:
+    """Return a broken actuator as a stuck one and as one that lost a share; anything else as it is.
+
+    Args:
+        found: the explanation.
+        scan: the search that it is from.
+        listed: the candidates of the dictionary: only kinds among them are offered.
+    """
+    family = found.candidates[0]
+    if len(found.candidates) == 1 and family.kind == "loss" and family.columns and not family.constants:
+        return [found._replace(logs=np.logaddexp(found.logs, _all_lost(found)) - np.log(2))]
+    if len(found.candidates) != 1 or family.kind != "stuck":
+        return [found]
+    kinds = {c.kind: c for c in listed if c.name == family.name}
+    result = []
+    if "stuck" in kinds:
+        result.append(_stuck(found, scan))
+    if "loss" in kinds and kinds["loss"].zero is None:
+        lost = replace(family, kind="loss", constants=True, members=(f"{family.name} loss",))
+        result.append(found._replace(candidates=(lost,), course=_course(found, scan, found.sizes), entry=family))
+    return result
+
+
+def _all_lost(found: Explanation) -> Array:
+    """Logarithm (K,) of the marginal likelihood with the share fixed to one."""
+    from scipy.special import ndtr
+
+    share, variance = found.sizes[:, 0], np.maximum(found.covariances[:, 0, 0], EXACT)
+    std = np.sqrt(variance)
+    wide = std * np.sqrt(np.mean(SPREADS))
+    before = ndtr(1 / wide) - 0.5
+    inside = ndtr((1 - share) / std) - ndtr(-share / std)
+    free = found.logs - np.log((1 - MODEL_ERROR) * inside / before + MODEL_ERROR)
+    return free - (1 - share) ** 2 / (2 * variance) - np.log(std * np.sqrt(2 * np.pi) * before)
+
+
+def _stuck(found: Explanation, scan: Scan) -> Explanation:
+    """The share fixed to one: the constants that belong to it, and the density of the share there."""
+    share, variance = found.sizes[:, 0], np.maximum(found.covariances[:, 0, 0], EXACT)
+    logs = _all_lost(found)
+    slope = found.covariances[:, 1:, 0] / variance[:, None]
+    sizes = np.hstack([np.ones((len(share), 1)), found.sizes[:, 1:] + slope * (1 - share)[:, None]])
+    covariances = np.zeros_like(found.covariances)
+    covariances[:, 0, 0] = EXACT
+    covariances[:, 1:, 1:] = found.covariances[:, 1:, 1:] - np.einsum(
+        "ki,kj,k->kij", slope, slope, found.covariances[:, 0, 0])
+    return found._replace(
+        logs=logs, sizes=sizes, covariances=covariances, energies=found.energies - (1 - share) ** 2 / variance,
+        course=_course(found, scan, sizes), entry=found.candidates[0],
+    )
+
+
+def _course(found: Explanation, scan: Scan, sizes: Array) -> Callable[[int], Explained]:
+    rows = {int(onset): row for row, onset in enumerate(found.onsets[:, 0])}
+    family = found.entry or found.candidates[0]
+
+    def made(onset: int) -> Explained:
+        fitted = scan.signature(family, onset) @ sizes[rows[onset]]
+        return Explained(fitted, scan.whitened.r - fitted, sizes.shape[1])
+
+    return made
+
+
+def final_effect(model: "HammersteinSS", name: str, size: Array) -> dict[str, float]:
+    """Return what a constant disturbance of estimated direction changes of every output in the end.
+
+    Args:
+        model: the healthy model.
+        name: of the fault; others than the disturbance of unknown direction have no effect to report.
+        size: (n,) along the states; NaN where it is not known.
+    """
+    A = np.eye(model.nx) - model.A - model.L @ model.C
+    if name != UNKNOWN_DIRECTION or size.shape != (model.nx,) or np.linalg.cond(A) > INTEGRATES:
+        return {}
+    return dict(zip(model.outputs, (model.C @ np.linalg.solve(A, size)).tolist()))

@@ -1,0 +1,103 @@
+"""Signatures of an identified model are uncertain: explanations are counted again with what their own traces may err.
+
+The errors delta of the parameters, of covariance P, change the trace S(theta) nu of a fault of size nu, too: J delta
+with J the sensitivity of the trace. So beside a fault the rest has the covariance I + J P J', and the larger the fault,
+the larger the error. With the singular values w and axes U of J P^(1/2) (whitened like the window) all products are
+those of generalised least squares: energies, magnitudes and their covariances at every onset, and the likelihood gains
+the factor of a rest that may be larger along U. Rivals whose traces differ by less than the error of either are then
+about as probable.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explanation, bounded_shares, marginal
+from optid.faults.faults import place_of
+from optid.faults.nuisance import ModelUncertainty, Nuisance
+from optid.faults.signatures import Candidate
+
+if TYPE_CHECKING:
+    from optid.faults.search.scanning import Scan
+
+SMALL = 1e-3
+"""Singular values below which an error of a trace counts for nothing."""
+
+
+def recounted(found: Explanation, scan: "Scan", uncertainty: ModelUncertainty | None) -> Explanation:
+    """Return an explanation by one candidate with the errors of its trace counted.
+
+    Args:
+        found: the explanation, from `scan`.
+        scan: the search.
+        uncertainty: of the identified model; None, or one without uncertain parameters, changes nothing.
+    """
+    if uncertainty is None or not uncertainty.root.shape[1] or len(found.candidates) != 1 or found.course is not None:
+        return found
+    candidate, best = found.candidates[0], found.best
+    if candidate.schedule is not None:
+        return found
+    error = trace_error(scan, uncertainty, candidate, int(found.onsets[best, 0]), found.sizes[best])
+    if not error.s.size:
+        return found
+    r = scan.whitened.r.ravel()
+    drop = 1 - 1 / (1 + error.s**2)
+    along = error.U.T @ r
+    changed = -0.5 * float(np.sum(np.log1p(error.s**2))) + 0.5 * float(np.sum(drop * along**2))
+    tested = int(np.sum(~np.isnan(scan.statistic[scan.index(candidate)])))
+    traces = np.stack([scan.signature(candidate, int(k)).reshape(r.size, -1) for k in found.onsets[:, 0]])
+    shared = np.einsum("nq,knd->kqd", error.U, traces, optimize=True)
+    gram = np.einsum("knd,kne->kde", traces, traces, optimize=True)
+    gram -= np.einsum("kqd,q,kqe->kde", shared, drop, shared, optimize=True)
+    along_traces = np.einsum("knd,n->kd", traces, r) - shared.transpose(0, 2, 1) @ (drop * along)
+    spread = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
+    nu = np.einsum("kde,ke->kd", spread, along_traces)
+    energy = np.einsum("kd,kd->k", nu, along_traces)
+    logs = marginal(energy, candidate.dimension) - np.log(tested) + changed
+    logs = logs + bounded_shares((candidate,), nu, spread)
+    kept = logs > logs.max() - NEGLIGIBLE
+    return found._replace(
+        onsets=found.onsets[kept], logs=logs[kept], sizes=nu[kept], covariances=spread[kept],
+        energies=energy[kept] + 2 * changed, error=error,
+    )
+
+
+def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidate, onset: int, size: Array) -> Nuisance:
+    """Return what the errors of the parameters leave of the trace of a fault, as a covariance of the window.
+
+    Args:
+        scan: the search.
+        uncertainty: of the model.
+        candidate: the fault.
+        onset: its first sample.
+        size: (d,) its magnitudes.
+    """
+    white = scan.whitened
+    def trace(changed: Any) -> Array:
+        found = replace(scan.dictionary, model=changed)
+        into_state, into_output = found.additions(moved(candidate, changed), len(white.r), onset, scan.u)
+        steady = replace(white.predictor, A=changed.A, C=changed.C, L=changed.L, K=changed.K)
+        return np.asarray(steady.respond(into_state @ size[:, None], into_output @ size[:, None], white.present))
+
+    pairs = uncertainty.moves
+    columns = np.empty((*white.r.shape, len(pairs)))
+    for j, (plus, minus, factor) in enumerate(pairs):
+        columns[:, :, j] = (trace(plus) - trace(minus))[:, :, 0] * factor
+    flat = white.seen(columns).reshape(white.r.size, -1)
+    U, s, _ = np.linalg.svd(flat, full_matrices=False)
+    there = s > SMALL
+    return Nuisance(U[:, there], s[there])
+
+
+def moved(candidate: Candidate, model: Any) -> Candidate:
+    """Return a candidate of another model: an actuator enters where that model says; directions stay."""
+    if not candidate.name.startswith("actuator"):
+        return candidate
+    into_state, into_output = place_of(model, candidate.name)
+    if into_state.shape != candidate.into_state.shape:
+        return candidate
+    return replace(candidate, into_state=into_state, into_output=into_output)
+
+

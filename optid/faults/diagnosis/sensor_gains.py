@@ -1,0 +1,188 @@
+"""A sensor that lost a share of its reading, (1.11): y = (1 - gamma) times what it would read, its noise as before.
+
+A lost share of a sensor is another row of C (of D and of the offset) from the onset on, so that the exact likelihood is
+that of a Kalman filter with this row, started from the state that the healthy one had at the onset. It is computed for
+many shares and onsets at once, over a grid that closes in on the most probable ones. A dead sensor, gamma = 1, reads
+its noise and is the end of the range.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Experiment
+from optid.errors import StructureError
+from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explained, Explanation
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Predictor, Whitened, predictor
+
+SHARES, ONSETS = 17, 15
+"""Shares and onsets of a grid."""
+
+ROUNDS = 12
+"""Grids at most, each about the best point of the one before."""
+
+CLOSER = 0.35
+"""A grid spans this share of the range of the one before."""
+
+FINE = 0.6
+"""Standard deviations of the share that the last grid may be apart."""
+
+LEAST = 5
+"""Samples that must follow the onset."""
+
+
+class _Grid(NamedTuple):
+    """The likelihood over a grid.
+
+    Attributes:
+        onsets: (K,).
+        shares: (G,).
+        logs: (K, G) of the likelihood beside that of health.
+    """
+
+    onsets: np.ndarray
+    shares: Array
+    logs: Array
+
+
+def sensor_gains(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
+    """Return the sensors of a dictionary that may have lost a share of their reading.
+
+    Args:
+        found: the dictionary; its candidates of kind "loss" at a sensor are judged.
+        white: the window.
+        part: the record behind it.
+    """
+    model = found.model
+    candidates = [c for c in found.candidates if c.kind == "loss" and not c.columns]
+    if not candidates or white.states is None or model.feedback or np.any(model.L):
+        return []
+    result = [_judged(found, candidate, white, part) for candidate in candidates]
+    return [explanation for explanation in result if explanation is not None]
+
+
+def _judged(found: Dictionary, candidate: Candidate, white: Whitened, part: Experiment) -> Explanation | None:
+    o = int(np.flatnonzero(candidate.into_output[:, 0])[0])
+    there = np.flatnonzero(white.present[:, o])
+    last = int(there[-LEAST]) if len(there) >= 2 * LEAST else 0
+    if last < 1:
+        return None
+    onsets: np.ndarray = np.unique(np.linspace(0, last, ONSETS).astype(int))
+    shares = np.linspace(0.0, 1.0, SHARES + 1)[1:]
+    grid, wide, high = None, float(last), 1.0
+    for _ in range(ROUNDS):
+        try:
+            grid = _likelihood(found, o, white, part, onsets, shares)
+        except StructureError:  # without this sensor some mode is not seen
+            return None
+        k, g = np.unravel_index(int(np.argmax(grid.logs)), grid.logs.shape)
+        weights = np.exp(grid.logs[k] - grid.logs[k, g])
+        weights /= weights.sum()
+        std = float(np.sqrt(max(weights @ grid.shares**2 - (weights @ grid.shares) ** 2, 0.0)))
+        step, apart = int(np.max(np.diff(onsets), initial=1)), float(shares[1] - shares[0])
+        if step == 1 and apart < FINE * std:
+            break
+        if step > 1:
+            wide *= CLOSER
+            reach = max(int(wide / 2), ONSETS // 2)
+            near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, last), ONSETS).astype(int)
+            onsets = np.unique(near)
+        if apart >= FINE * std:
+            high *= CLOSER
+            middle = float(np.clip(shares[g], high / 2, 1 - high / 2))
+            shares = np.linspace(max(middle - high / 2, 1e-6), middle + high / 2, SHARES)
+    assert grid is not None
+    return _explanation(found, candidate, white, part, o, grid)
+
+
+def _explanation(found: Dictionary, candidate: Candidate, white: Whitened, part: Experiment, o: int, grid: _Grid
+                 ) -> Explanation:
+    count = len(white.r)
+    most = grid.logs.max(axis=1)
+    weights = np.exp(grid.logs - most[:, None])
+    total = weights.sum(axis=1)
+    mean = weights @ grid.shares / total
+    variance = np.maximum(weights @ grid.shares**2 / total - mean**2, 1e-12)
+    logs = most + np.log(total * (grid.shares[1] - grid.shares[0])) - np.log(count)  # uniform over shares and onsets
+    kept = logs > logs.max() - NEGLIGIBLE
+
+    def rest(onset: int) -> Explained:
+        row = int(np.flatnonzero(grid.onsets == onset)[0])
+        left = _rests(found, o, white, part, np.array([onset]), mean[[row]])[0][0]
+        return Explained(white.r - left, left, 1)
+
+    return Explanation(
+        (candidate,), grid.onsets[kept][:, None], logs[kept], mean[kept][:, None], variance[kept][:, None, None],
+        2 * most[kept], rest,
+    )
+
+
+def _likelihood(found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
+                ) -> _Grid:
+    both = np.repeat(onsets, len(shares)), np.tile(shares, len(onsets))
+    rests, sizes = _rests(found, o, white, part, *both)
+    energies = np.einsum("jno,jno->j", rests, rests)
+    logs = 0.5 * float(np.sum(white.r**2)) - 0.5 * energies - sizes
+    return _Grid(onsets, shares, logs.reshape(len(onsets), len(shares)))
+
+
+def _rests(found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
+           ) -> tuple[Array, Array]:
+    """Whitened innovations (J, N, l) with a share lost from an onset on, and what their scale costs (J,)."""
+    model, steady, present = found.model, white.predictor, white.present
+    different, which = np.unique(shares, return_inverse=True)
+    scale = float(np.trace(steady.covariance) / np.trace(predictor(model).covariance))
+    filters = [_filter(found, o, float(share), scale) for share in different]
+    gain = np.stack([f.K for f in filters])[which]
+    rows, root = np.stack([f.C for f in filters])[which], np.stack([f.root for f in filters])[which]
+    left = np.ones((len(shares), model.l))
+    left[:, o] = 1 - shares
+    driven = model.expanded(part.u)
+    direct = driven @ model.D.T + model.offset_y
+    into = driven @ model.B.T + model.offset_x
+    assert white.states is not None
+    x, innovations = np.zeros((len(shares), model.nx)), np.empty((len(shares), *part.y.shape))
+    healthy = np.where(present, white.innovations, 0.0)
+    for k in range(len(part.y)):
+        begins = onsets == k
+        if begins.any():
+            x[begins] = white.states[k]
+        e = np.where(present[k], np.nan_to_num(part.y[k]) - left * direct[k] - np.einsum("jli,ji->jl", rows, x), 0.0)
+        innovations[:, k] = e
+        x = x @ model.A.T + into[k] + np.einsum("jil,jl->ji", gain, e)
+    result = np.empty_like(innovations)
+    before = steady.whitened(healthy, present)
+    costs = np.zeros(len(shares))
+    log_healthy = _scales(steady, present)
+    tails = [np.concatenate([np.cumsum((_scales(f, present) - log_healthy)[::-1])[::-1], [0.0]]) for f in filters]
+    for j, onset in enumerate(onsets):
+        result[j, :onset] = before[:onset]
+        own = replace(steady, covariance=filters[which[j]].covariance, root=root[j])
+        result[j, onset:] = own.whitened(innovations[j, onset:], present[onset:])
+        costs[j] = tails[which[j]][onset]
+    if white.nuisance is not None:
+        result = np.moveaxis(white.nuisance(np.moveaxis(result, 0, 2)), 2, 0)
+    return result, costs
+
+
+def _filter(found: Dictionary, o: int, share: float, scale: float) -> Predictor:
+    model = found.model
+    factors = np.ones(model.l)
+    factors[o] = 1 - share
+    damaged = replace(model, C=factors[:, None] * model.C, D=factors[:, None] * model.D,
+                      offset_y=factors * model.offset_y)
+    steady = predictor(damaged)
+    return replace(steady, covariance=scale * steady.covariance, root=steady.root / np.sqrt(scale))
+
+
+def _scales(steady: Predictor, present: np.ndarray) -> Array:
+    """Logarithm (N,) of the standard deviations of the readings that are there, together."""
+    patterns, of = np.unique(present, axis=0, return_inverse=True)
+    values = []
+    for pattern in patterns:
+        there = np.flatnonzero(pattern)
+        values.append(0.5 * float(np.linalg.slogdet(steady.covariance[np.ix_(there, there)])[1]) if there.size else 0.0)
+    return np.array(values)[of.ravel()]

@@ -1,0 +1,173 @@
+"""Kinds by likelihood, sensors that lost a share, leaks of unknown direction, disturbances of any course."""
+
+import numpy as np
+import pytest
+from fault_plants import levels
+from test_fault_injection import small
+
+from optid.errors import LookupFailed, StructureError
+from optid.faults import Fault, allocate, decoupled, diagnose, dictionary, direction_of, inject, whiten
+from optid.faults.diagnosis.sensor_gains import _likelihood, sensor_gains
+from optid.models.experiments import in_units_of
+
+COUNT = 160
+
+
+def said(fault, *, kinds=("bias", "loss", "stuck"), seed=1, process=None, u=None, **how):
+    model = small()
+    u = levels(COUNT, 0) if u is None else u
+    y = inject(model, u, fault, seed=seed, process=process)
+    return diagnose(model, (u, y), dictionary(model, kinds=list(kinds), **how))
+
+
+def test_a_sensor_that_lost_half_of_its_reading_is_named_with_its_share():
+    answer = said(Fault.loss("sensor:y1", 80, 0.5))
+    assert answer.best.label == "sensor:y1 loss" and answer.unique
+    low, high = answer.size_interval[0]
+    assert low <= 0.5 <= high and high - low < 0.2
+    assert answer.onset_interval[0] <= 80 <= answer.onset_interval[1]
+
+
+def test_the_likelihood_of_a_sensor_gain_is_that_of_a_kalman_filter_with_another_row():
+    model, u = small(), levels(COUNT, 0)
+    y = inject(model, u, Fault.loss("sensor:y2", 0, 0.4), seed=3)
+    found = dictionary(model, kinds=["bias", "loss"])
+    from optid.faults.diagnosis.records import record_of
+
+    record = record_of(model, (u, y))
+    part = in_units_of(model, record).experiments[0]
+    white = whiten(model, record, x0="zero")
+    grid = _likelihood(found, 1, white, part, np.array([0]), np.array([0.0, 0.4]))
+    factor = np.array([1.0, 0.6])
+    from dataclasses import replace
+
+    other = replace(model, C=factor[:, None] * model.C, D=factor[:, None] * model.D, offset_y=factor * model.offset_y)
+    again = whiten(other, record, x0="zero")
+    logs = [-0.5 * np.sum(w.r**2) + COUNT * np.linalg.slogdet(w.predictor.root)[1] for w in (white, again)]
+    assert grid.logs[0, 0] == pytest.approx(0, abs=1e-6)
+    assert grid.logs[0, 1] == pytest.approx(logs[1] - logs[0], rel=1e-6)
+
+
+@pytest.mark.sampled(1)
+def test_the_interval_of_a_sensor_gain_covers():
+    model, u, inside = small(), levels(COUNT, 0), 0
+    found = dictionary(model, kinds=["loss"])
+    from optid.faults.diagnosis.intervals import estimates
+    from optid.faults.diagnosis.records import record_of
+
+    for seed in range(20):
+        record = record_of(model, (u, inject(model, u, Fault.loss("sensor:y1", 60, 0.5), seed=seed)))
+        white = whiten(model, record)
+        one = next(e for e in sensor_gains(found, white, record.experiments[0]) if e.candidates[0].name == "sensor:y1")
+        low, high = estimates(one, 0.95, COUNT, 6)[0].size_interval[0]
+        inside += low <= 0.5 <= high
+    assert inside >= 16  # 19 of 20 are expected
+
+
+def test_a_partial_loss_about_another_zero_is_a_loss_and_a_stuck_actuator_is_stuck():
+    zero = -1.0  # the actuator does nothing there; f is the identity
+    u = levels(COUNT, 0) + 0.5
+    lost = Fault.loss("actuator:u1", 70, 0.5, bias=0.5 * zero)
+    answer = said(lost, u=u)
+    assert answer.best.label == "actuator:u1 loss" and answer.size[0] == pytest.approx(0.5, abs=0.15)
+    assert answer.size[1] == pytest.approx(0.5 * zero, abs=0.2)
+    stated = said(lost, u=u, zeros={"u1": zero})
+    assert stated.best.label == "actuator:u1 loss" and stated.size.shape == (1,)
+    assert stated.size_interval[0, 0] <= 0.5 <= stated.size_interval[0, 1]
+    answer = said(Fault.stuck("actuator:u1", 70, value=0.8), u=u)
+    assert answer.best.label == "actuator:u1 stuck"
+    np.testing.assert_allclose(answer.size, [1.0, 0.8], atol=0.2)
+    assert answer.size_interval[1, 0] <= 0.8 <= answer.size_interval[1, 1]
+
+
+def test_a_leak_without_its_direction_is_not_named_as_an_actuator():
+    model, leak = small(), {"leak": [0.1, 0.6, -0.7]}
+    answer = said(Fault.step("process:leak", 80, 0.9), process=leak)
+    assert answer.best.label == "process" and answer.unique
+    found = answer.size / np.linalg.norm(answer.size)
+    assert found @ np.array(leak["leak"]) / np.linalg.norm(leak["leak"]) > 0.9
+    assert model.outputs[0] in str(answer)  # what it does to the outputs is said, too
+    listed = said(Fault.step("process:leak", 80, 0.9), process=leak)
+    assert listed.verdict == "faulty"
+
+
+def test_directions_by_outputs_move_the_outputs_so_in_any_coordinates():
+    model = small()
+    found = direction_of(model, {"y1": -1.0})
+    np.testing.assert_allclose(model.C @ found, [-1.0, 0.0], atol=1e-5)
+    with pytest.raises(LookupFailed, match="no output 'y7'"):
+        direction_of(model, {"y7": 1.0})
+    with pytest.raises(StructureError, match="not zero"):
+        direction_of(model, {"y1": 0.0})
+
+
+@pytest.mark.parametrize("name", ["actuator:u2", "sensor:y2", "process:load"])
+def test_a_declared_disturbance_of_any_course_changes_nothing(name):
+    model, u, load = small(), levels(COUNT, 0), {"load": [0.3, -0.2, 0.5]}
+    found = dictionary(model, process=load, disturbances=[name], state_jump=False)
+    course = 30 * np.cumsum(np.random.default_rng(3).standard_normal(COUNT))
+    healthy = inject(model, u, (), seed=2, x0=np.zeros(3))
+    y = np.array(healthy)
+    if name == "actuator:u2":  # whose effect is the identity
+        y = inject(model, u + course[:, None] * [0.0, 1.0], (), seed=2, x0=np.zeros(3))
+    else:
+        unit = inject(model, u, Fault.jump(name, 0, 1.0), noise="none", x0=np.zeros(3), process=load)
+        impulse = unit - inject(model, u, (), noise="none", x0=np.zeros(3))
+        for k in range(COUNT):
+            y[k:] += course[k] * impulse[: COUNT - k]
+    _, steady = decoupled(model, [name], load)
+    from optid.faults.diagnosis.records import record_of
+
+    calm, moved = (whiten(found.model, record_of(model, (u, z)), x0="zero", scale=steady).r for z in (healthy, y))
+    assert np.abs(moved[4:] - calm[4:]).max() < 1e-2 < np.abs(y - healthy).max() / 100
+    assert np.mean(np.sum(calm[4:] ** 2, axis=1)) == pytest.approx(1, abs=0.3)  # one axis of two is left
+    assert diagnose(model, (u, y), found).verdict == "healthy"
+    broken = y + np.where(np.arange(COUNT) >= 80, 3.0, 0.0)[:, None] * np.array([1.0, 0.0])
+    answer = diagnose(model, (u, broken), found)
+    assert answer.detected and any("sensor:y1" in label for a in answer.candidates for label in a.labels)
+
+
+def test_an_input_outside_its_range_raises_no_fault_and_is_named():
+    from dataclasses import replace
+
+    from optid.bases import Polynomial
+    from optid.models import Nonlinearity
+
+    def curved(*, beyond):
+        basis = Polynomial(3, interval=(-1.2, 1.2), outside="extrapolate" if beyond else "clamp")
+        f = tuple(Nonlinearity(basis, np.array([1.0, 0.0, 0.3])) for _ in range(2))
+        return replace(small(), nonlinearities=f)
+
+    u = levels(COUNT, 0)
+    u[100:112, 1] = 2.5
+    y = inject(curved(beyond=True), u, (), seed=4)
+    found = dictionary(curved(beyond=False))
+    answer = diagnose(curved(beyond=False), (u, y), found)
+    assert answer.verdict == "healthy"
+    assert "u2 is outside the identified range [-1.2, 1.2] in 12 samples, first in sample 100" in answer.status
+    y[120:] += np.array([0.0, 2.0])
+    faulty = diagnose(curved(beyond=False), (u, y), found)
+    assert "sensor:y2" in [label for a in faulty.candidates for label in a.labels]
+
+
+def test_disturbances_that_cover_all_outputs_or_have_no_name_are_refused():
+    with pytest.raises(StructureError, match="nothing is left to judge"):
+        dictionary(small(), disturbances=["sensor:y1", "u1"])
+    with pytest.raises(LookupFailed, match="'wind'"):
+        dictionary(small(), disturbances=["wind"])
+
+
+def test_without_an_actuator_that_moves_it_is_said_what_is_out_of_reach():
+    from dataclasses import replace
+
+    from optid.bases import Linear
+    from optid.models import Nonlinearity
+
+    model = small()
+    dead = replace(model, nonlinearities=tuple(Nonlinearity(Linear(), np.zeros(1)) for _ in range(2)))
+    left = allocate(dead, low=[-1, -1], high=[1, 1])
+    target = left.attainable([1.0, 2.0])
+    assert not target.reachable and "nothing acts on y1, y2" in str(target)
+    np.testing.assert_allclose(target.y, dead.equilibrium(np.zeros(2))[1])
+    with pytest.raises(StructureError, match="not reachable: nothing acts on y1, y2"):
+        left.controller()
