@@ -97,7 +97,10 @@ def test_bad_input_is_one_message(folder, tmp_path):
         ((model, tmp_path / "none.csv"), "none.csv"), ((model, faulty, "--method", "exakt"), "exact"),
         ((model, faulty, "--kinds", "bais"), "bias"), ((model, faulty, "--max-faults", "3"), "sparse"),
         ((model, faulty, "--false-alarm", "1e-9"), "simulated windows"), ((model, faulty, "--load", "pump"), "NAME=E1"),
-        ((model, faulty, "--load", "pump=1,2"), "shape"), ((model, faulty, "--rescale"), "healthy"),
+        ((model, faulty, "--load", "pump=1,2"), "2 numbers for 3 states"),
+        ((model, faulty, "--process", "leak=y9:-1"), "no output 'y9'"), ((model, faulty, "--rescale"), "healthy"),
+        ((model, faulty, "--disturbance", "wind"), "'wind'"), ((model, faulty, "--zero", "u1"), "INPUT=VALUE"),
+        ((model, faulty, "--disturbance", "y1", "--disturbance", "y2"), "nothing is left to judge"),
         ((model, faulty, "--out", tmp_path / "no" / "d.json"), "no folder"), ((model, faulty, faulty), "one record"),
         ((model, faulty, "--picture", tmp_path / "d.xyz"), "xyz"), ((model, faulty, "--dt", "0.5"), "sampled every"),
     ):
