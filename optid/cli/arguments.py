@@ -239,7 +239,7 @@ def directions(words: Sequence[str] | None, option: str, model: Any = None) -> d
             raise StructureError(
                 f"{option} {word}: write NAME=E1,E2,..., one number per state, or NAME=OUTPUT:CHANGE,..."
             )
-        if named:
+        if named and model is not None:
             from optid.faults.directions import direction_of
 
             found[name] = direction_of(model, dict(zip(named, values)))

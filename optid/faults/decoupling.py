@@ -104,5 +104,5 @@ def silenced(loud: Predictor, steady: Predictor, silent: int) -> Predictor:
     kept = axes[:, : len(axes) - silent].T @ steady.root  # combinations of the outputs that do not feel them
     small = kept @ loud.covariance @ kept.T
     white = np.linalg.solve(np.linalg.cholesky(small), kept)
-    r = np.linalg.qr(np.vstack([white, np.zeros((silent, white.shape[1]))])[:, ::-1], mode="r")  # triangular again
+    r: Array = np.linalg.qr(np.vstack([white, np.zeros((silent, white.shape[1]))])[:, ::-1], mode="r")  # triangular again
     return replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
