@@ -9,7 +9,7 @@ whitening. On the others thresholds and false alarms are those of a plant withou
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -104,5 +104,5 @@ def silenced(loud: Predictor, steady: Predictor, silent: int) -> Predictor:
     kept = axes[:, : len(axes) - silent].T @ steady.root  # combinations of the outputs that do not feel them
     small = kept @ loud.covariance @ kept.T
     white = np.linalg.solve(np.linalg.cholesky(small), kept)
-    r: Array = np.linalg.qr(np.vstack([white, np.zeros((silent, white.shape[1]))])[:, ::-1], mode="r")  # triangular again
+    r: Any = np.linalg.qr(np.vstack([white, np.zeros((silent, white.shape[1]))])[:, ::-1], mode="r")  # triangular again
     return replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
