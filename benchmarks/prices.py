@@ -39,7 +39,9 @@ def rows(build: Callable[[Any], np.ndarray], equal: bool) -> Callable[[float], A
         def constraint(view: Any) -> dict[str, Any]:
             matrix = build(next(iter(view.bases.values())))
             x = view["mu"] if "mu" in view else view["Theta"] if equal else cp.sum(view["Theta"], axis=1)
-            return {"moved": [matrix @ x <= t, matrix @ x >= -t] if equal else [matrix @ x >= -t]}
+            if equal:
+                return {"moved": [matrix @ x <= t, matrix @ x >= -t]}
+            return {"moved": [matrix @ x >= -t, *([cp.sum(view["b"]) >= 0] if "b" in view else [])]}
 
         return constraint
 

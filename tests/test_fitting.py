@@ -155,7 +155,7 @@ def test_the_model_of_a_flipped_sign_keeps_its_units():
     """On scaled data the sign that a constraint gave to b survives the way back to raw units."""
     data = record(-1.0, noise=0.2)
     raw = optid.Data(u=5 * data.u, y=0.1 * data.y)
-    rules = ["monotone:increasing", "sign:b,negative"]
+    rules = [lambda v: {"rising": v.bases["u"].increments() @ v["mu"] >= 0}, "sign:b,negative"]
     fit = optid.fit(raw.scale(), na=2, nb=2, basis="triangular:6", constraints=rules)
     assert np.all(fit.model.b[0] < 0)
 

@@ -59,7 +59,7 @@ def test_rows_are_counted_over_the_members_of_a_group():
     fit = optid.fit(record(noise=1.0, count=60), na=2, nb=2, basis=BASIS, constraints=["convex"])
     price = fit.prices[0]
     bends = np.diff(np.diff(fit.model.nonlinearities[0](np.linspace(-1, 1, 7))))
-    assert price.rows == 5
+    assert price.rows == 5 + 1  # and the sign of the sum of b
     assert price.active == np.count_nonzero(np.abs(bends) < 1e-6)
     assert 0 < price.active < 5
 

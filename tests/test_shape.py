@@ -170,9 +170,26 @@ def test_a_direction_of_b_decides_the_sign_of_a_monotone_f(gain):
 
 def test_the_sign_rule_of_the_gauge_rests_where_a_constraint_fixes_a_sign():
     fit = optid.fit(record(-1.0, noise=0.2), na=2, nb=2, basis=BASIS,
-                    constraints=[shape.monotone("increasing"), shape.sign("b", "negative")])
+                    constraints=[lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b", "negative")])
     assert np.all(fit.model.b[0] < 0)
     assert shaped(fit.model, GRID)[-1] > shaped(fit.model, GRID)[0]
+
+
+@pytest.mark.parametrize("form", ["hammerstein_arx.exact", "hammerstein_arx.overparametrised", "hammerstein_oe.exact",
+                                  "hammerstein_armax.exact", "hammerstein_ss.sid", "hammerstein_ss.exact"])
+@pytest.mark.parametrize("gain", [1.0, -1.0])
+def test_a_monotone_plant_moves_where_the_word_says(form, gain):
+    orders = {"nx": 2} if "ss" in form else {"na": 2, "nb": 2, **({"nc": 1} if "armax" in form else {})}
+    errors = {}
+    for word in ("increasing", "decreasing"):
+        fit = optid.fit(record(gain, noise=0.2), form, basis=BASIS, constraints=[f"monotone:{word}"], prove=False,
+                        raises=False, **orders)
+        sign = 1.0 if word == "increasing" else -1.0
+        levels = [fit.model.simulate(np.full(3000, level))[-1] for level in GRID[::8]]
+        assert np.all(sign * np.diff(np.ravel(levels)) > -1e-5), word
+        errors[word] = fit.solution.objective
+    right, wrong = ("increasing", "decreasing") if gain > 0 else ("decreasing", "increasing")
+    assert errors[wrong] > 2 * errors[right]
 
 
 def two_channels():

@@ -2,10 +2,10 @@
 
 Every function returns a `Rule`, to be passed in ``constraints=[...]``. Two kinds of statement exist:
 
-* about the *shape* of f, free of scale and sign (monotone, odd, dead zone, known up to a factor). In the exact
-  formulations they act on ``mu`` and the sign is carried by ``b``: a monotone f with negative b is a falling static
-  characteristic. In the relaxed ones they act on ``Theta``; an inequality then speaks of the static characteristic,
-  the sum over the lags, which is implied by the exact statement when the lags sum to a positive number.
+* about the *shape* of f, free of scale (monotone, convex, odd, dead zone, known up to a factor). In the exact
+  formulations they act on ``mu``, and an inequality (monotone, convex, concave) also keeps the sum of ``b`` from being
+  negative, so that it holds for the static characteristic of a stable plant as for f. In the relaxed ones they act on
+  ``Theta``; an inequality then speaks of the static characteristic alone, the sum over the lags.
 * about the *static characteristic* ``y = (f(u) sum(b) + d) / (1 + sum(a))``, in units of the output: slope, range,
   points, gain. They are linear in ``(a, Theta, offset)`` and mean the same in every formulation and gauge. They
   include ``1 + sum(a) > 0``, which every stable model satisfies: without it there is no static characteristic.
@@ -40,7 +40,7 @@ SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic; 
 
 @recorded
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
-    """The nonlinearity is "increasing" or "decreasing" over the interval of its basis.
+    """The nonlinearity, and the static characteristic with it, is "increasing" or "decreasing" over its interval.
 
     Exact for piecewise linear and constant bases, sufficient for splines (control points), on a dense grid otherwise.
 
@@ -53,13 +53,13 @@ def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
 
 @recorded
 def convex(channel: str | None = None) -> Rule:
-    """The nonlinearity is convex over the interval of its basis."""
+    """The nonlinearity, and the static characteristic with it, is convex over the interval of its basis."""
     return _cone("convex", "", channel, lambda basis: basis.curvature(), heights=False)
 
 
 @recorded
 def concave(channel: str | None = None) -> Rule:
-    """The nonlinearity is concave over the interval of its basis."""
+    """The nonlinearity, and the static characteristic with it, is concave over the interval of its basis."""
     return _cone("concave", "", channel, lambda basis: -basis.curvature(), heights=False)
 
 
@@ -259,9 +259,11 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
     """Rows on f that are not negative; ``heights`` says that they are differences of its values."""
 
     def build(view: View) -> Any:
-        return [Limit(rows(view.basis(one)) @ curve >= 0, bound=one,
-                      step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
-                for one in _inputs(view, channel) for curve in view.curves(one)]
+        found = [Limit(rows(view.basis(one)) @ curve >= 0, bound=one,
+                       step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
+                 for one in _inputs(view, channel) for curve in view.curves(one)]
+        return found + [Limit(cp.sum(b) >= 0, bound=f"direction of {one}")
+                        for one in _inputs(view, channel) if (b := view.direction(one)) is not None]
 
     return Rule(label(f"{word}:{direction}" if direction else word, channel), build)
 

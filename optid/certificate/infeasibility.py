@@ -73,9 +73,21 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
             found.append(rows[:, form.problem.linear :] @ cp.hstack(thetas) <= lifted.linear.right[count:])
     if not found:
         return True
-    problem = cp.Problem(cp.Minimize(0), found)
+    bs = [program.variables[b] for _, b in form.blocks] if form is not None and form.gauge == "norm" else []
+    spoken = {v.id for name in names for c in program.constraints[name] for v in c.variables()}
+    return _feasible(found) and all(_has_length(b, found) for b in bs if b.id in spoken)
+
+
+def _feasible(members: Sequence[Any]) -> bool:
+    problem = cp.Problem(cp.Minimize(0), list(members))
     solve_quietly(problem)
     return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)  # an inaccurate proof is one as well
+
+
+def _has_length(b: cp.Variable, members: Sequence[Any]) -> bool:
+    """Whether b can have length one beside other constraints: then one entry has a modulus of 1 / sqrt(size)."""
+    least = b.size**-0.5
+    return any(_feasible([*members, sign * flat(b)[i] >= least]) for i in range(b.size) for sign in (1, -1))
 
 
 def _linearised(member: Any) -> Any:

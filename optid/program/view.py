@@ -141,6 +141,11 @@ class View(Mapping[str, cp.Expression]):
         mu = self.key("mu", channel)
         return self[mu] if mu in self else self[self.key("Theta", channel)]
 
+    def direction(self, channel: str) -> cp.Expression | None:
+        """Return ``b`` of an input where the sign of its sum is that of the plant over f; None where f is no factor."""
+        mu, b = self.key("mu", channel), self.key("b", channel)
+        return self[b] if mu in self and b in self and self[b].ndim == 1 else None
+
     def curves(self, channel: str) -> list[cp.Expression]:
         """Return what the shape of f is stated in: ``mu``, or the static curve of every output."""
         mu = self.key("mu", channel)
