@@ -232,7 +232,8 @@ _THRUSTER = _System(
 _TWO_INPUTS = _System(
     "two_inputs", 1.0, {"valve": "", "heater": "V"}, {"temperature": "K"}, np.array([-1.1, 0.3]),
     (np.array([-0.6, -0.3]), np.array([0.5, 0.4])), (_saturation, _power),
-    {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8", "constraints": ["monotone:increasing"]})
+    {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8",
+     "constraints": ["monotone:decreasing,channel=valve", "monotone:increasing,channel=heater"]})
 
 
 __dir__ = public_names(__name__)

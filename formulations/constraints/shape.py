@@ -262,8 +262,9 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
         found = [Limit(rows(view.basis(one)) @ curve >= 0, bound=one,
                        step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
                  for one in _inputs(view, channel) for curve in view.curves(one)]
-        return found + [Limit(cp.sum(b) >= 0, bound=f"direction of {one}")
-                        for one in _inputs(view, channel) if (b := view.direction(one)) is not None]
+        ways: dict[str, Any] = {one: view.direction(one) for one in _inputs(view, channel)}
+        return found + [Limit(np.ones(b.size) @ b >= 0, bound=f"direction of {one}") for one, b in ways.items()
+                        if b is not None]
 
     return Rule(label(f"{word}:{direction}" if direction else word, channel), build)
 

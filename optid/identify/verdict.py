@@ -17,6 +17,7 @@ from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.delays import LagSums, linear, sharp_delays
+from optid.identify.validation.checks import record_structure
 from optid.identify.validation.correlations import cross_correlation
 from optid.identify.validation.predictions import fit_percent, one_step, simulated_or_nan
 from optid.models.functions import has_feedback, static_functions
@@ -35,6 +36,9 @@ GAP = 15.0
 CORRELATED = 0.25
 """Largest correlation of residuals and past inputs; their p-values say nothing on long records."""
 
+STRUCTURE = 0.1
+"""Share of the residual variance that another structure may save in a model that is called good."""
+
 OUTSIDE = 0.01
 """Share of the samples that may lie outside the interval of a function."""
 
@@ -43,11 +47,12 @@ LAGS = 25
 
 @dataclass(frozen=True)
 class Finding:
-    """One part of a verdict: what was looked at, what was found, and whether it passes."""
+    """One part of a verdict: what was looked at, what was found, and whether it passes; some do not decide the word."""
 
     name: str
     value: str
     passed: bool
+    counts: bool = True
 
 
 @dataclass(frozen=True)
@@ -105,7 +110,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     parts += _delays(model, raw)
     steady = bool(model.is_stable) or (has_feedback(model) and np.isfinite(own))
     parts.append(Finding("stability", "stable" if steady else "unstable", steady))
-    parts += _ranges(model, raw)
+    parts += [*_ranges(model, raw), *_structure(model, raw)]
     return Verdict(_word(score, worst, pooled is not None and own - pooled > OVERFIT, parts), tuple(parts), score)
 
 
@@ -114,7 +119,7 @@ def _word(score: float, worst: float, overfitted: bool, parts: Sequence[Finding]
         return USELESS
     if score < POOR_FIT or overfitted:
         return POOR
-    failed = [part for part in parts if not part.passed]
+    failed = [part for part in parts if part.counts and not part.passed]
     return GOOD if score >= GOOD_FIT and not worst < GOOD_BLOCK and not failed else FAIR
 
 
@@ -165,6 +170,17 @@ def _ranges(model: Any, data: Data) -> list[Finding]:
     share, name = max(found)
     return [Finding("samples outside the range of a function", f"{100 * share:.2g} %" + (
         f" ({name})" if share and len(found) > 1 else ""), share <= OUTSIDE)]
+
+
+def _structure(model: Any, data: Data) -> list[Finding]:
+    """Say whether the record has the structure of the model; what saves hardly anything leaves a model good."""
+    with np.errstate(all="ignore"):
+        found = record_structure(model, data)
+    if found is None:
+        return []
+    saved = "" if found.passed else f", which saves {100 * found.saving:.2g} % of the residual variance"
+    return [Finding("structure", f"the record {found.finding}{saved} (p = {found.p_value:.2g})", found.passed,
+                    found.saving > STRUCTURE)]
 
 
 def _by_block(data: Data, runs: Sequence[Array]) -> Array:

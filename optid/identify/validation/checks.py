@@ -12,7 +12,15 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
 from optid.identify.record_checks import list_outside
 from optid.identify.validation.correlations import LEVEL, Correlation, autocorrelation, cross_correlation
-from optid.identify.validation.predictions import ONE_STEP, SIMULATION, Measures, one_step, predictors, simulated
+from optid.identify.validation.predictions import (
+    ONE_STEP,
+    SIMULATION,
+    Measures,
+    one_step,
+    predictors,
+    simulated,
+    simulated_or_nan,
+)
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.functions import has_feedback, static_functions
 from optid.registry import Rendered
@@ -120,7 +128,7 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
         if found := _simulated(model, raw, word, x0, notes):
             predicted[word] = found
     outside = _outside(model, raw, notes)
-    structure = _structure(model, raw, notes)
+    structure = record_structure(model, raw, notes)
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
     y = np.vstack([e.y for e in raw.experiments])
@@ -182,19 +190,28 @@ def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
     return shares
 
 
-def _structure(model: Any, data: Data, notes: list[str]) -> Structure | None:
-    # in closed loop the test says nothing, and the others are more than Hammerstein models
-    if has_feedback(model) or getattr(model, "latent", ()) or not static_functions(model):
+def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> Structure | None:
+    """Test whether a record has the structure of a model, None where nothing is to be tested; notes say why.
+
+    Hammerstein models answer for their class, models with feedback or latent functions for their own residuals.
+    """
+    notes = [] if notes is None else notes
+    beyond = has_feedback(model) or bool(getattr(model, "latent", ()))
+    if not beyond and not static_functions(model):
+        return None
+    runs = simulated_or_nan(model, data) if beyond else None
+    if runs is not None and not all(np.isfinite(y).all() for y in runs):
         return None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)
-            found = structure_test(data)
+            found = structure_test(data, runs)
     except RankError as error:
         notes.append(f"No structure test: this record does not determine a free model. {error}")
         return None
     if not found.passed:
         notes.append(
-            f"The record does not look Hammerstein: another structure saves {100 * found.saving:.2g} % of the residual "
-            f"variance (p = {found.p_value:.1g}). Consider a Wiener or Volterra model, or nonlinear feedback.")
+            f"The record {found.finding}; that saves {100 * found.saving:.2g} % of the "
+            f"residual variance (p = {found.p_value:.1g}). Consider functions of latent signals (lfr.exact), a Wiener "
+            "model, or nonlinear feedback.")
     return found

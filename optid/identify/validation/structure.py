@@ -5,8 +5,11 @@ A Hammerstein system with additive output noise of any colour obeys
     y(k) = c + sum_c sum_i h_c(i) f_c(u_c(k - i)) + v(k).
 
 Two consequences are tested, and neither needs an order or a noise model: (1) functions of single input samples explain
-all of y that the input explains, so that products of samples at different lags and functions of a filtered input, the
-mark of a Wiener system, save nothing; (2) the matrix of coefficients, lags times functions, has rank one.
+all of y that the input explains, so that alternatives (`structure_alternatives`) save nothing: products of samples at
+different lags, the mark of a Wiener system, functions of an output, fed back or not, functions behind a part of the
+poles, a gain that changes; (2) the matrix of coefficients, lags times functions, has rank one. What the functions and
+filters miss of a Hammerstein system is completed by finer functions and further lags, and a share of the variance too
+small to notice is allowed for in the distribution of every test.
 
 Lags are compressed by a few filters (`structure_design`). An autoregression fitted to the residuals makes the noise
 white, and since filtering in time leaves (1) and (2) as they are, F tests on the filtered columns hold for noise of
@@ -16,31 +19,41 @@ Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher
 (Billings and Voon 1986); rank one (Bai 1998).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.special import fdtrc
+from scipy.special import fdtrc, ncfdtr
 
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.validation.correlations import lagged_products
-from optid.identify.validation.structure_design import EXPLAINED, Design
+from optid.identify.validation.structure_alternatives import alternatives, wider
+from optid.identify.validation.structure_design import EXPLAINED, Design, Family, convolved
 from optid.statistics.factors import conditioning, dependent_column, root_of_gram
 from optid.structures.bilinear import minimise
 from optid.structures.rank_one import RankOne, matrices
 
-SIGNIFICANT = 1e-3
-NOTICEABLE = 0.015
-"""Share of the residual variance that another structure must save before a record is said not to look Hammerstein."""
+SIGNIFICANT = 5e-3
+UNNOTICED = 0.003
+"""Share of the residual variance that another structure may save in truth while a record counts as Hammerstein: the
+functions and filters of the test follow a system up to that."""
+
+PRODUCTS = "inputs at different lags act together, as in a Wiener system"
+RANK = "different lags see different nonlinearities"
+FUNCTIONS = "functions of the inputs explain a part of the residuals"
 
 NOISE_ORDER, KEPT = 12, 0.4
 """Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
 
 DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
+TURNS, SHARPER = 3, 0.99
+"""Regressions on fine functions, one on the filters between them; share of the variance they must leave to be used."""
+
 SAMPLES = 30_000
 """The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
 
@@ -51,55 +64,70 @@ class Structure:
 
     Attributes:
         ratios: second over first singular value of lags times functions by input, the largest over the outputs.
-        p_value: of the hypothesis that the record is Hammerstein, all tests together (Bonferroni); 1 when nothing is
-            to be tested.
-        saving: share of the residual variance that the more telling alternative saves.
-        products: by output, p value of the test that samples at different lags do not multiply.
-        rank: by output, p value of the test that all lags see the same nonlinearity.
+        p_value: of the hypothesis that the record is Hammerstein, up to what is not noticeable, all tests together
+            (Bonferroni); 1 when nothing is to be tested.
+        saving: share of the residual variance that the most telling alternative saves.
+        alternative: its words.
+        p_values: of every alternative by output.
     """
 
     ratios: dict[str, float]
     p_value: float
     saving: float
-    products: dict[str, float]
-    rank: dict[str, float]
+    alternative: str
+    p_values: dict[str, dict[str, float]]
 
     @property
     def passed(self) -> bool:
-        """Whether the record looks Hammerstein; a difference must be significant and noticeable to count."""
-        return not (self.p_value < SIGNIFICANT and self.saving > NOTICEABLE)
+        """Whether the record looks Hammerstein."""
+        return self.p_value >= SIGNIFICANT
 
     @property
     def finding(self) -> str:
         """What the tests say, in words."""
-        if self.passed:
-            return "looks Hammerstein"
-        if min(self.products.values()) <= min(self.rank.values()):
-            return "does not look Hammerstein: inputs at different lags act together, as in a Wiener system"
-        return "does not look Hammerstein: different lags see different nonlinearities"
+        kind = "look Hammerstein" if RANK in self.alternatives else "look like the model"
+        return kind.replace("look", "looks", 1) if self.passed else f"does not {kind}: {self.alternative}"
+
+    @property
+    def alternatives(self) -> set[str]:
+        """What has been tested."""
+        return {words for each in self.p_values.values() for words in each}
 
 
-def f_test(more: float, extra: int, rest: float, spare: int) -> tuple[float, float]:
-    """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom.
+@dataclass(frozen=True)
+class FTest:
+    """One F test: its p value, and the share of the residual variance that an alternative saves."""
 
-    Returns:
-        p value of the hypothesis that they are zero, 1 when nothing is to be tested, and the share of the residual
-        variance that they save, degrees of freedom discounted.
-    """
-    if extra <= 0 or rest <= 0:
-        return 1.0, 0.0
-    free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
-    return float(fdtrc(extra, spare, max(more, 0.0) / extra / free)), float(1 - free / restricted)
+    p_value: float = 1.0
+    saving: float = 0.0
+
+    @classmethod
+    def of(cls, more: float, extra: int, rest: float, spare: int, unnoticed: float) -> "FTest":
+        """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom.
+
+        The hypothesis is that they would save no more than a share `unnoticed` of the variance if the record were long
+        enough to know them: the statistic follows a noncentral F distribution at that share. The saving discounts the
+        degrees of freedom.
+        """
+        if extra <= 0 or rest <= 0:
+            return cls()
+        free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
+        ratio = max(more, 0.0) / extra / free
+        p = 1 - ncfdtr(extra, spare, unnoticed * (spare + extra), ratio) if unnoticed else fdtrc(extra, spare, ratio)
+        return cls(float(max(p, 0.0)), float(1 - free / restricted))
 
 
-def structure_test(data: Data) -> Structure:
+def structure_test(data: Data, simulated: Sequence[Array] | None = None) -> Structure:
     """Test whether a record comes from static nonlinearities of the inputs followed by linear dynamics.
 
-    The inputs must not depend on the noise: in closed loop the test says nothing. Of a long record, the first 30,000
-    samples are read, spread over the experiments in proportion.
+    With the simulated outputs of a model of another kind, such as nonlinear feedback, the test is whether functions of
+    the inputs, of these outputs, or of time explain what it leaves. The inputs must not depend on the noise: in closed
+    loop the test says nothing. Of a long record, the first 30,000 samples are read, spread over the experiments in
+    proportion.
 
     Args:
         data: the record; NaN = missing, several experiments as they are.
+        simulated: outputs of a model, (N, l) by experiment, which is tested in place of the best Hammerstein model.
 
     Raises:
         RankError: the record does not determine the free model, because it is short or its inputs have few levels or
@@ -108,58 +136,152 @@ def structure_test(data: Data) -> Structure:
     if data.n_samples > 1.1 * SAMPLES:
         data = data.split(SAMPLES / data.n_samples)[0]
     design = Design.of(data)
-    found = {name: _test_output(design, o) for o, name in enumerate(data.outputs)}
-    tests = [test for products, rank, _ in found.values() for test in (products, rank)]
-    # what is significant but too small to notice must not hide what is both
-    p_value, saving = min(tests, key=lambda test: (test[0] if test[1] > NOTICEABLE else 1.0, test[0]))
-    ratios = np.max([each for _, _, each in found.values()], axis=0)
-    return Structure(dict(zip(data.inputs, ratios.tolist())), min(1.0, len(tests) * p_value), saving,
-                     {name: products[0] for name, (products, _, _) in found.items()},
-                     {name: rank[0] for name, (_, rank, _) in found.items()})
+    if simulated is None:
+        found = {name: _test_output(design, o) for o, name in enumerate(data.outputs)}
+    else:
+        runs = [y[: e.n_samples] for y, e in zip(simulated, data.experiments)]
+        found = {name: _test_residuals(design, o, runs) for o, name in enumerate(data.outputs)}
+    tests = [(test, words) for each, _ in found.values() for words, test in each.items()]
+    best, words = min(tests, key=lambda pair: (pair[0].p_value, -pair[0].saving))
+    ratios = np.max([each for _, each in found.values()], axis=0)
+    return Structure(dict(zip(data.inputs, ratios.tolist())), min(1.0, len(tests) * best.p_value), best.saving, words,
+                     {name: {words: test.p_value for words, test in each.items()}
+                      for name, (each, _) in found.items()})
 
 
-def _test_output(design: Design, o: int) -> tuple[tuple[float, float], tuple[float, float], list[float]]:
-    """Return the F tests of products and rank on one output, and the second over first singular value by input."""
+@dataclass(frozen=True)
+class _Hypothesis:
+    """A Hammerstein model of an output.
+
+    Attributes:
+        bs: (J,) by input, coefficients of the filters.
+        functions: by input, (family, coefficients) of f.
+        theta: coefficients of the columns [1 | additive | fine through the filters `bs`].
+    """
+
+    bs: list[Array]
+    functions: list[tuple[Family, Array]]
+    theta: Array
+
+    def columns(self, design: Design, u: Array) -> Array:
+        """Return the columns of theta."""
+        return np.hstack([design.additive(u), design.finer(u, [design.filters @ b for b in self.bs])])
+
+
+def _test_output(design: Design, o: int) -> tuple[dict[str, FTest], list[float]]:
+    """Return the tests on one output by words, and the second over first singular value by input."""
     additive = _additive_gram(design, o)
     problem = _rank_one(additive, design.blocks, 1)
     free = matrices(np.linalg.solve(problem.root, problem.target)[1:], design.blocks)
     # the residuals of the hypothesis: the free model would explain part of a slow noise and hide its colour
-    hypothesis = minimise(problem, count=3).point
+    found = minimise(problem, count=3).point
+    theta = np.asarray(found.lift(), dtype=float)
+    hypothesis = _Hypothesis([np.asarray(b, dtype=float) for b in found.bs],
+                             [(f, np.asarray(mu, dtype=float)) for f, mu in zip(design.families, found.mus)],
+                             np.concatenate([theta, np.zeros(sum(f.size for f in design.fine))]))
     leading = [np.asarray(np.linalg.svd(theta)[2][:2], dtype=float) for theta in free]
     responses = _responses(design, leading, _linear_coefficients(additive, design.blocks))
-    bs = [np.asarray(b, dtype=float) for b in hypothesis.bs]
-    lines = [design.filters @ b for b in bs]
-    theta = np.asarray(hypothesis.lift(), dtype=float)
-    residuals, mean, spread, size = _residuals(design, o, theta, responses)
+    residuals, predicted, mean, spread, size = _residuals(design, o, hypothesis, responses)
     # in units of eps: one for every term of the sum, and the condition number for theta, found from a Gram matrix
     rounding = np.finfo(float).eps * (theta.size + conditioning(problem.root)) * size
     if np.nanstd(np.concatenate(residuals)) <= rounding:
-        return (1.0, 0.0), (1.0, 0.0), [0.0] * design.data.m
-    noise = _autoregression(residuals)
+        return {RANK: FTest()}, [0.0] * design.data.m
+    finer = _sharpened(design, o, hypothesis)
+    again = _residuals(design, o, finer, responses)
+    if np.nanvar(np.concatenate(again[0])) < SHARPER * np.nanvar(np.concatenate(residuals)):
+        hypothesis, (residuals, predicted, *_) = finer, again
+    groups, missed = alternatives(design, predicted), wider(design, hypothesis.functions)
+
+    def columns(i: int, part: slice, u: Array, output: Array) -> list[Array]:
+        carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
+        posed = hypothesis.columns(design, u)
+        return [np.hstack([posed, missed[i][part]]), _alternatives(carriers),
+                *(group[i][part] for group in groups.values()), (output - posed @ hypothesis.theta)[:, None]]
+
+    gram, edges, rows = _whitened(design, o, _autoregression(residuals), columns)
+    # what was cut off the responses acts on all of the output, however small the residuals are
+    cut = design.cut * float(np.var(np.concatenate(predicted))) / float(np.nanvar(np.concatenate(residuals)))
+    tests = _tested(gram, edges, rows, (PRODUCTS, *groups), UNNOTICED + cut)
+    if PRODUCTS not in tests:
+        raise RankError(f"{rows} complete rows for {edges[2]} columns of the structure test: use a longer record.")
+    keep = np.r_[: edges[1], edges[-1] - 1]
+    tests[RANK], ratios = _rank_test(gram[np.ix_(keep, keep)], hypothesis, design.blocks, rows, UNNOTICED + cut)
+    return tests, ratios
+
+
+def _test_residuals(design: Design, o: int, simulated: Sequence[Array]) -> tuple[dict[str, FTest], list[float]]:
+    """Test whether anything explains what a model leaves of an output."""
+    reach = len(design.filters) - 1
+    predicted = [y[reach:, o] for y in simulated]
+    groups = alternatives(design, predicted)
+    residuals = [e.y[reach:, o] - p for e, p in zip(design.data.experiments, predicted)]
+
+    def columns(i: int, part: slice, u: Array, output: Array) -> list[Array]:
+        one, rest = np.split(design.additive(u), [1], axis=1)
+        return [one, rest, *(group[i][part] for group in groups.values()), (output - predicted[i][part])[:, None]]
+
+    gram, edges, rows = _whitened(design, o, _autoregression(residuals), columns)
+    return _tested(gram, edges, rows, (FUNCTIONS, *groups), UNNOTICED), [0.0] * design.data.m
+
+
+def _whitened(design: Design, o: int, noise: Array, columns: Callable[[int, slice, Array, Array], list[Array]]
+              ) -> tuple[Array, list[int], int]:
+    """Return the Gram matrix of blocks of columns, filtered by the noise model; where they begin, and its rows."""
     past = noise.size - 1
     gram, sizes, rows = np.zeros((1, 1)), [0], 0
-    for _, u, output, valid in design.stretches(o, past):
-        carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
-        additive = design.additive(u)
-        blocks = [additive, design.finer(u, lines), _alternatives(carriers), (output - additive @ theta)[:, None]]
-        sizes, columns = [block.shape[1] for block in blocks], np.hstack(blocks)
+    for i, part, u, output, valid in design.stretches(o, past):
+        blocks = columns(i, part, u, output)
+        sizes, side_by_side = [block.shape[1] for block in blocks], np.hstack(blocks)
         complete = np.convolve(~valid, np.ones(past + 1))[past : valid.size] < 0.5
-        white = np.sum([a * columns[past - i : len(columns) - i] for i, a in enumerate(noise)], axis=0)[complete]
+        white = np.sum([a * side_by_side[past - k : len(side_by_side) - k] for k, a in enumerate(noise)],
+                       axis=0)[complete]
         gram = gram + white.T @ white
         rows += len(white)
-    edges = np.cumsum([0, *sizes])
-    if rows < 1.5 * edges[-1]:
-        raise RankError(f"{rows} complete rows for {edges[-1]} columns of the structure test: use a longer record.")
-    keep = np.r_[: edges[2], edges[-1] - 1]
-    return (_products_test(gram, int(edges[2]), rows),
-            *_rank_test(gram[np.ix_(keep, keep)], theta, bs, design.blocks, rows))
+    return gram, np.cumsum([0, *sizes]).tolist(), rows
+
+
+def _tested(gram: Array, edges: list[int], rows: int, words: Sequence[str], unnoticed: float) -> dict[str, FTest]:
+    """Test every block but the first and the last, the residual, beside the first; those that the rows allow."""
+    tests = {}
+    for name, first, last in zip(words, edges[1:], edges[2:-1]):
+        keep = np.r_[: edges[1], first:last, edges[-1] - 1]
+        if rows >= 1.5 * keep.size:
+            tests[name] = _added(gram[np.ix_(keep, keep)], edges[1], rows, unnoticed)
+    return tests
+
+
+def _sharpened(design: Design, o: int, hypothesis: _Hypothesis) -> _Hypothesis:
+    """Fit the fine functions and the filters in turn, beginning with the filters of a hypothesis."""
+    def regressed(columns: Callable[[Array], Array]) -> Array:
+        gram: Any = 0.0
+        for _, _, u, output, valid in design.stretches(o):
+            used = np.column_stack([np.ones(len(output)), columns(u), output])[valid]
+            gram = gram + used.T @ used
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        scaled = gram / np.outer(scale, scale)
+        return np.linalg.pinv(scaled[:-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:-1, -1] * scale[-1] / scale[:-1]
+
+    def filtered(u: Array) -> Array:
+        return np.hstack([convolved(f.values(u[:, c]) @ part[:, None], design.filters)[:, :, 0]
+                          for c, (f, part) in enumerate(zip(design.fine, parts))])
+
+    bs, theta, parts = hypothesis.bs, np.zeros(1), []
+    for turn in range(TURNS):
+        if turn:
+            found = regressed(filtered)[1:].reshape(design.data.m, -1)
+            bs = [b / max(float(np.linalg.norm(b)), 1e-300) for b in found]
+        lines: list[Array] = [design.filters @ b for b in bs]
+        theta = regressed(lambda u, lines=lines: design.finer(u, lines))
+        parts = np.split(theta[1:], np.cumsum([f.size for f in design.fine])[:-1])
+    coarse = np.zeros(sum(p * j for p, j in design.blocks))
+    return _Hypothesis(bs, list(zip(design.fine, parts)), np.concatenate([theta[:1], coarse, theta[1:]]))
 
 
 def _additive_gram(design: Design, o: int) -> Array:
     """Gram matrix [1 | filters of functions by input | y] of the additive regression."""
     size = 2 + sum(p * j for p, j in design.blocks)
     gram, rows = np.zeros((size, size)), 0
-    for _, u, output, valid in design.stretches(o):
+    for _, _, u, output, valid in design.stretches(o):
         used = np.column_stack([design.additive(u), output])[valid]
         gram += used.T @ used
         rows += len(used)
@@ -196,22 +318,27 @@ def _responses(design: Design, leading: list[Array], linear: Array) -> Array:
     return np.stack(responses, axis=1)
 
 
-def _residuals(design: Design, o: int, theta: Array, responses: Array) -> tuple[list[Array], Array, Array, float]:
-    """Residuals of the additive regression, NaN where a row is incomplete; mean and spread of the filtered inputs.
+def _residuals(design: Design, o: int, hypothesis: _Hypothesis, responses: Array
+               ) -> tuple[list[Array], list[Array], Array, Array, float]:
+    """Residuals of the hypothesis, NaN where a row is incomplete; its outputs; mean and spread of the filtered inputs.
 
     The last figure is the sum of the moduli of the terms of a row, root mean square over the rows.
     """
     residuals: list[Array] = [np.zeros(0)] * len(design.u)
+    predicted = list(residuals)
     sums, count, moduli = np.zeros((2, responses.shape[1])), 0, 0.0
-    for i, u, output, valid in design.stretches(o):
-        columns = design.additive(u)
-        residuals[i] = np.append(residuals[i], np.where(valid, output - columns @ theta, np.nan))
-        moduli += float(np.sum((np.abs(columns) @ np.abs(theta)) ** 2))
+    for i, _, u, output, valid in design.stretches(o):
+        columns = hypothesis.columns(design, u)
+        said = columns @ hypothesis.theta
+        predicted[i] = np.append(predicted[i], said)
+        residuals[i] = np.append(residuals[i], np.where(valid, output - said, np.nan))
+        moduli += float(np.sum((np.abs(columns) @ np.abs(hypothesis.theta)) ** 2))
         carriers = design.filtered(u, responses)
         sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
         count += len(carriers)
     mean = sums[0] / count
-    return residuals, mean, np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300)), float(np.sqrt(moduli / count))
+    spread = np.sqrt(np.maximum(sums[1] / count - mean**2, 1e-300))
+    return residuals, predicted, mean, spread, float(np.sqrt(moduli / count))
 
 
 def _alternatives(carriers: Array) -> Array:
@@ -250,7 +377,7 @@ def _distinct(gram: Array, least: float) -> Array:
     return vectors[:, values > least] / np.sqrt(values[values > least])
 
 
-def _products_test(gram: Array, n: int, rows: int) -> tuple[float, float]:
+def _added(gram: Array, n: int, rows: int, unnoticed: float) -> FTest:
     """Test whether columns n ... of the Gram matrix [additive | alternatives | residual] save anything."""
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     scaled = gram / np.outer(scale, scale)
@@ -263,7 +390,7 @@ def _products_test(gram: Array, n: int, rows: int) -> tuple[float, float]:
     more = float(np.sum((distinct.T @ (left[:-1, -1] / size)[new]) ** 2))
     extra = distinct.shape[1]
     rest = max(float(left[-1, -1]) - more, EXPLAINED)
-    return f_test(more, extra, rest, rows - sound.shape[1] - extra)
+    return FTest.of(more, extra, rest, rows - sound.shape[1] - extra, unnoticed)
 
 
 def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> RankOne:
@@ -276,35 +403,39 @@ def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> 
     return RankOne(root[:n, :n], root[:n, n], float(root[n, n] ** 2), blocks, linear)
 
 
-def _rank_test(gram: Array, theta: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int
-               ) -> tuple[tuple[float, float], list[float]]:
-    """Test rank one of every block of [1 | blocks | fine | residual]; also second over first singular values.
+def _rank_test(gram: Array, hypothesis: _Hypothesis, blocks: tuple[tuple[int, int], ...], rows: int,
+               unnoticed: float) -> tuple[FTest, list[float]]:
+    """Test rank one of every block of [1 | blocks | fine | missed | residual]; also second over first singular values.
 
-    The fine functions through the leading filter stay free: what the functions of the blocks miss of f must not pass
-    for a second nonlinearity.
+    The fine functions through the leading filter stay free, and so does what the filters miss: what the blocks miss of
+    f must not pass for a second nonlinearity.
     """
-    size = 1 + sum(p * j for p, j in blocks)
-    finer = _finer_directions(gram, leading, blocks)
-    linear = 1 + finer.shape[1]
+    size, n = 1 + sum(p * j for p, j in blocks), hypothesis.theta.size
+    filtered = np.asarray(block_diag(1.0, *(np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, hypothesis.bs))
+                                     ))
     unit = np.eye(len(gram))
+    finer = _beside(gram, np.pad(filtered, ((0, len(gram) - size), (0, 0))), unit[:, size:n])
+    finer = np.hstack([finer, _beside(gram, unit[:, :n], unit[:, n:-1], whole=True)])
+    linear = 1 + finer.shape[1]
     change = np.hstack([unit[:, :1], finer, unit[:, 1:size], unit[:, -1:]])
     problem = _rank_one(change.T @ gram @ change, blocks, linear)
-    output = problem.target + problem.root @ np.concatenate([theta[:1], np.zeros(linear - 1), theta[1:]])
+    coarse = np.concatenate([hypothesis.theta[:1], np.zeros(linear - 1), hypothesis.theta[1:size]])
+    fine = np.concatenate([np.zeros(size), hypothesis.theta[size:], np.zeros(len(gram) - n)])
+    output = problem.target + problem.root @ coarse
+    if fine.any():
+        output = output + np.linalg.solve(problem.root.T, change[:, :-1].T @ (gram @ fine))
     problem = replace(problem, target=output, scale=float("nan"))
     free = matrices(np.linalg.solve(problem.root, problem.target)[linear:], blocks)
     singular = [np.linalg.svd(theta, compute_uv=False) for theta in free]
     ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
     extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), max(problem.remainder, EXPLAINED * gram[-1, -1])
     more = minimise(problem, count=3).value - rest if extra else 0.0
-    return f_test(more, extra, rest, rows - len(problem.target)), ratios
+    return FTest.of(more, extra, rest, rows - len(problem.target), unnoticed), ratios
 
 
-def _finer_directions(gram: Array, leading: Sequence[Array], blocks: tuple[tuple[int, int], ...]) -> Array:
-    """Combinations (columns of `gram`) of the fine functions that the blocks' functions, so filtered, do not give."""
-    filtered = np.asarray(block_diag(1.0, *(np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, leading))))
-    size = len(filtered)
-    coarse, fine = np.pad(filtered, ((0, len(gram) - size), (0, 0))), np.eye(len(gram))[:, size:-1]
+def _beside(gram: Array, coarse: Array, fine: Array, whole: bool = False) -> Array:
+    """Combinations (columns of `gram`) of fine columns that coarse ones do not give: what they add, or as a whole."""
     fine = fine / np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
     inner = np.linalg.pinv(coarse.T @ gram @ coarse, rcond=1e-12, hermitian=True)
-    fine = fine - coarse @ (inner @ (coarse.T @ gram @ fine))
-    return fine @ _distinct(fine.T @ gram @ fine, DISTINCT)
+    added = fine - coarse @ (inner @ (coarse.T @ gram @ fine))
+    return (fine if whole else added) @ _distinct(added.T @ gram @ added, DISTINCT)

@@ -159,7 +159,8 @@ def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
     return poles * np.minimum(1.0, radius / np.maximum(np.abs(poles), 1e-300))
 
 
-def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, longest: int) -> Array:
+def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, longest: int, squared: bool = True
+                        ) -> Array:
     """Return impulse responses (T, J) that span q^-(delay + i) / A(q)^2, i = 0 ... 2n + extra, A with the given poles.
 
     With A^2 in the denominator the span contains B / A' for poles near the given ones, up to the square of their error.
@@ -169,8 +170,10 @@ def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, l
         extra: lags beyond those of A^2, for pulses and further delays.
         delay: samples before all responses begin.
         longest: samples after which the responses are cut at the latest.
+        squared: A^2 in the denominator, else A.
     """
-    a = np.asarray(np.real(np.poly(np.concatenate([poles, poles]))), dtype=float) if len(poles) else np.ones(1)
+    every = np.concatenate([poles, poles]) if squared else poles
+    a = np.asarray(np.real(np.poly(every)), dtype=float) if len(poles) else np.ones(1)
     count = a.size + extra
     response = lfilter([1.0], a, np.eye(1, max(longest, count + 1))[0])
     large = np.flatnonzero(np.abs(response) > SETTLED * np.abs(response).max())
@@ -215,6 +218,8 @@ class Design:
         fine: more functions of each input.
         filters: (L, J) orthonormal impulse responses.
         heavy: samples after a missing input until most of its effect has passed.
+        poles: those of the filters.
+        delay: samples before which the filters begin.
     """
 
     data: Data
@@ -223,13 +228,16 @@ class Design:
     fine: tuple[Family, ...]
     filters: Array
     heavy: int
+    poles: NDArray[np.complex128]
+    delay: int
 
     @classmethod
     def of(cls, data: Data) -> "Design":
         """Estimate delay and poles, and place the functions."""
         delay = delay_of(data)
         longest = int(np.clip(data.n_samples // 5, 20, LONGEST))
-        filters = orthonormal_filters(poles_of(data, delay), EXTRA, delay, longest)
+        poles = poles_of(data, delay)
+        filters = orthonormal_filters(poles, EXTRA, delay, longest)
         energy = np.cumsum(np.sum(filters**2, axis=1))
         each = data.n_samples // data.m
         hats, fine = int(np.clip(each // SAMPLES, 0, HATS)), int(np.clip(each // FINE_SAMPLES, 2, FINE_HATS))
@@ -237,17 +245,25 @@ class Design:
             data, tuple(interpolated(e.u) for e in data.experiments),
             families=tuple(Family.of(data, c, DEGREE, hats) for c in range(data.m)),
             fine=tuple(Family.of(data, c, FINE_DEGREE, fine) for c in range(data.m)),
-            filters=filters, heavy=int(np.searchsorted(energy, PRESENT * energy[-1])) + 1)
+            filters=filters, heavy=int(np.searchsorted(energy, PRESENT * energy[-1])) + 1, poles=poles,
+            delay=delay)
 
     @property
     def blocks(self) -> tuple[tuple[int, int], ...]:
         """Functions and filters by input."""
         return tuple((family.size, self.filters.shape[1]) for family in self.families)
 
-    def stretches(self, o: int, before: int = 0) -> Iterator[tuple[int, Array, Array, NDArray[np.bool_]]]:
-        """Yield experiment, inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
+    @property
+    def cut(self) -> float:
+        """Share of the energy of the slowest response that lies behind the end of the filters."""
+        slowest = float(np.max(np.abs(self.poles), initial=0.0))
+        return slowest ** (2 * (len(self.filters) - self.delay))
 
-        The first `before` rows of every stretch are those before it, once more.
+    def stretches(self, o: int, before: int = 0
+                  ) -> Iterator[tuple[int, slice, Array, Array, NDArray[np.bool_]]]:
+        """Yield experiment, rows, inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
+
+        The first `before` rows of every stretch are those before it, once more. Rows count from sample L - 1.
         """
         reach = len(self.filters) - 1
         for i, (e, u) in enumerate(zip(self.data.experiments, self.u)):
@@ -255,7 +271,8 @@ class Design:
             valid = (np.convolve(lost, np.ones(self.heavy))[: len(u)] < 0.5) & ~np.isnan(e.y[:, o])
             for start in range(reach + before, len(u), CHUNK):
                 rows = slice(start - before, min(start + CHUNK, len(u)))
-                yield i, u[rows.start - reach : rows.stop], e.y[rows, o], valid[rows]
+                counted = slice(rows.start - reach, rows.stop - reach)
+                yield i, counted, u[rows.start - reach : rows.stop], e.y[rows, o], valid[rows]
 
     def additive(self, u: Array) -> Array:
         """Return [1, filters of functions], (T, 1 + sum P_c J); per input, filters outermost."""
