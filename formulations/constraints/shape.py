@@ -263,7 +263,7 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
                        step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
                  for one in _inputs(view, channel) for curve in view.curves(one)]
         ways: dict[str, Any] = {one: view.direction(one) for one in _inputs(view, channel)}
-        return found + [Limit(np.ones(b.size) @ b >= 0, bound=f"direction of {one}") for one, b in ways.items()
+        return found + [Limit(b >= 0, bound=f"direction of {one}") for one, b in ways.items()
                         if b is not None]
 
     return Rule(label(f"{word}:{direction}" if direction else word, channel), build)

@@ -142,9 +142,22 @@ class View(Mapping[str, cp.Expression]):
         return self[mu] if mu in self else self[self.key("Theta", channel)]
 
     def direction(self, channel: str) -> cp.Expression | None:
-        """Return ``b`` of an input where the sign of its sum is that of the plant over f; None where f is no factor."""
+        """Return what has the sign of the static gain over f of an input: the sum of ``b``, or through A, B, C and D.
+
+        None where f is no factor, with several outputs, or where there is no static characteristic.
+        """
         mu, b = self.key("mu", channel), self.key("b", channel)
-        return self[b] if mu in self and b in self and self[b].ndim == 1 else None
+        if mu not in self or b not in self or self[b].ndim != 1:
+            return None
+        if "C" not in self.reference:
+            return np.ones(self[b].size) @ self[b]
+        if len(self.reference["C"]) > 1 or not (self.holds_matrices or self.key("static", channel) in self):
+            return None
+        if not self.holds_matrices:  # to first order, along the f where the descent stands
+            return np.ravel(self.reference[mu]) @ self.static(channel)
+        a, c = self.reference["A"], self.reference["C"]
+        row = np.linalg.lstsq((np.eye(len(a)) - a).T, c[0])[0]
+        return self.weights(channel, row, None) @ self[b]
 
     def curves(self, channel: str) -> list[cp.Expression]:
         """Return what the shape of f is stated in: ``mu``, or the static curve of every output."""
