@@ -240,8 +240,7 @@ def test_a_zero_input_channel_has_a_gauge():
 def test_the_start_has_the_sign_that_the_constraints_ask_for(solver):
     rising = record()
     falling = optid.Data(u=rising.u, y=-rising.y)
-    limits = [shape.monotone("increasing")]
-    up = optid.fit(rising, na=2, nb=2, basis=BASIS, constraints=limits, solver=solver, prove=False)
-    down = optid.fit(falling, na=2, nb=2, basis=BASIS, constraints=limits, solver=solver, prove=False)
+    up, down = (optid.fit(data, na=2, nb=2, basis=BASIS, constraints=[shape.monotone(word)], solver=solver, prove=False)
+                for data, word in ((rising, "increasing"), (falling, "decreasing")))
     assert down.solution.objective == pytest.approx(up.solution.objective, rel=1e-7)
-    assert np.allclose(down.model.b[0], -up.model.b[0], atol=1e-5)
+    assert np.allclose(down.model.nonlinearities[0].mu, -up.model.nonlinearities[0].mu, atol=1e-5)

@@ -184,5 +184,6 @@ def test_constraints_on_the_curve_leave_the_sign_to_the_gauge(gain, rule):
 
 
 def test_a_constraint_on_f_decides_the_sign():
-    fit = optid.fit(record(-1.0), na=2, nb=2, basis=BASIS, constraints=[shape.monotone()])
+    fit = optid.fit(record(-1.0), na=2, nb=2, basis=BASIS, constraints=[
+        lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}])
     assert fit.model.b[0][0] < 0 and "its sign follows from the constraints" in str(fit)

@@ -87,7 +87,8 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
 
 def test_products_of_two_cones():
     program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS,
-                                                      constraints=[shape.monotone(), shape.sign("b")])
+                                                      constraints=[
+        lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b")])
     lifted = lift(program, program.structure)
     assert set(lifted.cones) == set(lifted.directions) == {0}
     assert lifted.add_products(program.structure.problem) == [] and set(lifted.cones) == {0}
@@ -95,7 +96,7 @@ def test_products_of_two_cones():
     assert not right.any() and not equal.any()
     mu, b = np.random.default_rng(2).normal(size=6), np.array([0.3, 2.0])
     z = np.concatenate([np.zeros(3), np.kron(b, mu)])
-    (curve,), (sign,) = program.limits["monotone:increasing"], program.limits["sign:b:positive"]
+    (curve,), (sign,) = program.limits["rising"], program.limits["sign:b:positive"]
     ratio = -rows @ z / np.kron(b / sign.sizes, BASIS.increments() @ mu / curve.sizes)
     assert ratio[0] > 0 and np.allclose(ratio, ratio[0])  # one factor, that of the units
 

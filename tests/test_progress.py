@@ -26,5 +26,5 @@ def test_a_terminal_sees_the_time_that_is_left(monkeypatch, capsys):
 def test_a_fit_and_a_search_are_logged_and_print_nothing(caplog, capsys):
     with caplog.at_level(logging.DEBUG, "optid"):
         optid.identify(example("dead_zone").data, budget=2, workers=1, classes=["linear"])
-    assert " of at most 2 s, linear: " in caplog.text and "fit arx: optimal" in caplog.text
+    assert " of at most 2 s, linear: " in caplog.text and "fit arx: " in caplog.text
     assert capsys.readouterr() == ("", "")

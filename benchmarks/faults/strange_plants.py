@@ -120,8 +120,8 @@ FAILURES: dict[str, tuple[Failure, ...]] = {
               Failure("process:leak", "leak", 0)),
     "heater": (Failure("actuator:v", "loss", 0, 0.4), Failure("actuator:v", "stuck", 0, 5.0),
                Failure("sensor:T", "bias", 0, 1.0), Failure("sensor:T", "drift", 0, 0.02),
-               Failure("sensor:T", "frozen", 0),
-               Failure("sensor:T", "dead", 0), Failure("sensor:T", "gain", 0, 0.5), Failure("sensor:T", "noise", 0, 4.0),
+               Failure("sensor:T", "frozen", 0), Failure("sensor:T", "dead", 0),
+               Failure("sensor:T", "gain", 0, 0.5), Failure("sensor:T", "noise", 0, 4.0),
                Failure("process:leak", "leak", 0)),
 }
 """Faults of each plant; the onset is set by the run."""

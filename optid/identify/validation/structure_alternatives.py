@@ -54,16 +54,17 @@ def wider(design: Design, functions: Sequence[tuple[Family, Array]]) -> list[Arr
     Every f, a family with coefficients, at single lags and through slow poles, and what inputs before the record left.
     """
     reach = len(design.filters) - 1
-    lags = min(LAGS, design.data.n_samples // (20 * design.data.m), reach)
+    room = design.data.n_samples // (20 * design.data.m)
+    lags, slow = min(LAGS, room // 2, reach), SLOW[max(len(SLOW) - room // 4, 0) :]
     found = []
     for u in design.u:
         columns = []
         for c, (family, part) in enumerate(functions):
             v = family.values(u[:, c]) @ part
             columns += [v[reach - lag : len(v) - lag] for lag in range(lags)]
-            columns += [lfilter([1.0], [1.0, -pole], v - v.mean())[reach:] for pole in SLOW]
-        if len(design.u) <= FEW_RECORDS:
-            decays = np.asarray([pole ** np.arange(len(u) - reach) for pole in SLOW]).T
+            columns += [lfilter([1.0], [1.0, -pole], v - v.mean())[reach:] for pole in slow]
+        if slow and len(design.u) <= FEW_RECORDS:
+            decays = np.asarray([pole ** np.arange(len(u) - reach) for pole in slow]).T
             blocks = [decays if i == len(found) else 0 * decays for i in range(len(design.u))]
             columns += list(np.hstack(blocks).T)
         found.append(np.column_stack(columns))
