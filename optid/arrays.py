@@ -106,10 +106,15 @@ def one_of(name: str, value: Any, known: Sequence[str]) -> None:
 
 def finite(values: Any, name: str) -> np.ndarray:
     """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
-    array = np.array(values, dtype=float)
+    try:
+        array = np.array(values, dtype=float)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise StructureError(f"{name} must be an array of real numbers ({error}).") from error
     if not np.all(np.isfinite(array)):
         at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
+    if array.size and np.abs(array).max() > LARGEST:
+        raise StructureError(f"{name} contains a value above {LARGEST:g}, whose square overflows.")
     array.flags.writeable = False
     return array
 

@@ -62,8 +62,8 @@ def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, A
     if not text.strip():
         raise ModelFileError(f"{path} is empty. Save the {what} again.")
     try:
-        content = json.loads(text)
-    except (json.JSONDecodeError, RecursionError) as error:
+        content = json.loads(text, object_pairs_hook=_unique, parse_constant=_refused)
+    except (ValueError, RecursionError) as error:
         if text.lstrip()[0] == "{" and f'"{form}"' in text:
             raise ModelFileError(f"{path} is truncated or damaged ({error}). Save the {what} again.") from error
         raise ModelFileError(f"{path} is not a {what}: it is not JSON. {remedy}") from error
@@ -78,10 +78,23 @@ def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, A
         return build(content)
     except KeyError as error:
         raise ModelFileError(f"{path} lacks {error}: it is damaged. Save the {what} again.") from error
-    except (TypeError, ValueError, AttributeError, LookupFailed) as error:
+    except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError, RecursionError, MemoryError) as error:
         if isinstance(error, StructureError) and "functions=" in str(error):
             raise
-        raise ModelFileError(f"{path} is damaged: {error} Save the {what} again.") from error
+        text = str(error)[:500].rstrip(".")
+        raise ModelFileError(f"{path} is damaged: {text}. Save the {what} again.") from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"the key {next(key for key in keys if keys.count(key) > 1)!r} stands twice in one object")
+    return content
+
+
+def _refused(word: str) -> None:
+    raise ValueError(f"{word} is no number of JSON")
 
 
 def from_content(content: dict[str, Any], functions: dict[str, Any] | None = None) -> Any:

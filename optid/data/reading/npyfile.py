@@ -1,6 +1,7 @@
 """NumPy files, read and not mapped: mapped pages count as resident memory; headers are compared with the file first."""
 
 import math
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -140,10 +141,10 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"npy version {version} is unknown")
-    if version == (1, 0):
-        shape, by_column, dtype = np.lib.format.read_array_header_1_0(file)
-    else:
-        shape, by_column, dtype = np.lib.format.read_array_header_2_0(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # headers of Python 2, and damaged ones that look like them
+        shape, by_column, dtype = read(file)
     if any(not isinstance(n, int) or n < 0 for n in shape):
         raise ValueError(f"its header has shape {shape}")
     return shape, by_column, dtype

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from optid.errors import DataError
+from optid.data.reading.parts import damaged_parquet
 
 
 def parquet_schema(path: Path) -> dict[str, Any]:
@@ -27,4 +27,4 @@ def _guarded(path: Path, read: Callable[[], Any]) -> Any:
     try:
         return read()
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, MemoryError) as error:
-        raise DataError(f"{path.name} is not a Parquet file, or it is damaged: {error}") from error
+        raise damaged_parquet(path, error) from error

@@ -169,14 +169,26 @@ class RowGroups:
         import pyarrow as pa
 
         # Both settings bound the memory: by default pyarrow fetches the whole file ahead, or a whole row group.
-        with parquet.ParquetFile(self.path, buffer_size=1 << 20, pre_buffer=False) as file:
-            for name in wanted:
-                kind = file.schema_arrow.field(name).type
-                if name != clock and not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-                    raise DataError(f"{self.path.name}: column {name!r} is of type {kind}; convert it to numbers "
-                                    "first.")
-            for batch in file.iter_batches(self.chunk, row_groups=self.groups, columns=list(dict.fromkeys(wanted))):
-                yield {name: batch.column(name).to_numpy(zero_copy_only=False) for name in wanted}
+        try:
+            with parquet.ParquetFile(self.path, buffer_size=1 << 20, pre_buffer=False) as file:
+                for name in wanted:
+                    kind = file.schema_arrow.field(name).type
+                    if name != clock and not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+                        raise DataError(f"{self.path.name}: column {name!r} is of type {kind}; convert it to numbers "
+                                        "first.")
+                columns = list(dict.fromkeys(wanted))
+                for batch in file.iter_batches(self.chunk, row_groups=self.groups, columns=columns):
+                    block = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in wanted}
+                    yield block
+        except DataError:
+            raise
+        except (OSError, ValueError, KeyError, IndexError, MemoryError, pa.ArrowException) as error:
+            raise damaged_parquet(self.path, error) from error
+
+
+def damaged_parquet(path: Path, error: BaseException) -> DataError:
+    """Return the refusal of a Parquet file that a library could not read."""
+    return DataError(f"{path.name} is not a Parquet file, or it is damaged: {str(error)[:500]}")
 
 
 def parquet_parts(path: Path, chunk: int) -> list[FilePart]:

@@ -9,7 +9,16 @@ from typing import Any
 from optid.data.reading.chunks import Block
 from optid.data.reading.csvfile import open_csv
 from optid.data.reading.npyfile import NpyFile, open_npy
-from optid.data.reading.parts import FilePart, FramePart, Part, RowGroups, is_dask, parquet_parts, pyarrow_parquet
+from optid.data.reading.parts import (
+    FilePart,
+    FramePart,
+    Part,
+    RowGroups,
+    damaged_parquet,
+    is_dask,
+    parquet_parts,
+    pyarrow_parquet,
+)
 from optid.data.reading.tables import existing, position_names
 from optid.errors import DataError
 
@@ -124,8 +133,8 @@ def _parquet_footer(path: Path) -> tuple[list[str], int]:
     parquet = pyarrow_parquet(path.name)
     try:
         return list(parquet.read_schema(path).names), parquet.read_metadata(path).num_rows
-    except (ValueError, OSError) as error:
-        raise DataError(f"{path.name} is not a Parquet file, or it is damaged: {error}") from error
+    except (ValueError, KeyError, OSError, MemoryError) as error:
+        raise damaged_parquet(path, error) from error
 
 
 def _of_folder(folder: Path, chunk: int) -> Source:

@@ -1,0 +1,125 @@
+"""Damaged files end in an error of optid that names the file, in bounded time; some are still good, and are read."""
+
+import time
+import warnings
+
+import numpy as np
+import polars as pl
+import pytest
+from damage import bytes_of
+from scipy.io import savemat
+
+import optid
+from optid.data.reading import csvfile
+from optid.errors import OptidError
+
+U, Y = np.arange(60.0)[:, None], np.sin(np.arange(60.0))[:, None]
+
+
+def good_file(kind, folder):
+    """Write a good file of a kind and return its path."""
+    path = folder / f"r.{kind.split('-')[0]}"
+    if kind == "csv":
+        rows = [f"{0.1 * k:.1f},{u:.3f},{y:.6f}" for k, (u, y) in enumerate(zip(U[:, 0], Y[:, 0]))]
+        path.write_text("t,u,y\n" + "\n".join(rows))
+    elif kind == "parquet":
+        pl.DataFrame({"u": U[:, 0], "y": Y[:, 0], "run": ["a"] * 60}).write_parquet(path)
+    elif kind == "npz":
+        np.savez(path, u=U, y=Y, fs=3.0)
+    elif kind == "npz-packed":
+        np.savez_compressed(path, u=U, y=Y)
+    elif kind == "npy":
+        np.save(path, np.hstack([U, Y]))
+    elif kind == "mat":
+        savemat(path, {"u": U, "y": Y, "log": {"u": U, "note": "x"}})
+    elif kind == "mat-packed":
+        savemat(path, {"u": U, "y": Y}, do_compression=True)
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w", userblock_size=512) as file:
+            file["u"], file["y"], file["log/u"] = U.T, Y.T, U.T
+        with open(path, "r+b") as file:
+            file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
+    return path
+
+
+def outcome(path, read):
+    """Return "read" or "refused"; anything but an error of optid that names the file is a failure."""
+    started = time.monotonic()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optid.errors.DataWarning)
+            read()
+    except OptidError as error:
+        assert path.name in str(error) or "channel" in str(error), error
+        assert len(str(error)) < 3000
+        return "refused"
+    finally:
+        assert time.monotonic() - started < 30
+    return "read"
+
+
+def read_record(path):
+    names = {"inputs": 0, "outputs": 1} if path.suffix == ".npy" else {}
+    return optid.read(path, **names)
+
+
+def stream_record(path):
+    names = {"inputs": 0, "outputs": 1} if path.suffix == ".npy" else {}
+    for _ in optid.open_stream(path, **names):
+        pass
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "npz", "npz-packed", "npy"])
+def test_damaged_records(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(csvfile, "SMALL", -1)
+    path = good_file(kind, tmp_path)
+    assert outcome(path, lambda: read_record(path)) == "read"
+    found = []
+    for bad in bytes_of(path.read_bytes(), 200, seed=1):
+        path.write_bytes(bad)
+        found.append(outcome(path, lambda: read_record(path)))
+    assert found.count("refused") > 20
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "npy"])
+def test_damaged_streams(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(csvfile, "SMALL", -1)
+    path = good_file(kind, tmp_path)
+    found = []
+    for bad in bytes_of(path.read_bytes(), 200, seed=2):
+        path.write_bytes(bad)
+        found.append(outcome(path, lambda: stream_record(path)))
+    assert found.count("refused") > 20
+
+
+@pytest.mark.parametrize("kind", ["mat", "mat-packed", "mat-7.3"])
+@pytest.mark.parametrize("count", [6, pytest.param(200, marks=pytest.mark.slow)])
+def test_damaged_mat_files(tmp_path, kind, count):
+    path = good_file(kind, tmp_path)
+    assert outcome(path, lambda: read_record(path)) == "read"
+    found = []
+    for bad in bytes_of(path.read_bytes(), count, seed=3):
+        path.write_bytes(bad)
+        found.append(outcome(path, lambda: read_record(path)))
+    assert "refused" in found
+
+
+# -- models
+
+
+def models():
+    """Models of every kind, by name."""
+    r = np.random.default_rng(0)
+    u = r.uniform(-1, 1, (150, 2))
+    y = np.stack([np.convolve(x, a ** np.arange(20.0))[:150] for x, a in ((u[:, 0] ** 3, 0.7), (u[:, 1], 0.5))], 1)
+    both = optid.Data(u=u, y=y + 0.01 * r.normal(size=y.shape), dt=0.1)
+    one = both.select(["u1"], ["y1"])
+    return {
+        "arx": optid.fit(one, na=2, nb=2, basis=optid.Triangular(5)),
+        "linear": optid.fit(one, "arx", na=1, nb=1),
+        "armax": optid.fit(one, "hammerstein_armax.exact", na=1, nb=1, nc=1, basis=optid.Polynomial(3), prove=False),
+        "ss": optid.fit(both, "hammerstein_ss.sid", nx=2, basis=optid.Polynomial(3), prove=False),
+        "feedback": optid.fit(both, "hammerstein_ss.asivid", nx=2, basis=optid.Linear(),
+                              feedback_basis=optid.Polynomial(2), prove=False),
+    }
