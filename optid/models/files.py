@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.errors import LookupFailed, ModelFileError, StructureError
+from optid.errors import ModelFileError, StructureError
 
 FORMAT = "optid model"
 VERSION = 1
