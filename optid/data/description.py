@@ -31,7 +31,7 @@ class Description:
         table = [("channel", "role", "unit", "low", "high", "mean", "std", "levels", "missing")]
         for c in self.channels:
             levels = str(c.levels) if c.levels <= MOST_LEVELS else f"over {MOST_LEVELS}"
-            table.append((c.name, c.role, c.unit, *(f"{value:.4g}" for value in (c.low, c.high, c.mean, c.std)), levels,
+            table.append((c.name, c.role, c.unit, *(f"{value:.4g}" for value in (c.low, c.high, c.mean, c.std)), levels,  # pyright: ignore[reportArgumentType]
                           f"{c.missing:.2%}" if c.missing else "none"))
         widths = [max(map(len, column)) for column in zip(*table)]
         for row in table:

@@ -52,7 +52,7 @@ def time_growth(times: np.ndarray, n: np.ndarray, groups: np.ndarray) -> Growth:
     cells = {key: logs for key, logs in cells.items() if len(of_group[key[0]]) > 1}
     lengths = np.unique([length for _, length in cells])
     means = [np.concatenate([logs for (_, at), logs in cells.items() if at == length]) for length in lengths]
-    shown = np.exp([np.mean(logs) for logs in means]) if len(lengths) else np.zeros(0)
+    shown = np.exp(np.array([np.mean(logs) for logs in means])) if len(lengths) else np.zeros(0)
     if not any(len(own) >= MINIMUM_LENGTHS and max(own) >= MINIMUM_SPREAD * min(own) for own in of_group.values()):
         most = max((len(own) for own in of_group.values()), default=0)
         needs = (f"needs at least {MINIMUM_LENGTHS} record lengths, the longest {MINIMUM_SPREAD:g} times the shortest, "
