@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.arrays import LARGEST
 from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.choice import choose, fallbacks, find
 from optid.certificate.convex import TANGENT, certify_convex
@@ -135,6 +136,8 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
     judged = time.perf_counter()
     assert point.residuals is not None
+    if abs(point.objective) > LARGEST:  # models refuse such numbers, since their squares overflow
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
         return _conflict(base, reason)
