@@ -21,7 +21,6 @@ _HOME = {
     "search.pair_search": ["pairs", "PairSearch"],
     "search.calibration": ["thresholds", "Thresholds"],
     "search.empirical": ["sliding_scan", "SlidingScan", "empirical_thresholds", "EmpiricalThresholds"],
-    "monitor.empirical": ["empirical_calibration"],
     "search.programmes": ["signature_estimate", "membership", "profile", "noise_covariance"],
     "consistency.bounded_noise": ["Membership"],
     "consistency.profiles": ["Profile"],

@@ -1,8 +1,9 @@
 """Thresholds of a running search from the mean time between false alarms that is asked for, by simulation.
 
 The whitened innovations of a healthy plant are white with unit covariance, so that the search itself can be run on
-random numbers, without the plant. The largest statistics of blocks as long as the window are kept. An alarm is a block
-that exceeds a threshold after one that did not, and the rate of alarms while there is none is
+random numbers, without the plant; what an uncertain model leaves in them is added. The largest statistics of blocks as
+long as the window are kept. An alarm is a block that exceeds a threshold after one that did not, and the rate of alarms
+while there is none is
 
     1 / ARL0 = -log(1 - alarms / blocks without an alarm before) / length of a block.
 
@@ -18,17 +19,16 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
-from optid.faults.monitor import layout as at
-from optid.faults.monitor.layout import Tables
-from optid.faults.monitor.tables import blank
+from optid.faults.monitor.columns import Columns, Window
+from optid.faults.whitening import Predictor
 
-ALARMS = 400
-"""False alarms that a simulation must see, so that their rate is known to 5 %."""
+ALARMS = 100
+"""False alarms that a simulation must see, so that their rate is known to 10 %."""
 
 FEWEST = 50
 """With fewer alarms than this the threshold is extrapolated, or refused."""
 
-LONGEST = 4_000_000
+LONGEST = 1_000_000
 """Samples simulated at most, unless more are asked for."""
 
 CHUNK = 20_000
@@ -84,31 +84,31 @@ class Calibration:
 
 
 def calibrate(
-    t: Tables, labels: tuple[str, ...], f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
-    extrapolate: bool = False,
+    columns: Columns, steady: Predictor, window: int, f: Array, arl0: float, *, samples: int | None = None,
+    seed: int | None = 0, extrapolate: bool = False, effect: Array | None = None,
 ) -> Calibration:
     """Find the thresholds of a search.
 
     Args:
-        t: its tables.
-        labels: of the candidates.
-        f: (T, r) functions of the input of a healthy plant, repeated as often as needed; it matters for losses and
-            stuck actuators only.
+        columns: of its candidates.
+        steady: the predictor behind the innovations.
+        window: samples of the window.
+        f: (T, r) functions of the input of a healthy plant, repeated as often as needed.
         arl0: samples between false alarms.
         samples: samples to simulate; enough for `ALARMS` false alarms by default, `LONGEST` at most.
         seed: of the simulation.
         extrapolate: whether the tail may be extrapolated where the simulation is too short.
+        effect: (T, l, q) what uncertain parameters of unit variance leave in the innovations along f.
 
     Raises:
         StructureError: an ARL0 below the length of the window.
         DataError: a simulation that cannot support so rare an alarm.
     """
-    window = int(t.i[0, at.WINDOW])
     if not (np.isfinite(arl0) and arl0 >= window):
         raise StructureError(
             f"arl0={arl0!r}: a mean time between false alarms of at least the window, {window} samples, is needed."
         )
-    wanted = int(min(ALARMS * arl0, LONGEST)) if samples is None else int(samples)
+    wanted = int(min(max(ALARMS * arl0, 200 * window), LONGEST)) if samples is None else int(samples)
     extrapolated = wanted < FEWEST * arl0
     if extrapolated and not extrapolate:
         raise DataError(
@@ -116,33 +116,53 @@ def calibrate(
             f"Simulate {int(np.ceil(FEWEST * arl0))} samples (samples=), ask for a lower arl0, or let the tail be "
             "extrapolated (extrapolate=True)."
         )
-    largest = maxima(t, f, wanted, seed)
+    largest = maxima(columns, steady, window, f, wanted, seed, effect)
     q, alarms = equalised(largest, window, arl0)
+    labels = tuple(c.label for c in columns.candidates)
     return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated)
 
 
-def maxima(t: Tables, f: Array, samples: int, seed: int | None) -> Array:
+def maxima(columns: Columns, steady: Predictor, window: int, f: Array, samples: int, seed: int | None,
+           effect: Array | None = None) -> Array:
     """Return the largest statistics (B, C) of blocks of W samples of a healthy search."""
-    from optid.faults.monitor.search_kernels import rehearse
-
-    window, l, candidates = (int(t.i[0, d]) for d in (at.WINDOW, at.NY, at.CANDIDATES))  # noqa: E741
-    blocks = max(CHUNK // window, 1)
+    l, period = len(steady.C), max(len(f), 1)  # noqa: E741
+    blocks = max(min(CHUNK, samples) // window, 1)
     length = blocks * window
     count = max(1, -(-samples // (RUNS * length)))
-    inputs = np.resize(f, (length, f.shape[1])) if f.size else np.zeros((length, f.shape[1]))
 
     def run(seeds: np.random.SeedSequence) -> Array:
-        s, streams = blank(t), [np.random.default_rng(part) for part in seeds.spawn(count + 1)]
-        found = np.empty((count, blocks, candidates))
-        # the first window fills up
-        rehearse(t, s, inputs, streams[0].standard_normal((window, l)), np.empty((1, candidates)))
-        for number, stream in enumerate(streams[1:]):
-            shifted = np.roll(inputs, -number * length % max(len(f), 1), axis=0)
-            rehearse(t, s, shifted, stream.standard_normal((length, l)), found[number])
-        return found.reshape(-1, candidates)
+        found, place = [], int(np.random.default_rng(seeds).integers(period))
+        for part in seeds.spawn(count):
+            rng = np.random.default_rng(part)
+            rows = (place + np.arange(-1, length + window)) % period
+            r = rng.standard_normal((length + window, l))
+            if effect is not None:  # every stretch has a model of its own
+                r += effect[rows[1:]] @ rng.standard_normal(effect.shape[2])
+            inputs = f[rows] if len(f) else np.zeros((len(rows), f.shape[1]))
+            found.append(block_maxima(columns, steady, window, inputs, r)[1:])
+            place = int(rows[-1]) + 1
+        return np.vstack(found)
 
     with ThreadPoolExecutor(min(RUNS, os.cpu_count() or 1)) as pool:
         return np.vstack(list(pool.map(run, np.random.SeedSequence(seed).spawn(RUNS))))
+
+
+def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: Array) -> Array:
+    """Return the largest statistics (B, C) of blocks of W samples along whitened innovations.
+
+    Args:
+        columns: of the candidates.
+        steady: the predictor behind the innovations.
+        window: samples W of window and block; what is left over at the end does not count.
+        f: (T + 1, r) functions of the inputs, from one sample earlier on.
+        r: (T, l) whitened innovations.
+    """
+    kept = Window(columns, window, len(steady.A), np.eye(len(steady.C)), steady)
+    parts = tuple(np.ascontiguousarray(part, dtype=float) for part in (steady.A, steady.C, steady.K, steady.root))
+    _, statistic, _ = kept.advance(parts, columns.signals(f[:-1], f[1:]), np.ascontiguousarray(r),
+                                   np.full(len(columns.size), np.inf))
+    count = len(statistic) // window
+    return statistic[: count * window].reshape(count, window, -1).max(axis=1)
 
 
 def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:

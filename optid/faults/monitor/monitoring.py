@@ -3,7 +3,7 @@
 import hashlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,16 +11,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.bases.expansions import UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
-from optid.faults.monitor import layout as at
 from optid.faults.monitor.arl import Calibration, calibrate, held_levels
+from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
+from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
-from optid.faults.monitor.layout import State, Tables
-from optid.faults.monitor.tables import blank, monitored, tables, with_thresholds
+from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect
+from optid.faults.monitor.readings import ReadingChecks
+from optid.faults.monitor.running_filter import RunningFilter
+from optid.faults.monitor.search_kernel import DRIFT, expand
+from optid.faults.nuisance import ModelUncertainty, model_uncertainty
 from optid.faults.signatures import Dictionary, dictionary
-from optid.faults.whitening import health, whiten
 from optid.identify.recursive.intake import as_block
 from optid.models.experiments import state_like
 from optid.models.feedback_tables import tabulated
@@ -28,48 +30,40 @@ from optid.models.feedback_tables import tabulated
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-RULES = {
-    "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
-    "forgiven": 0.3, "wide": 0.0, "odd": 4.3,
-}
-"""Numbers of the decisions, in the order of `optid.faults.monitor.decide_kernels`.
-
-A fault is named once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
-samples with all statistics below `release` of their thresholds. A named fault is carried `settle` samples later.
-A transient is dropped when what is left of it has this energy (`faded`). A carried fault is no longer estimated when
-the error of its size has this energy in a window (`learned`), and is gone when its significance falls below this share
-of the threshold (`forgiven`). `wide` is the variance of an unknown state, set by the model. Nothing explains an alarm
-when the energy that is left is so many standard deviations too large (`odd`).
-"""
-
-WIDE = 1e8
-"""Energy that a state of which nothing is known may have in one innovation."""
-
-KINDS = ("alarm", "isolated", "cleared", "untestable", "testable", "isolated")
 KINDS_BY_DEFAULT = ("bias", "loss", "spike")
-
-EVENTS = 64
-"""Events taken out of the compiled loop at a time."""
 
 INPUTS = 20_000
 """Samples of simulated input for the calibration."""
 
+BLOCK = 4096
+"""Samples searched at a time."""
+
 _KNOWN: dict[str, Calibration] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What a monitor is made of before it knows its thresholds: the candidates it looks for, and the others."""
+
+    dictionary: Dictionary
+    labels: tuple[str, ...]
+    skipped: dict[str, str]
 
 
 class Monitor:
     """A search for the faults of a dictionary on a stream.
 
-    It is a state: `step` and `run` change it. Missing readings correct nothing and count for nothing; after a missing
-    input the state of the plant is taken as unknown.
+    It is a state: `step` and `run` change it. Missing readings correct nothing and count for nothing. What an input
+    does is taken as unknown while it is missing or outside the range in which the model was identified.
 
     Attributes:
-        dictionary: the faults.
-        labels: of those that are looked for.
+        dictionary: the faults; its model has the noise of the healthy records, where they asked for another.
+        labels: of the candidates looked for.
         skipped: {label: why} of the others.
         calibration: the thresholds and what they rest on.
         window: samples of the window.
         seed: of the simulation.
+        remark: what the healthy records showed; empty without.
         source: JSON types that are kept with the state: where the stream came from.
     """
 
@@ -84,7 +78,7 @@ class Monitor:
         *,
         x0: Any = "unknown",
         healthy: Data | None = None,
-        rescale: bool = False,
+        uncertainty: Data | ModelUncertainty | None = None,
         u: ArrayLike | None = None,
         samples: int | None = None,
         extrapolate: bool = False,
@@ -100,8 +94,10 @@ class Monitor:
             seed: of the simulation.
             thresholds: a `Calibration` of an earlier monitor, {label: threshold} or (C,), instead of a simulation.
             x0: the state before the first sample: "unknown", "zero" or (n,).
-            healthy: a healthy record, whose innovations must be white and of the size that the model says.
-            rescale: take the scale of the noise from the healthy record.
+            healthy: a healthy record that the model was not identified from: the noise that it shows is used, and the
+                thresholds are raised until the record keeps the rate of alarms.
+            uncertainty: the record that the model was identified from, or `model_uncertainty` of it: what the
+                parameters do not know raises the thresholds.
             u: (N, m) inputs typical of the healthy plant, for the thresholds of losses and stuck actuators; levels over
                 the intervals of the nonlinearities by default.
             samples: length of the simulation.
@@ -110,11 +106,10 @@ class Monitor:
 
         Raises:
             StructureError: a dictionary of another model, a window that is too short, an unknown rule, no candidate.
-            DataError: a simulation too short for the ARL0; a healthy record whose innovations are not white or of
-                another size.
+            DataError: a simulation too short for the ARL0; a healthy record that is too short.
 
         Warns:
-            DataWarning: candidates that a monitor cannot look for.
+            DataWarning: candidates that a monitor cannot look for; a healthy record of other noise than the model says.
         """
         found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
         if found.model is not model:
@@ -122,68 +117,80 @@ class Monitor:
         least = 2 * model.nx + 2
         if isinstance(window, bool) or int(window) != window or window < least:
             raise StructureError(f"window={window!r}: at least {least} samples are needed for {model.nx} states.")
-        unknown = set(rules) - (set(RULES) - {"wide"})
+        unknown = set(rules) - set(RULES)
         if unknown:
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
+        self.remark, effect, inputs = "", None, None
+        if uncertainty is not None:
+            known = uncertainty if isinstance(uncertainty, ModelUncertainty) else model_uncertainty(model, uncertainty)
+            found = replace(found, predictor=known.predictor)
+            if isinstance(uncertainty, Data):
+                effect, inputs = parameter_effect(known, uncertainty)
         if healthy is not None:
-            judged = health(whiten(model, healthy))
-            found = replace(found, predictor=judged.predictor(found.predictor, rescale=rescale))
-        self._of(found, int(window), seed)
+            found, self.remark = observed(found, healthy)
+            if self.remark:
+                warnings.warn(self.remark, DataWarning, stacklevel=2)
+        self._set(found, int(window), seed, {**RULES, **rules} | ({} if found.unknown else {"odd": np.inf}))
         for label, why in self.skipped.items():
             warnings.warn(f"{label} is not monitored: {why}.", DataWarning, stacklevel=2)
-        strength = float(np.max(np.sum((found.predictor.root @ found.predictor.C) ** 2, axis=0), initial=1e-300))
-        numbers = {**RULES, **rules} | {"wide": WIDE / strength} | ({} if found.unknown else {"odd": np.inf})
-        t = tables(found, self._chosen, self.window, list(numbers.values()))
-        self.calibration = self._calibrated(t, arl0, thresholds, u, samples, extrapolate)
-        self._start(with_thresholds(t, self.calibration.q), blank(t))
-        if isinstance(x0, str) and x0 == "unknown":
-            from optid.faults.monitor.carry_kernels import lose_state
-
-            lose_state(self._tables, self._state)
-        elif not (isinstance(x0, str) and x0 == "zero"):
-            self._state.v[at.X, : model.nx] = state_like(x0, (model.nx,))
-
-    def _of(self, found: Dictionary, window: int, seed: int | None) -> None:
-        self.dictionary, self.window, self.seed, self.source = found, window, seed, None
-        self._chosen = tuple(c for c in found.candidates if monitored(c))
-        if not self._chosen:
-            raise StructureError("No candidate has a signature that a monitor could look for: add the kind 'bias'.")
-        self.labels = tuple(c.label for c in self._chosen)
-        self.skipped = {
-            c.label: "its course may be anything, which only a record can be tested for"
-            for c in found.candidates if not monitored(c)
-        }
-
-    def _start(self, t: Tables, s: State) -> None:
-        self._tables, self._state = t, s
-        model = self.dictionary.model
-        self._feedback, self._functions = model.parts.tables, tabulated(model.nonlinearities)
-        self._plain = all(
-            isinstance(g.basis, UserFunctions) and g.basis.size == len(g.basis.functions)
-            and (g.basis.interval is None or g.basis.outside != "error") for g in model.nonlinearities
-        )
-        self._one = np.empty(1)
-        self._sample = np.empty(model.m + model.l)  # one array, so that one look finds what is infinite
-        self._u, self._y = self._sample[None, : model.m], self._sample[None, model.m :]
-        self._f = np.empty((1, int(t.i[0, at.NF])))
-        self._input_of = np.array(model.input_of, dtype=np.int64)
-        width = 6 + len(self.labels) + max(c.dimension for c in self._chosen)
-        self._events, self._event = np.zeros((EVENTS, width)), np.zeros((1, width))
-
-    def _calibrated(
-        self, t: Tables, arl0: float, thresholds: Any, u: ArrayLike | None, samples: int | None, extrapolate: bool
-    ) -> Calibration:
         if thresholds is not None:
-            return self._given(thresholds, arl0)
-        f = self._rehearsed(u)
-        key = hashlib.sha256(repr((self.labels, float(arl0), samples, self.seed, extrapolate)).encode())
-        for part in (f, t.m, t.i, t.w):
+            self.calibration = self._given(thresholds, arl0)
+        else:
+            f = self._rehearsed(u) if inputs is None else inputs
+            self.calibration = self._simulated(f, arl0, samples, extrapolate, effect)
+            if healthy is not None:
+                self.calibration = calibrated_on(self, healthy, self.calibration)
+        self.decisions.q = self.calibration.q
+        if isinstance(x0, str) and x0 == "unknown":
+            self.plant.lose()
+        elif not (isinstance(x0, str) and x0 == "zero"):
+            self.plant.x[: model.nx] = state_like(x0, (model.nx,))
+
+    def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float]) -> None:
+        """Set up everything but the thresholds."""
+        self.dictionary, self.window, self.seed, self.source = found, window, seed, None
+        chosen = tuple(c for c in found.candidates if c.kind in COURSES and not (c.kind == "loss" and not c.columns))
+        if not chosen:
+            raise StructureError("No candidate has a signature that a monitor could look for: add the kind 'bias'.")
+        self.labels = tuple(c.label for c in chosen)
+        self.skipped = {
+            c.label: "the readings themselves show it, whatever is asked for" if c.kind in ("frozen", "noise") else
+            "it has no signature that a running search could look for"
+            for c in found.candidates if c not in chosen
+        }
+        model, steady = found.model, found.predictor
+        if not model.parts.tables.compiled:
+            raise StructureError(
+                "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first."
+            )
+        self.columns = columns_of(model, chosen)
+        n, widest = model.nx, int(self.columns.size.max())
+        directions = steady.root / np.linalg.norm(steady.root, axis=0)
+        self.search = Window(self.columns, window, n + SPARE + 2 * widest, directions.T.copy(), steady)
+        self.plant = RunningFilter(model, steady, self.columns, np.zeros(n), np.zeros((n, n)),
+                                   np.zeros(self.columns.count), np.zeros(model.B.shape[1]))
+        self.checks = ReadingChecks(model)
+        self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), rules, model.outputs,
+                                   np.ones(len(chosen), dtype=bool), [])
+        self.samples = 0
+        self._functions, self._input_of = tabulated(model.nonlinearities), np.array(model.input_of, dtype=np.int64)
+        self._output_of = np.array(model.output_of, dtype=np.int64)
+        parts = (steady.A, steady.C, steady.K, steady.root)
+        self._steady = tuple(np.ascontiguousarray(part, dtype=float) for part in parts)
+
+    def _simulated(
+        self, f: Array, arl0: float, samples: int | None, extrapolate: bool, effect: Array | None
+    ) -> Calibration:
+        c = self.columns
+        key = hashlib.sha256(repr((self.labels, float(arl0), samples, self.seed, extrapolate, self.window)).encode())
+        moving = [part for pair in c.losses for part in pair]
+        moving += [] if effect is None else [effect]
+        for part in (f, c.into_state, c.into_output, c.course, *moving, *self._steady):
             key.update(np.ascontiguousarray(part).tobytes())
         name = key.hexdigest()
         if name not in _KNOWN:
-            _KNOWN[name] = calibrate(
-                t, self.labels, f, arl0, samples=samples, seed=self.seed, extrapolate=extrapolate
-            )
+            _KNOWN[name] = calibrate(c, self.dictionary.predictor, self.window, f, arl0, samples=samples,
+                                     seed=self.seed, extrapolate=extrapolate, effect=effect)
         return _KNOWN[name]
 
     def _given(self, thresholds: Any, arl0: float) -> Calibration:
@@ -206,7 +213,7 @@ class Monitor:
 
     def _rehearsed(self, u: ArrayLike | None) -> Array:
         model = self.dictionary.model
-        if not any(c.columns for c in self._chosen):
+        if not self.columns.losses:
             return np.zeros((0, model.B.shape[1]))
         if u is not None:
             inputs = np.asarray(u, dtype=float).reshape(len(np.asarray(u)), -1)
@@ -223,42 +230,27 @@ class Monitor:
 
     # -- samples -------------------------------------------------------------------------------------------------
 
-    @property
-    def samples(self) -> int:
-        """Samples seen."""
-        return int(self._state.counts[at.NOW])
-
-    def step(self, u: ArrayLike, y: ArrayLike) -> Event | None:
+    def step(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
         """Take in one sample; NaN is a missing value.
 
         Args:
             u: (m,) inputs.
             y: (l,) readings.
 
-        Returns:
-            what happened, if anything; at most one event per sample.
-
         Raises:
             DataError: another number of channels, or an infinite value.
         """
-        from optid.faults.monitor.decide_kernels import march
-
+        model = self.dictionary.model
         try:
-            if np.size(u) != self._u.size or np.size(y) != self._y.size:
-                raise ValueError
-            self._u[0], self._y[0] = u, y
+            rows = np.array(u, dtype=float).reshape(1, model.m), np.array(y, dtype=float).reshape(1, model.l)
         except (ValueError, TypeError):
             raise DataError(
-                f"sample {self.samples}: u = {u!r} and y = {y!r}; {self._u.size} and {self._y.size} numbers are "
+                f"sample {self.samples}: u = {u!r} and y = {y!r}; {model.m} and {model.l} numbers are "
                 "needed, NaN for one that is missing."
             ) from None
-        if np.isinf(self._sample).any():
+        if np.isinf(rows[0]).any() or np.isinf(rows[1]).any():
             raise DataError(f"sample {self.samples}: an infinite value; use NaN for one that is missing.")
-        self._expand(self._u, self._f)
-        _, found, refused = march(self._tables, self._state, self._feedback, self._f, self._y, self._event)
-        if refused:
-            self._refuse()
-        return self._told(self._event[0]) if found else None
+        return self._take_in(*rows)
 
     def run(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
         """Take in a block of samples, with the same result as `step` for each of them.
@@ -270,71 +262,98 @@ class Monitor:
         Raises:
             DataError: other channels than the model's, unequal lengths, or an infinite value.
         """
-        from optid.faults.monitor.decide_kernels import march
-
         model = self.dictionary.model
         u, y = (np.ascontiguousarray(as_block(part, names, what, self.samples))
                 for part, names, what in ((u, model.inputs, "u"), (y, model.outputs, "y")))
         if len(u) != len(y):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
-        f = np.empty((len(u), self._f.shape[1]))
-        self._expand(u, f)
-        events, done = [], 0
-        while done < len(y):
-            taken, found, refused = march(self._tables, self._state, self._feedback, f[done:], y[done:], self._events)
-            events += [self._told(line) for line in self._events[:found]]
-            if refused:
-                self._refuse()
-            done += taken
+        events: list[Event] = []
+        for start in range(0, len(u), BLOCK):
+            events += self._take_in(u[start : start + BLOCK], y[start : start + BLOCK])
         return events
 
-    def _expand(self, u: Array, f: Array) -> None:
-        if self._functions.compiled:
-            from optid.faults.monitor.predict_kernels import expand
+    def _take_in(self, u: Array, y: Array) -> list[Event]:
+        start, count = self.samples, len(u)
+        f = self._expanded(u)
+        screened = self.checks.screen(u, y, start)
+        fed = self._fed(screened.y)
+        missing = np.isnan(screened.y).any(axis=1) | screened.unsure.any(axis=1)
+        stops = np.flatnonzero(missing | screened.repeating | np.isin(np.arange(count), list(screened.frozen)))
+        events, k = list(screened.events), 0
+        unsure = screened.unsure[:, self._input_of]
+        while k < count:
+            clean = int(stops[np.searchsorted(stops, k)]) if stops.size and k <= stops[-1] else count
+            if clean > k and self.plant.certain and self.decisions.waits(start + k):
+                k += self._search_block(f[k:clean], fed[k:clean], screened.y[k:clean], events)
+                continue
+            if k in screened.frozen:
+                self._excuse(screened.frozen[k], start + k)
+            self._search_sample(f[k], fed[k], screened.y[k], unsure[k], screened.repeating[k], events)
+            k += 1
+        return sorted(events, key=lambda e: e.sample)
 
+    def _search_block(self, f: Array, fed: Array, y: Array, events: list[Event]) -> int:
+        """Search samples by the steady predictor until a decision is due; return how many."""
+        plant, decisions, now = self.plant, self.decisions, self.samples
+        x, r = plant.run(f, fed, y)
+        before = np.vstack([plant.before, f[:-1]])
+        moving = self.columns.signals(before, f)
+        done, statistic, weight = self.search.advance(self._steady, moving, r, decisions.limit)
+        plant.x, plant.before = x[done].copy(), f[done - 1].copy()
+        self.samples += done
+        decisions.count_quiet(statistic)
+        last = decisions.judge(self.samples - 1, self.search, plant, hold=False)
+        events += decisions.excitation(weight if last is None else weight[:-1], now, self.window)
+        if last is not None:
+            events.append(last)
+        return done
+
+    def _search_sample(self, f: Array, fed: Array, y: Array, unsure: np.ndarray, repeating: bool, events: list[Event]
+                       ) -> None:
+        plant, decisions, now = self.plant, self.decisions, self.samples
+        used = np.where(np.isnan(f), plant.before, f)
+        moving = self.columns.signals(plant.before[None], used[None])
+        if plant.certain and not (np.isnan(y).any() or unsure.any()):
+            x, r = plant.run(used[None], fed[None], y[None])
+            plant.x, plant.before = x[1].copy(), used.copy()
+            matrices, white, shown = self._steady, r, None
+        else:
+            innovation, matrices, _ = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
+            white, shown = innovation[None], int(np.count_nonzero(~np.isnan(y)))
+        _, statistic, weight = self.search.advance(matrices, moving, white, np.full(len(self.labels), np.inf), shown)
+        self.samples += 1
+        if unsure.any():
+            decisions.begun = now + 1
+        decisions.count_quiet(statistic)
+        watching = decisions.phase == WATCHING
+        event = decisions.judge(now, self.search, plant, hold=bool(repeating))
+        if event is None and watching and decisions.phase == WATCHING:
+            events += decisions.excitation(weight, now, self.window)
+        if event is not None:
+            events.append(event)
+
+    def _excuse(self, onset: int, now: int) -> None:
+        """Forget what a sensor did that has been found frozen."""
+        self.decisions.excuse(onset, now, self.search)
+        self.plant.lose()
+
+    def _expanded(self, u: Array) -> Array:
+        model = self.dictionary.model
+        if self._functions.compiled:
+            f = np.empty((len(u), model.B.shape[1]))
             bad = expand(self._functions, self._input_of, u, f)
             if bad >= 0:
                 raise DataError(f"sample {self.samples + bad}: an input is outside the interval of its basis.")
-        elif len(u) > 1 or not self._plain:
-            f[:] = self.dictionary.model.expanded(u)
-        else:  # as the bases do it, without their tables
-            for j, (nonlinearity, c) in enumerate(zip(self.dictionary.model.nonlinearities, self._input_of)):
-                basis: Any = nonlinearity.basis
-                self._one[0] = u[0, c]
-                if basis.outside == "clamp" and basis.interval is not None:
-                    np.clip(self._one, *basis.interval, out=self._one)
-                total = nonlinearity.offset or 0.0
-                for function, weight in zip(basis.functions, nonlinearity.mu):
-                    total += weight * function(self._one)[0]
-                f[0, j] = total
+            return f
+        return np.vstack([model.expanded(u[k : k + 1]) for k in range(len(u))])  # the same digits for any block
 
-    def _refuse(self) -> None:
-        raise DataError(f"sample {self.samples}: an output leaves the interval of a feedback basis that refuses it.")
-
-    def _told(self, line: Array) -> Event:
-        code, sample, best, onset = (int(value) for value in line[:4])
-        kind, count = KINDS[code], len(self.labels)
-        label = self.labels[best] if best >= 0 else ""
-        if code in (at.UNTESTABLE, at.TESTABLE):
-            since = sample - self.window + 1 if code == at.UNTESTABLE else None
-            return Event(kind, sample, ((label, 1.0),), since, (), float(line[4]))
-        if code == at.CLEARED:
-            return Event(kind, sample, ((label, 1.0),) if label else (), None, (), 0.0)
-        if code == at.STRANGE:
-            return Event(kind, sample, (("unknown", 1.0),), onset, (), float(line[4]), "no candidate explains it")
-        gains = line[5 : 5 + count]
-        weight = np.exp((gains - gains.max()) / 2)
-        weight /= weight.sum()
-        order = [best, *(int(c) for c in np.argsort(-weight, kind="stable") if c != best)]
-        kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
-        size = tuple(float(v) for v in line[5 + count : 5 + count + self._chosen[best].dimension])
-        named = tuple((self.labels[c], float(weight[c])) for c in order[:kept])
-        note = ""
-        if code == at.ISOLATED and not (self._chosen[best].additive or line[-1]):
-            note = "the actuator hardly moves: its loss cannot be told from a constant"
-        elif code == at.ISOLATED and kept > 1:
-            note = "not told apart in time"
-        return Event(kind, sample, named, onset, size, float(line[4]), note)
+    def _fed(self, y: Array) -> Array:
+        fed = np.empty((len(y), len(self._output_of)))
+        if fed.size and expand(self.dictionary.model.parts.tables, self._output_of, y, fed) >= 0:
+            raise DataError(
+                f"sample {self.samples}: an output leaves the interval of a feedback basis that refuses it."
+            )
+        return fed
 
     def __str__(self) -> str:
         """Say what is looked for, what the thresholds rest on, what was seen, and what is carried."""
@@ -351,41 +370,41 @@ class Monitor:
     @property
     def statistics(self) -> dict[str, float]:
         """{label: largest energy explained over the onsets of the window} at the last sample."""
-        return dict(zip(self.labels, self._state.v[at.STATISTIC].tolist()))
+        return dict(zip(self.labels, self.search.statistic.tolist()))
 
     @property
     def onsets(self) -> dict[str, int]:
         """{label: onset at which it explains most}; -1 where it cannot be looked for yet."""
-        return dict(zip(self.labels, self._state.i[at.PEAK].tolist()))
+        peaks = self.search.peak
+        return dict(zip(self.labels, np.where(peaks > 0, self.samples - peaks, -1).tolist()))
 
     @property
     def carried(self) -> tuple[Carried, ...]:
         """The faults that were named and are accounted for."""
-        s, first = self._state, 0
-        owners = s.i[at.OWNER, : s.counts[at.ACTIVE]]
-        found = []
-        for number, (label, c) in enumerate(zip(self.labels, self._chosen)):
-            own = slice(first, first + c.dimension)
-            first += c.dimension
-            size = np.array(s.v[at.SLOPE if c.kind == "drift" else at.HELD, own])
-            variance, mine = np.zeros(c.dimension), np.flatnonzero(owners == number)
-            for q in mine:
-                if c.kind != "drift" or s.v[at.GROWTH, q] > 0:
-                    size[s.i[at.COLUMN, q] - own.start] += s.v[at.NU, q]
-                    variance[s.i[at.COLUMN, q] - own.start] += s.m[at.P, q, q]
-            if mine.size or size.any():
-                found.append(Carried(label, tuple(size.tolist()), tuple(np.sqrt(variance).tolist())))
+        plant, n, found = self.plant, self.dictionary.model.nx, []
+        for number, label in enumerate(self.labels):
+            own = self.columns.of(number)
+            size, variance = plant.held[own].copy(), np.zeros(own.stop - own.start)
+            mine = [p for p, one in enumerate(plant.directions) if one.owner == number]
+            for p in mine:
+                one = plant.directions[p]
+                if self.columns.course[one.column] != DRIFT or one.growth > 0:
+                    size[one.column - own.start] += plant.x[n + p]
+                    variance[one.column - own.start] += plant.P[n + p, n + p]
+            if mine or size.any():
+                spread = self.columns.in_order(number, np.sqrt(variance))
+                found.append(Carried(label, self.columns.in_order(number, size), spread))
         return tuple(found)
 
     @property
     def alarmed(self) -> bool:
         """Whether there is an alarm that has not been cleared or answered by carrying the fault."""
-        return bool(self._state.counts[at.PHASE] != at.WATCHING)
+        return self.decisions.phase >= NAMING
 
     @property
     def state(self) -> Array:
         """(n,) expected state before the next sample, carried faults included."""
-        return np.array(self._state.v[at.X, : self.dictionary.model.nx])
+        return np.array(self.plant.x[: self.dictionary.model.nx])
 
     # -- files -----------------------------------------------------------------------------------------------------
 

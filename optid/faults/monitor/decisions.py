@@ -1,0 +1,275 @@
+"""The decisions of a monitor: alarm, name, carry, clear."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.faults.monitor.columns import Columns, Window
+from optid.faults.monitor.events import Event
+from optid.faults.monitor.running_filter import RunningFilter
+from optid.faults.monitor.search_kernel import DRIFT
+
+RULES = {
+    "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
+    "forgiven": 0.3, "odd": 4.3,
+}
+"""Numbers of the decisions.
+
+A fault is named once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
+samples with all statistics below `release` of their thresholds. A named fault is carried `settle` samples later.
+A transient is over when what is left of it has this energy (`faded`). A carried fault is no longer estimated when
+the error of its size has this energy in a window (`learned`), and is gone when its significance falls below this share
+of the threshold (`forgiven`). Nothing explains an alarm when the energy that is left is so many standard deviations too
+large (`odd`).
+"""
+
+WATCHING, NAMING, SETTLING, LOST = range(4)
+"""Phases: no alarm; alarm, not named; named, the size still growing sharp; an alarm that no candidate explains."""
+
+NOTHING, AGAIN = -1, -2
+"""No candidate is named; the alarm is one that no candidate has explained before."""
+
+
+@dataclass(eq=False)
+class Decisions:
+    """State of the decisions.
+
+    Attributes:
+        columns: the candidates.
+        labels: what they are called.
+        q: (C,) their thresholds.
+        rules: numbers, see `RULES`.
+        outputs: names of the sensors.
+        phase, alarm, named, named_at, quiet: where the decisions are.
+        begun: first sample after the last input of which nothing is known.
+        testable: (C,) whether a whole loss would be noticed.
+        passing: [candidate, sample at which it has faded] of transients.
+    """
+
+    columns: Columns
+    labels: tuple[str, ...]
+    q: Array
+    rules: dict[str, float]
+    outputs: tuple[str, ...]
+    testable: np.ndarray
+    passing: list[list[int]]
+    phase: int = WATCHING
+    alarm: int = 0
+    named: int = NOTHING
+    named_at: int = 0
+    quiet: int = 0
+    begun: int = 0
+
+    KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "passing"
+
+    @property
+    def limit(self) -> Array:
+        """(C,) energies at which the search must stop for a decision."""
+        return self.q if self.phase == WATCHING else np.zeros(len(self.q))
+
+    def waits(self, now: int) -> bool:
+        """Whether the samples from now on can be searched as a block."""
+        return self.phase == WATCHING and not self.passing
+
+    def count_quiet(self, statistic: Array) -> None:
+        """Count the samples (T, C) at the end of a block in which all is quiet."""
+        loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.q, axis=1))
+        self.quiet = self.quiet + len(statistic) if not loud.size else len(statistic) - 1 - int(loud[-1])
+
+    def excitation(self, weight: Array, now: int, window: int) -> list[Event]:
+        """Return what becomes testable or untestable along weights (T, C) of samples from `now` on."""
+        events = []
+        for k, c in enumerate(self.columns.candidates):
+            if c.additive:
+                continue
+            line = weight[:, k]
+            full = (line >= 0) & (now + np.arange(len(line)) - self.begun >= window)
+            for t in np.flatnonzero(full & np.where(self.testable[k], line < self.q[k], line > 1.2 * self.q[k])):
+                if self.testable[k] and line[t] < self.q[k]:
+                    self.testable[k] = False
+                    events.append(Event("untestable", now + int(t), ((self.labels[k], 1.0),),
+                                        now + int(t) - window + 1, (), float(line[t])))
+                elif not self.testable[k] and line[t] > 1.2 * self.q[k]:
+                    self.testable[k] = True
+                    events.append(Event("testable", now + int(t), ((self.labels[k], 1.0),), None, (), float(line[t])))
+            if full.any() and not self.testable[k]:  # later samples of the block, after a change of the flag
+                back = np.flatnonzero(full & (line > 1.2 * self.q[k]))
+                last = next((e.sample for e in reversed(events) if e.candidates[0][0] == self.labels[k]), now - 1)
+                for t in back[back + now > last][:1]:
+                    self.testable[k] = True
+                    events.append(Event("testable", now + int(t), ((self.labels[k], 1.0),), None, (), float(line[t])))
+        return sorted(events, key=lambda e: e.sample)
+
+    def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
+        """Decide what the last sample means.
+
+        Args:
+            now: its number.
+            window: the search.
+            plant: the filter.
+            hold: whether nothing may be named yet, because a sensor repeats its reading.
+        """
+        gains = np.where(window.peak > 0, window.statistic - self.q, -np.inf)
+        best = int(np.argmax(gains))
+        if self.phase == WATCHING:
+            if gains[best] > 0:
+                self.phase, self.alarm = NAMING, now
+                return self._event("alarm", now, best, gains, window)
+            return self._review(now, window, plant)
+        if not np.isfinite(gains[best]):
+            return None
+        if self.phase == LOST:
+            if gains[best] > 0:
+                self.phase, self.alarm = NAMING, now
+            elif self.quiet >= self.rules["still"]:
+                self.phase, self.named = WATCHING, NOTHING
+                return Event("cleared", now)
+            return None
+        return None if hold else self._name(now, best, gains, window, plant)
+
+    def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
+        rule = self.rules
+        share = np.exp((gains - gains[best]) / 2)
+        sure = 1 / share.sum() >= rule["certainty"]
+        chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is named
+        if self.phase == NAMING:
+            odd, free = self._left_over(best, window)
+            waited = now - self.alarm
+            late = waited >= rule["patience"] or (waited >= rule["settle"] and old + rule["settle"] >= window.length)
+            testable = self.columns.candidates[best].additive or self.testable[best]
+            if self.quiet >= rule["still"] or (late and gains[best] <= 0):
+                self.phase, self.named = WATCHING, NOTHING
+                return Event("cleared", now)
+            if not late and not (sure and gains[best] > 0 and free >= 4 and testable):
+                return None
+        else:
+            if now - self.named_at < rule["settle"] and old < window.length:
+                return None
+            chosen = best if sure else self.named
+            if window.peak[chosen] == 0:
+                self.phase, self.named = WATCHING, NOTHING
+                return Event("cleared", now)
+            odd, free = self._left_over(chosen, window)
+        if odd > rule["odd"]:
+            return self._lost(now, chosen, window)
+        if self.phase == NAMING or chosen != self.named:
+            self.phase, self.named, self.named_at = SETTLING, chosen, now
+            return self._event("isolated", now, chosen, gains, window)
+        plant.room(2 * int(self.columns.size.max()))
+        left = plant.carry(chosen, window)
+        if np.isfinite(left):
+            self.passing.append([chosen, now + _fading(plant, left, rule["faded"])])
+        window.restart()
+        self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
+        return None
+
+    def _lost(self, now: int, best: int, window: Window) -> Event | None:
+        said, onset = self.named == AGAIN, now - int(window.peak[best]) + 1
+        energy = float(window.statistic[best])
+        sensor, factor = noisy_sensor(window, int(window.peak[best]))
+        self.phase, self.named, self.quiet = LOST, AGAIN, 0
+        window.restart()
+        if said:
+            return None
+        if sensor >= 0:
+            return Event("isolated", now, ((f"sensor:{self.outputs[sensor]} noise", 1.0),), onset, (factor,), energy,
+                         "size is the factor of the standard deviation")
+        return Event("isolated", now, (("unknown", 1.0),), onset, (), energy, "no candidate explains it")
+
+    def _left_over(self, number: int, window: Window) -> tuple[float, float]:
+        """How many deviations more than noise a candidate leaves since its onset, and on how many readings."""
+        if not np.isfinite(self.rules["odd"]):
+            return 0.0, np.inf
+        energy, free = window.since(number)
+        free -= float(self.columns.size[number])
+        if free < 1:
+            return 0.0, free
+        # Wilson and Hilferty: the cube root of chi2 / free is nearly Gaussian
+        spread = 2 / (9 * free)
+        left = max(energy - float(window.statistic[number]), 0.0)
+        return float(((left / free) ** (1 / 3) - 1 + spread) / np.sqrt(spread)), free
+
+    def _event(self, kind: str, now: int, best: int, gains: Array, window: Window) -> Event:
+        weight = np.exp((gains - gains.max()) / 2)
+        weight /= weight.sum()
+        order = [best, *(int(c) for c in np.argsort(-weight, kind="stable") if c != best)]
+        kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
+        note = ""
+        if kind == "isolated" and not (self.columns.candidates[best].additive or self.testable[best]):
+            note = "the actuator hardly moves: its loss cannot be told from a constant"
+        elif kind == "isolated" and kept > 1:
+            note = "not told apart in time"
+        sizes, _, _ = window.estimate(best)
+        return Event(kind, now, tuple((self.labels[c], float(weight[c])) for c in order[:kept]),
+                     now - int(window.peak[best]) + 1, self.columns.in_order(best, sizes),
+                     float(window.statistic[best]), note)
+
+    def _review(self, now: int, window: Window, plant: RunningFilter) -> Event | None:
+        """Drop carried faults that have gone, hold those that are known well; report the first one gone."""
+        for number, (owner, until) in enumerate(self.passing):
+            if now >= until:
+                del self.passing[number]
+                return Event("cleared", now, ((self.labels[owner], 1.0),))
+        n = plant.model.nx
+        for owner in dict.fromkeys(one.owner for one in plant.directions):
+            if self.columns.course[self.columns.first[owner]] == DRIFT:
+                continue
+            rows = [p for p, one in enumerate(plant.directions) if one.owner == owner]
+            at = [n + p for p in rows]
+            own = self.columns.of(owner)
+            whole = np.zeros((own.stop - own.start, len(rows)))  # a part may be carried twice, after a repair
+            whole[[plant.directions[p].column - own.start for p in rows], range(len(rows))] = 1.0
+            sizes, covariance = plant.held[own] + whole @ plant.x[at], whole @ plant.P[np.ix_(at, at)] @ whole.T
+            energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
+            if energy < self.rules["forgiven"] * self.q[owner]:
+                for p in reversed(rows):
+                    plant.forget(p, window, keep=False)
+                plant.release(own)
+                return Event("cleared", now, ((self.labels[owner], 1.0),))
+            left = sum(window.length * plant.directions[p].power * plant.P[n + p, n + p] for p in rows)
+            if 0 < left < self.rules["learned"]:
+                for p in reversed(rows):
+                    plant.forget(p, window, keep=True)
+        return None
+
+    def excuse(self, onset: int, now: int, window: Window) -> None:
+        """Take back an alarm that a sensor raised which has been found frozen."""
+        if self.phase != WATCHING and now - int(window.peak.max(initial=0)) + 1 <= now and self.alarm >= onset:
+            self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
+        window.restart()
+
+
+def _fading(plant: RunningFilter, energy: float, faded: float) -> int:
+    """Samples after which a transient has faded."""
+    if energy <= faded:
+        return 1
+    radius = float(np.max(np.abs(np.linalg.eigvals(plant.steady.F)), initial=0.0))
+    return 1 + int(np.ceil(np.log(faded / energy) / np.log(min(max(radius, 1e-6), 1 - 1e-6)) / 2))
+
+
+def noisy_sensor(window: Window, count: int) -> tuple[int, float]:
+    """Return the sensor whose noise has grown over the last samples, and by which factor; -1 where none explains it.
+
+    More noise of one sensor makes the whitened innovations larger along one direction alone, the others stay as they
+    are.
+    """
+    r = window.recent(count)
+    l, best, found, factor = r.shape[1], 0.0, -1, 1.0  # noqa: E741
+    if len(r) < 4:
+        return found, factor
+    total = float(np.sum(r**2))
+    for o, direction in enumerate(window.directions):
+        along = float(np.sum((r @ direction) ** 2))
+        share, free = along / len(r), (l - 1) * len(r)
+        rest = ((total - along) / free) ** (1 / 3) - 1 + 2 / (9 * free) if l > 1 else 0.0
+        gain = len(r) * (share - 1 - np.log(share)) if share > 1 else 0.0
+        if gain > best and rest < 4.3 * np.sqrt(2 / (9 * max(free, 1))):
+            best, found, factor = gain, o, float(np.sqrt(share))
+    return (found, factor) if best > 12 else (-1, 1.0)
+
+
+def kept(decisions: Decisions) -> dict[str, Any]:
+    """Return the state of the decisions in JSON types."""
+    return {**{name: getattr(decisions, name) for name in Decisions.KEPT}, "testable": decisions.testable.tolist()}

@@ -1,0 +1,157 @@
+"""What healthy records say about the noise: its colour, its size, and how much the thresholds must rise."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import DataError
+from optid.faults.monitor.arl import Calibration, block_maxima
+from optid.faults.nuisance import ModelUncertainty, _sensitivities
+from optid.faults.signatures import Dictionary
+from optid.faults.whitening import OTHER_SCALE, Predictor, Whitened, health, whiten
+from optid.models import HammersteinSS, NoiseCovariances
+from optid.models.experiments import in_units_of
+
+if TYPE_CHECKING:
+    from optid.faults.monitor.monitoring import Monitor
+
+FEWEST = 20
+"""Windows that a healthy record has at least."""
+
+ORDERS = 1, 2, 3, 4, 6, 8
+"""Orders of the autoregressions tried for innovations that are not white."""
+
+LONGEST = 3000
+"""Samples of the identification along which the effect of uncertain parameters is simulated."""
+
+COMMON = 0.1
+"""Share of windows whose energies are compared with those of white noise."""
+
+
+def parameter_effect(known: ModelUncertainty, data: Data) -> tuple[Array, Array]:
+    """Return what uncertain parameters of unit variance leave in the whitened innovations of the record they came from.
+
+    Args:
+        known: the uncertainty.
+        data: the record.
+
+    Returns:
+        (T, l, q), and the functions of the inputs (T, r) along which it does.
+    """
+    raw = in_units_of(known.model, data)
+    given = known.model.initial_state(raw, "predict")
+    effects, inputs = [], []
+    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
+        here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
+        there = ~np.isnan(here.y)
+        by_parameter, _ = _sensitivities(known.model, known.predictor, here, x0, there, known.root)
+        effects.append(by_parameter.reshape(*here.y.shape, -1))
+        inputs.append(known.model.expanded(here.u))
+    return np.concatenate(effects), np.nan_to_num(np.concatenate(inputs))
+
+
+def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
+    """Return a dictionary with the noise that a healthy record shows, and what was changed.
+
+    Innovations that are white and of the size predicted leave it as it is. Otherwise they get an autoregression, whose
+    order is chosen by BIC; its past innovations are states beside those of the plant.
+    """
+    white = whiten(found.model, healthy, scale=found.predictor)
+    judged = health(white)
+    if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
+        return found, ""
+    parts = [white] if isinstance(white, Whitened) else list(white)
+    signals = [np.where(part.present, part.innovations, 0.0) for part in parts]
+    taps, covariance = ([], _covariance(signals)) if judged.white else _autoregression(signals)
+    said = (f"on the healthy record the innovations are not those of the model (whiteness p = {judged.p_value:.2g}, "
+            f"size {judged.ratio:.2f} times the predicted one): its noise is taken from that record"
+            + (f", as an autoregression of order {len(taps)}." if taps else "."))
+    return _recoloured(found, taps, covariance), said
+
+
+def _covariance(signals: list[Array]) -> Array:
+    return np.asarray(sum(s.T @ s for s in signals) / sum(len(s) for s in signals))
+
+
+def _autoregression(signals: list[Array]) -> tuple[list[Array], Array]:
+    """Taps (l, l) and covariance of what is left, by least squares; the order by BIC."""
+    l, best = signals[0].shape[1], (np.inf, [], np.eye(1))  # noqa: E741
+    most = max(ORDERS)
+    for order in ORDERS:
+        past = np.vstack([np.hstack([s[most - i : len(s) - i] for i in range(1, order + 1)]) for s in signals])
+        now = np.vstack([s[most:] for s in signals])
+        weights = np.linalg.lstsq(past, now, rcond=None)[0]
+        left = now - past @ weights
+        covariance = left.T @ left / len(left)
+        score = len(left) * float(np.linalg.slogdet(covariance)[1]) + order * l * l * np.log(len(left))
+        if score < best[0]:
+            best = score, [part.T for part in np.split(weights, order)], covariance
+    return best[1], best[2]
+
+
+def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dictionary:
+    """Put an autoregression of the innovations into the state."""
+    model, steady = found.model, found.predictor
+    n, l, p = model.nx, model.l, len(taps)  # noqa: E741
+    more = p * l
+    mix = np.hstack(taps) if taps else np.zeros((l, 0))
+    A = np.zeros((n + more, n + more))
+    A[:n, :n], A[:n, n:] = model.A, steady.K @ mix
+    if more:
+        A[n : n + l, n:] = mix
+        A[n + l :, n : n + more - l] = np.eye(more - l)
+    C = np.hstack([model.C, mix])
+    K = np.vstack([steady.K, np.eye(l)[:, :l], np.zeros((max(more - l, 0), l))])[: n + more]
+
+    def padded(part: Array) -> Array:
+        return np.vstack([part, np.zeros((more, part.shape[1]))])
+
+    noise = NoiseCovariances(K @ covariance @ K.T, covariance, K @ covariance, covariance)
+    wider = _with_states(model, A, C, K, padded, noise, more)
+    lower = np.linalg.inv(np.linalg.cholesky(covariance))
+    predictor = Predictor(A, C, wider.L, K, covariance, np.tril(lower))
+    candidates = tuple(replace(c, into_state=padded(c.into_state)) for c in found.candidates)
+    return replace(found, model=wider, predictor=predictor, candidates=candidates)
+
+
+def _with_states(model: HammersteinSS, A: Array, C: Array, K: Array, padded: object, noise: NoiseCovariances, more: int
+                 ) -> HammersteinSS:
+    assert callable(padded)
+    return replace(model, A=A, B=padded(model.B), C=C, E=padded(model.E), L=padded(model.L), K=K, noise=noise,
+                   offset_x=np.concatenate([model.offset_x, np.zeros(more)]))
+
+
+def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
+    """Return thresholds that a healthy record keeps: all of them get one factor, never below one.
+
+    A record is rarely long enough to show alarms as rare as a monitor wants them. The factor is the larger of two: how
+    much larger the energies are that a tenth of its windows reach than those of white noise, and what the largest of
+    all asks for.
+
+    Raises:
+        DataError: a record of fewer than 20 windows.
+    """
+    found, window, columns = monitor.dictionary, monitor.window, monitor.columns
+    raw = in_units_of(found.model, healthy)
+    white = whiten(found.model, raw, scale=found.predictor)
+    parts = [white] if isinstance(white, Whitened) else list(white)
+    seen, usual = [], []
+    rng = np.random.default_rng(monitor.seed)
+    for part, experiment in zip(parts, raw.experiments):
+        f = np.nan_to_num(found.model.expanded(experiment.u))
+        f = np.vstack([f[:1], f])
+        for rows, target, repeats in ((part.r, seen, 1), (None, usual, 5)):
+            for _ in range(repeats):
+                r = rng.standard_normal(part.r.shape) if rows is None else rows
+                target.append(block_maxima(columns, found.predictor, window, f, r) / base.q)
+    largest, white_largest = (np.max(np.vstack(blocks), axis=1) for blocks in (seen, usual))
+    if len(largest) < FEWEST:
+        raise DataError(
+            f"The healthy record has {len(largest)} stretches of {window} samples: {FEWEST} are needed for thresholds."
+        )
+    ratio = float(np.quantile(largest, 1 - COMMON) / np.quantile(white_largest, 1 - COMMON))
+    factor = max(1.0, ratio, 1.05 * float(largest.max()))
+    return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.r) for part in parts))

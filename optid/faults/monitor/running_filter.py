@@ -1,0 +1,255 @@
+"""The filter of the monitor: the steady predictor, and a Kalman filter wherever something beside it is uncertain.
+
+Faults that were named are carried as unknown constants beside the state (B. Friedland, IEEE Trans. Automatic Control
+14, 1969; A. S. Willsky, H. L. Jones, IEEE Trans. Automatic Control 21, 1976). One filter of state and constants covers
+them, an unknown initial state, missing readings, and inputs of which nothing is known. With e the innovations of the
+steady predictor, the plant is x+ = A x + ... + K e, y = C x + ... + e, whose state is known once it was: the filter is
+the steady predictor as soon as nothing else is uncertain.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from optid.arrays import Array
+from optid.faults.monitor.columns import SPARE, Columns, Window
+from optid.faults.monitor.search_kernel import DRIFT, JUMP, add_product, predict
+from optid.faults.whitening import Predictor
+from optid.models import HammersteinSS
+
+WIDE = 1e8
+"""Energy that what nothing is known of may have in one innovation."""
+
+CERTAIN = 1e-12
+"""Energy in one innovation below which the state is known."""
+
+
+@dataclass(eq=False)
+class Direction:
+    """A constant that is carried.
+
+    Attributes:
+        owner: number of its candidate.
+        column: of the candidates.
+        growth: what its course grows by per sample.
+        grown: its course at the next sample.
+        power: energy that one unit leaves in one innovation, on average.
+    """
+
+    owner: int
+    column: int
+    growth: float
+    grown: float
+    power: float = 0.0
+
+
+@dataclass(eq=False)
+class RunningFilter:
+    """State of the plant and of what is carried, before the next sample.
+
+    Attributes:
+        model: the healthy plant.
+        steady: its predictor.
+        columns: of the candidates.
+        x: (n + q,) expected state and constants; the additions of carried faults at the next sample are in it.
+        P: (n + q, n + q) covariance.
+        directions: (q,) the constants.
+        held: (D,) magnitudes that are known well and no longer estimated.
+        before: (r,) functions of the inputs of the sample before.
+        certain: whether the steady predictor is exact.
+    """
+
+    model: HammersteinSS
+    steady: Predictor
+    columns: Columns
+    x: Array
+    P: Array
+    held: Array
+    before: Array
+    directions: list[Direction] = field(default_factory=list)
+    certain: bool = True
+
+    @property
+    def strength(self) -> float:
+        """Energy that a state of unit size leaves in one innovation, at most."""
+        return float(np.max(np.sum((self.steady.root @ self.steady.C) ** 2, axis=0), initial=1e-300))
+
+    def lose(self) -> None:
+        """From the next sample on the state is unknown."""
+        n = self.model.nx
+        self.P[:n], self.P[:, :n] = 0.0, 0.0
+        self.P[:n, :n] = WIDE / self.strength * np.eye(n)
+        self.certain = False
+
+    def additions(self, before: Array, f: Array) -> tuple[Array, Array]:
+        """Return what held faults add to the state (T, n) and to the output (T, l)."""
+        model, count = self.model, len(f)
+        into_state, into_output = np.zeros((count, model.nx)), np.zeros((count, model.l))
+        for j in np.flatnonzero(self.held):
+            number = self.columns.driven[j]
+            if number >= 0:
+                add_product(self.held[j] * self.columns.losses[number][0], before, into_state)
+                add_product(self.held[j] * self.columns.losses[number][1], f, into_output)
+            else:
+                into_state += self.held[j] * self.columns.into_state[j]
+                into_output += self.held[j] * self.columns.into_output[j]
+        return into_state, into_output
+
+    def run(self, f: Array, fed: Array, y: Array) -> tuple[Array, Array]:
+        """Return states (T + 1, n) and whitened innovations (T, l) of complete samples; the filter stays as it is.
+
+        Args:
+            f: (T, r) functions of the inputs.
+            fed: (T, s) functions of the outputs.
+            y: (T, l) readings.
+        """
+        model, steady = self.model, self.steady
+        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
+        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
+                                       (model.D, f, direct)):
+            if matrix.any():
+                add_product(np.ascontiguousarray(matrix), signal, target)
+        if self.held.any():
+            into_state, into_output = self.additions(f, f)
+            drive += into_state  # what the inputs of this sample add to the next state
+            direct += into_output
+        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
+        x[0] = self.x
+        predict(np.ascontiguousarray(model.A), np.ascontiguousarray(model.C), np.ascontiguousarray(steady.K),
+                np.ascontiguousarray(steady.root), drive, y, direct, x, r)
+        return x, r
+
+    def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, tuple[Array, ...], Array]:
+        """Take in one sample; return whitened innovation (l,), matrices of the search, and the prediction (l,).
+
+        Args:
+            f: (r,) functions of the inputs.
+            fed: y -> (s,) functions of the outputs.
+            y: (l,) readings, NaN where missing.
+            unsure: (r,) functions of the inputs of which nothing is known at this sample.
+        """
+        model, steady, n, q = self.model, self.steady, self.model.nx, len(self.directions)
+        there = np.flatnonzero(~np.isnan(y))
+        lost = np.where(np.isnan(y), model.L, 0.0)
+        _, shift = self.columns.units(self.before, f)
+        later, _ = self.columns.units(f, f)
+        H, J = np.zeros((model.l, q)), np.zeros((n, q))
+        for p, one in enumerate(self.directions):
+            H[:, p] = shift[one.column] * one.grown
+            one.grown += one.growth
+            J[:, p] = later[one.column] * one.grown
+        held_state, held_output = (part[0] for part in self.additions(f[None], f[None]))
+        C = np.hstack([model.C, H])
+        predicted = C @ self.x + model.D @ f + model.offset_y + held_output
+        A = np.zeros((n + q, n + q))
+        A[:n, :n], A[:n, n:], A[n:, n:] = model.A, J, np.eye(q)
+        gain, root, r = np.zeros((n + q, model.l)), np.zeros((model.l, model.l)), np.zeros(model.l)
+        noise = np.vstack([steady.K + lost, np.zeros((q, model.l))])
+        drift = A.copy()
+        drift[:n] += lost @ C
+        used = np.where(np.isnan(y), predicted, y)
+        x = A @ self.x
+        x[:n] += model.B @ f + model.offset_x + model.L @ used + held_state
+        if model.E.size:
+            x[:n] += model.E @ fed(used)
+        wide = np.flatnonzero(unsure)
+        into, onto = np.vstack([model.B[:, wide], np.zeros((q, len(wide)))]), model.D[:, wide]
+        sizes = np.sum((steady.root @ np.vstack([model.C @ model.B, model.D]).reshape(2, model.l, -1)[:, :, wide]) ** 2,
+                       axis=(0, 1))
+        spread = WIDE / np.maximum(sizes, 1e-300)
+        seen, direct, covariance = C[there], onto[there], steady.covariance[:, there]
+        if there.size:
+            S = seen @ self.P @ seen.T + covariance[there] + (direct * spread) @ direct.T
+            cross = drift @ self.P @ seen.T + noise @ covariance + (into * spread) @ direct.T
+            lower = np.linalg.cholesky((S + S.T) / 2)
+            inverse = solve_triangular(lower, np.eye(there.size), lower=True)
+            gain[:, there] = cross @ inverse.T @ inverse
+            root[np.ix_(there, there)] = inverse
+            innovation = y[there] - predicted[there]
+            r[there] = inverse @ innovation
+            x += gain[:, there] @ innovation
+        forget, left = drift - gain @ C, noise - gain
+        left[:, np.isnan(y)] = noise[:, np.isnan(y)]
+        blind = into - gain @ onto
+        self.P = forget @ self.P @ forget.T + left @ steady.covariance @ left.T + (blind * spread) @ blind.T
+        self.P = (self.P + self.P.T) / 2
+        for p, one in enumerate(self.directions):
+            response = root @ C[:, n + p]
+            one.power += (float(response @ response) - one.power) / 100
+        self.x, self.before = x, f
+        self.certain = not q and self.strength * float(np.trace(self.P)) < CERTAIN
+        if self.certain:
+            self.P = np.zeros((n, n))
+        missing = gain.copy()
+        missing[:n] -= lost
+        return r, (A, C, missing, root), predicted
+
+    def carry(self, number: int, window: Window) -> float:
+        """Correct the state by the estimate of a candidate and carry it; return the energy left in the state alone."""
+        sizes, covariance, whole = window.estimate(number)
+        n, q, own = self.model.nx, len(self.directions), self.columns.of(number)
+        moved = whole[: n + q]
+        self.x = self.x + moved @ sizes
+        grown = window.peak[number]
+        jump = self.columns.course[own.start] == JUMP
+        self.P = self.P + moved @ covariance @ moved.T
+        self.certain = False
+        if jump:
+            return self.strength * float(np.sum((moved[:n] @ sizes) ** 2))
+        later, _ = self.columns.units(self.before, self.before)
+        drifting = self.columns.course[own.start] == DRIFT
+        columns = list(range(own.start, own.stop))
+        course = float(grown + 1) if drifting else 1.0
+        added = np.zeros_like(moved)
+        added[:n] = course * later[own].T
+        self.x = self.x + added @ sizes
+        self.P = self.P + (moved @ covariance @ added.T) + (added @ covariance @ moved.T) + added @ covariance @ added.T
+        self._append(number, columns, sizes, covariance, moved + added, 1.0 if drifting else 0.0, course)
+        if drifting:  # an onset that is a little off leaves a constant
+            self.P[n + q :, n + q :] *= 4.0
+            guess = np.diag(np.diag(covariance)) * (2.0 * grown) ** 2
+            constant = np.vstack([self._constant(own, int(grown)), np.zeros((q + len(sizes), len(sizes)))])
+            self.P = self.P + constant @ guess @ constant.T
+            self._append(number, columns, np.zeros(len(sizes)), guess, constant, 0.0, 1.0)
+        return np.inf
+
+    def _append(self, number: int, columns: list[int], sizes: Array, covariance: Array, moved: Array, growth: float,
+                grown: float) -> None:
+        cross = moved @ covariance
+        self.P = np.block([[self.P, cross], [cross.T, covariance]])
+        self.x = np.concatenate([self.x, sizes])
+        self.directions += [Direction(number, j, growth, grown) for j in columns]
+
+    def _constant(self, own: slice, count: int) -> Array:
+        """What constants in the place of columns have done to the state after some samples of the steady predictor."""
+        steady, jolt, shift = self.steady, self.columns.into_state[own].T, self.columns.into_output[own].T
+        moved = jolt.copy()
+        for _ in range(count):
+            moved = steady.A @ moved - steady.K @ (steady.C @ moved + shift) + jolt
+        return moved
+
+    def forget(self, p: int, window: Window | None, *, keep: bool) -> None:
+        """Stop estimating a constant; its estimate is held, or taken out."""
+        n, one = self.model.nx, self.directions.pop(p)
+        if keep:
+            self.held[one.column] += self.x[n + p] * one.grown
+        else:
+            later, _ = self.columns.units(self.before, self.before)
+            self.x[:n] -= later[one.column] * one.grown * self.x[n + p]
+        self.x, self.P = np.delete(self.x, n + p), np.delete(np.delete(self.P, n + p, 0), n + p, 1)
+        if window is not None:
+            window.drop(n + p)
+
+    def release(self, own: slice) -> None:
+        """Stop accounting for the held magnitudes of columns."""
+        later, _ = self.columns.units(self.before, self.before)
+        self.x[: self.model.nx] -= self.held[own] @ later[own]
+        self.held[own] = 0.0
+
+    def room(self, count: int) -> None:
+        """Hold the oldest constants until so many new ones find room."""
+        most = SPARE + 2 * int(self.columns.size.max()) - count
+        while len(self.directions) > most:
+            self.forget(0, None, keep=True)
