@@ -4,8 +4,6 @@ import json
 import os
 import signal
 import sys
-import time as clock
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,11 +25,8 @@ from optid.cli.options import (
 )
 from optid.cli.terminal import FILES, Waiting, hearing, note
 
-POLL = 0.1
-"""Seconds between looks at a file that is followed."""
-
-BLOCK = 1 << 16
-"""Bytes read at a time."""
+LOUD = 20
+"""Rows that cannot be read that are named for each block read; the others are counted."""
 
 ARL0 = 10_000
 """Mean samples between false alarms that are asked for where nothing is said."""
@@ -60,9 +55,12 @@ def monitor(
     delimiter: Delimiter = ",",
     decimal: Decimal = ".",
     fill_gaps: Annotated[
-        bool,
-        typer.Option("--fill-gaps", rich_help_panel=RECORD, help="Count samples that the time stamps skip as missing."),
-    ] = False,
+        int | None,
+        typer.Option(
+            "--fill-gaps", metavar="N", rich_help_panel=RECORD,
+            help="Count up to N samples that the time stamps skip as missing; of a longer gap N.",
+        ),
+    ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", rich_help_panel=RECORD, help="Stop at a row that cannot be read.")
     ] = False,
@@ -85,16 +83,20 @@ def monitor(
     window: Annotated[
         int, typer.Option("--window", "-w", metavar="N", rich_help_panel=MODEL, help="Samples of the window.")
     ] = 100,
+    identified: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--identified", metavar=FILES, rich_help_panel=MODEL,
+            help="The record that the model was identified from: the uncertainty of its parameters counts.",
+        ),
+    ] = None,
     healthy: Annotated[
         list[Path] | None,
         typer.Option(
             "--healthy", metavar=FILES, rich_help_panel=MODEL,
-            help="A healthy record: its innovations must be white and of the size that the model says.",
+            help="A later healthy record: the noise that it shows is used, and the thresholds keep it quiet.",
         ),
     ] = None,
-    rescale: Annotated[
-        bool, typer.Option("--rescale", rich_help_panel=MODEL, help="Take the scale of the noise from --healthy.")
-    ] = False,
     thresholds: Annotated[
         Path | None,
         typer.Option(
@@ -122,7 +124,9 @@ def monitor(
 ) -> None:
     """Watch a stream: one line for every alarm, every fault that is named, and everything that is over.
 
-    Rows that cannot be read are named on the error stream and count as missing samples.
+    Rows that cannot be read are named on the error stream and count as missing samples. A file that is rotated, cut or
+    replaced is followed. With --json every line has the fields kind, sample, line, time, candidates, onset, size,
+    statistic and note.
 
     Example: optid monitor model.json --arl0 10000 < stream.csv
     """
@@ -139,21 +143,34 @@ def monitor(
         )
         reader = RowReader(
             how["inputs"], how["outputs"], dt=how["dt"], time=False if time == "none" else time,
-            columns=words.listed(columns), delimiter=delimiter.replace("\\t", "\t"), decimal=decimal, fill=fill_gaps,
-            label="standard input" if follow is None else follow.name,
+            columns=words.listed(columns), delimiter=delimiter.replace("\\t", "\t"), decimal=decimal,
+            fill=fill_gaps or 0, label="standard input" if follow is None else follow.name,
         )
         if state is not None and state.exists():
             watcher = _resumed(state, plant, model)
         else:
             waiting.step("simulating healthy plants for the thresholds")
-            sound: Any = words.read_record(healthy, how) if healthy else None
+            origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
             watcher = _new(
                 plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
-                window=window, seed=seed, healthy=sound, rescale=rescale, extrapolate=extrapolate,
+                window=window, seed=seed, healthy=sound, uncertainty=origin, extrapolate=extrapolate,
             )
+            if sound is None and origin is not None:
+                _doubt(plant, origin)
     for sentence in heard:
         note(sentence)
-    _watch(watcher, reader, follow, until_end, state, strict=strict, as_json=lines)
+    _Watch(watcher, reader, follow, state, strict=strict, as_json=lines).run(until_end)
+
+
+def _doubt(plant: Any, origin: Any) -> None:
+    """Say whether the noise of a model is that of the record behind it, and how to calibrate the monitor if not."""
+    from optid.faults import health, whiten
+
+    judged = health(whiten(plant, origin))
+    if not (judged.white and judged.scaled):
+        note(f"whiteness of the innovations of the record of the identification: p = {judged.p_value:.2g}, size "
+             f"{judged.ratio:.2f} times the predicted one: thresholds for white noise are too low. Calibrate them on a "
+             "later healthy record: --healthy FILE...")
 
 
 def _new(
@@ -186,123 +203,89 @@ def _resumed(state: Path, plant: Any, path: Path) -> Any:
     from optid.faults import Monitor
 
     found = Monitor.load(state)
-    if found.dictionary.model.to_dict() != plant.to_dict():
+    if found.source is not None and found.source["model"] != json.loads(json.dumps(plant.to_dict())):
         raise StructureError(f"{state} is the state of another model than {path}: remove it, or name another file")
     return found
 
 
-def _watch(
-    watcher: Any, reader: Any, follow: Path | None, until_end: bool, state: Path | None, *, strict: bool, as_json: bool
-) -> None:
-    """Read, judge and tell until the stream ends."""
-    from optid.errors import DataError
+class _Watch:
+    """Reads, judges and tells until the stream ends."""
 
-    start = 0
-    if watcher.source is not None and follow is not None:
-        if watcher.source["path"] != str(follow.resolve()):
-            raise DataError(f"{state} is the state of {watcher.source['path']}, not of {follow}: name another file")
-        start = int(watcher.source["offset"])
-        reader.resume(watcher.source)
-    offset, bad, saved = start, 0, watcher.samples
+    def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: Path | None, *, strict: bool,
+                 as_json: bool) -> None:
+        from optid.cli.following import Followed, standard_input
+        from optid.errors import DataError
 
-    def keep() -> None:
-        nonlocal saved
-        if state is not None:
-            watcher.source = None if follow is None else {
-                "path": str(follow.resolve()), "offset": offset, **reader.memory
-            }
-            watcher.save(state)
-            saved = watcher.samples
+        self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
+        self.plant = (watcher.source or {}).get("model") or watcher.dictionary.model.to_dict()
+        self.bad, self.saved, kept = 0, watcher.samples, (watcher.source or {}).get("place")
+        if kept is not None and follow is not None:
+            if kept["path"] != str(follow.resolve()):
+                raise DataError(f"{state} is the state of {kept['path']}, not of {follow}: name another file")
+            reader.resume(watcher.source)
+        self.file = None if follow is None else Followed(follow, None if kept is None else kept)
+        self._input = standard_input
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        for raw in _lines(follow, until_end, start):
-            first, line = watcher.samples, reader.line
-            rows = reader.read(_text(raw, reader))
-            if strict and rows.bad:
-                raise DataError(rows.bad[0][1])
-            for _, text in rows.bad:
-                note(text)
-            bad += len(rows.bad)
-            events = watcher.run(rows.u, rows.y)
-            for event in events:
-                place = event.sample - first
-                _tell(event, int(rows.lines[place]), rows.stamps[place] if rows.stamps else "", as_json)
-            # a line that ends the stream is the first to be read when it is resumed
+    def run(self, until_end: bool) -> None:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        # with a state the last line may still be completed, so that it is read by the next run
+        parts = self._input() if self.file is None else self.file.lines(until_end, partial=self.state is None)
+        try:
+            for raw, fresh in parts:
+                if fresh:
+                    note(fresh)
+                    self.reader.begin_file()
+                self._take_in(raw)
+        except KeyboardInterrupt:
+            pass
+        except BrokenPipeError:  # whoever read the events has gone
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        finally:
+            self._keep()
+        if not self.watcher.samples:
+            note("no sample was read: there was nothing behind the header")
+        if self.bad:
+            note(f"{self.bad} of {self.watcher.samples} rows could not be read in full")
+
+    def _take_in(self, raw: list[bytes]) -> None:
+        from optid.errors import DataError
+
+        first, line = self.watcher.samples, self.reader.line
+        rows = self.reader.read([part.removesuffix(b"\r").decode("utf-8", "replace") for part in raw])
+        if self.strict and rows.bad:
+            raise DataError(rows.bad[0][1])
+        for _, text in rows.bad[:LOUD]:
+            note(text)
+        self.bad += len({number for number, _ in rows.bad})
+        events = self.watcher.run(rows.u, rows.y)
+        for event in events:
+            place = event.sample - first
+            self._tell(event, int(rows.lines[place]), _clean(rows.stamps[place]) if rows.stamps else "")
+        if self.file is not None:  # a line that ends the stream is the first to be read when it is resumed
             done = raw[: rows.stop - line - 1] if rows.error else raw
-            offset += sum(map(len, done)) + len(done)
-            if rows.error:
-                raise DataError(rows.error)
-            if events or watcher.samples - saved >= KEPT:
-                keep()
-    except KeyboardInterrupt:
-        pass
-    except BrokenPipeError:  # whoever read the events has gone
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    finally:
-        keep()
-    if not watcher.samples:
-        note("no sample was read: there was nothing behind the header")
-    if bad:
-        note(f"{bad} of {watcher.samples} rows could not be read in full")
+            self.file.advance(sum(map(len, done)) + len(done), done)
+        if rows.error:
+            raise DataError(rows.error)
+        if events or self.watcher.samples - self.saved >= KEPT:
+            self._keep()
+
+    def _keep(self) -> None:
+        if self.state is not None:
+            place = None if self.file is None else self.file.place
+            self.watcher.source = {"model": self.plant, "place": place, **self.reader.memory}
+            self.watcher.save(self.state)
+            self.saved = self.watcher.samples
+
+    def _tell(self, event: Any, line: int, stamp: str) -> None:
+        if self.as_json:
+            print(json.dumps({**event.to_dict(), "line": line, "time": stamp or None}), flush=True)
+        else:
+            print(f"t = {stamp}, sample {event}" if stamp else f"sample {event}", flush=True)
 
 
-def _tell(event: Any, line: int, stamp: str, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps({**event.to_dict(), "line": line, "time": stamp or None}), flush=True)
-    else:
-        print(f"t = {stamp}, sample {event}" if stamp else f"sample {event}", flush=True)
-
-
-def _lines(follow: Path | None, until_end: bool, start: int) -> Iterator[list[bytes]]:
-    """Yield complete lines as they come, without their ends."""
-    rest = b""
-    for part in _standard_input() if follow is None else _followed(follow, until_end, start):
-        whole, found, after = (rest + part).rpartition(b"\n")
-        if found:
-            yield whole.split(b"\n")
-        rest = after
-        if not part and rest:  # the last line has no end
-            yield [rest]
-
-
-def _text(raw: list[bytes], reader: Any) -> list[str]:
-    from optid.errors import DataError
-
+def _clean(stamp: str) -> str:
+    """A time stamp without the last digits of a sum of floating-point numbers."""
     try:
-        return [line.removesuffix("\r") for line in b"\n".join(raw).decode("utf-8").split("\n")]
-    except UnicodeDecodeError:
-        for number, line in enumerate(raw, reader.line + 1):
-            try:
-                line.decode("utf-8")
-            except UnicodeDecodeError as error:
-                raise DataError(f"line {number} is not UTF-8 text ({error})") from None
-        raise
-
-
-def _standard_input() -> Iterator[bytes]:
-    if sys.stdin.isatty():
-        note("reading from the terminal; end with Ctrl-D, or pipe a file: optid monitor model.json < stream.csv")
-    while part := os.read(sys.stdin.fileno(), BLOCK):
-        yield part
-    yield b""
-
-
-def _followed(path: Path, until_end: bool, start: int) -> Iterator[bytes]:
-    from optid.errors import DataError
-
-    with open(path, "rb") as file:
-        if os.fstat(file.fileno()).st_size < start:
-            raise DataError(f"{path} is shorter than what was read of it before: it was replaced or cut")
-        file.seek(start)
-        while True:
-            part = file.read(BLOCK)
-            if part:
-                yield part
-            elif until_end:
-                yield b""
-                return
-            else:
-                if path.stat().st_size < file.tell():
-                    raise DataError(f"{path} was cut while it was followed: start again on the new file")
-                clock.sleep(POLL)
+        return f"{float(stamp):.12g}"
+    except ValueError:
+        return stamp

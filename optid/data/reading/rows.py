@@ -11,6 +11,9 @@ from optid.data.reading.columns import TIME_TOLERANCE, as_stamps, choose, second
 from optid.data.reading.csvfile import MISSING
 from optid.errors import DataError
 
+LARGEST = 1e100
+"""Larger numbers are no readings."""
+
 
 class Rows(NamedTuple):
     """What was read.
@@ -43,7 +46,7 @@ class RowReader:
 
     def __init__(
         self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
-        columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: bool = False,
+        columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: int = 0,
         label: str = "stream", tolerance: float = TIME_TOLERANCE,
     ) -> None:
         """Say what is read.
@@ -56,7 +59,7 @@ class RowReader:
             columns: names of the columns of a table without a header.
             delimiter: between the cells.
             decimal: decimal mark.
-            fill: whether a gap of whole sampling times is filled with missing samples instead of being refused.
+            fill: largest number of missing samples that a gap of whole sampling times is filled with; 0 refuses gaps.
             label: what messages call the table.
             tolerance: largest deviation of a time step from dt, relative to it.
 
@@ -74,6 +77,7 @@ class RowReader:
         self._blank: list[int] = []
         self._last: np.ndarray | None = None
         self._since = 0
+        self._headed = columns is None
         if columns is not None:
             self._known([str(name) for name in columns])
 
@@ -103,6 +107,12 @@ class RowReader:
             self._known(list(memory["names"]))
         if memory["last"] is not None:
             self._last = as_stamps([memory["last"]], self._label)
+
+    def begin_file(self) -> None:
+        """Expect the header of another file; its time stamps may begin anew."""
+        if self._headed:
+            self._names = None
+        self.line, self._blank, self._last, self._since = 0, [], None, 0
 
     def read(self, lines: Sequence[str]) -> Rows:
         """Read complete lines, without their ends.
@@ -148,7 +158,7 @@ class RowReader:
                     raise ValueError
                 columns = list(zip(*cells)) or [()] * width
                 values = np.array([list(map(float, columns[place])) for place in self._places]).T
-                if np.isinf(values).any():
+                if np.any(np.abs(values) > LARGEST):
                     raise ValueError
                 stamps = [] if self._clock is None else [cell.strip() for cell in columns[self._clock]]
                 return values.reshape(len(lines), -1), np.arange(first, first + len(lines)), stamps, []
@@ -187,7 +197,7 @@ class RowReader:
             text = cell.replace(self._decimal, ".")
             value = np.nan
             if cell.lower() not in MISSING:
-                if _is_number(text) and np.isfinite(float(text)):
+                if _is_number(text) and abs(float(text)) <= LARGEST:
                     value = float(text)
                 else:
                     wrong.append((number, (
@@ -232,6 +242,7 @@ class RowReader:
         whole = int(round(extra))
         if self._fill and whole >= 1 and abs(extra - whole) <= self._tolerance:
             self._last, self._since = read[at : at + 1], 0
+            whole = min(whole, self._fill)
             gap = np.full((whole, values.shape[1]), np.nan)
             rest = self._checked(values[row + 1 :], lines[row + 1 :], stamps[row + 1 :])
             return _Checked(
@@ -248,8 +259,9 @@ class RowReader:
         ), int(lines[row]))
 
     def _one_by_one(self, values: Array, lines: np.ndarray, stamps: list[str]) -> "_Checked":
-        """Find the stamp that cannot be read, and read those before it."""
+        """Take rows whose time stamp cannot be read as rows without one."""
         kind = None if self._last is None else self._last.dtype
+        kept = list(stamps)
         for row, stamp in enumerate(stamps):
             try:
                 found = as_stamps([stamp], self._label) if stamp else None
@@ -257,14 +269,13 @@ class RowReader:
                 found = np.array([np.nan])
             if found is None:
                 continue
-            kind = found.dtype if kind is None else kind
-            if found.dtype != kind or not np.isfinite(found).all():
-                head = self._checked(values[:row], lines[:row], stamps[:row])
-                return head if head.error else _Checked(*head[:3], (
-                    f"{self._label}, line {lines[row]}: {stamp!r} is no time stamp like those before. Repair it, or "
-                    "ignore the stamps with --time none."
-                ), int(lines[row]))
-        raise DataError(f"{self._label}: the time stamps of lines {lines[0]} to {lines[-1]} cannot be read together.")
+            if not np.isfinite(found).all() or (kind is not None and found.dtype != kind):
+                kept[row] = ""  # the row is there, its time is not known
+            else:
+                kind = found.dtype
+        if kept == list(stamps):
+            raise DataError(f"{self._label}: the time stamps of lines {lines[0]} to {lines[-1]} do not fit together.")
+        return self._checked(values, lines, kept)
 
 
 class _Checked(NamedTuple):

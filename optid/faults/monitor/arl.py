@@ -22,8 +22,8 @@ from optid.errors import DataError, StructureError
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.whitening import Predictor
 
-ALARMS = 100
-"""False alarms that a simulation must see, so that their rate is known to 10 %."""
+ALARMS = 60
+"""False alarms that a simulation must see, so that their rate is known to 13 %."""
 
 FEWEST = 50
 """With fewer alarms than this the threshold is extrapolated, or refused."""

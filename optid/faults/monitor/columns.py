@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.monitor.search_kernel import DRIFT, DRIVEN, JUMP, LASTING, search
+from optid.faults.monitor.search_kernel import DEPENDENT, DRIFT, DRIVEN, JUMP, LASTING, search
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
@@ -171,6 +171,19 @@ class Window:
             self.table[:, :, [place, place + W]] = sig[:, :, None]
             self.products[:, [place, place + W]] = total[:, None]
             self.deviations[:, :, place] = xi
+        self.factors, self.inverses = np.zeros_like(self.products), np.zeros((parts.count, 2 * W))
+        for number, d in enumerate(parts.size):
+            own, start = int(parts.first[number]), int(np.sum((parts.size * (parts.size + 1) // 2)[:number]))
+            at = {(i, h): start + i * (i + 1) // 2 + h for i in range(d) for h in range(i + 1)}
+            for (i, h), row in at.items():
+                left_over = self.products[row] - sum(
+                    (self.factors[at[i, q]] * self.factors[at[h, q]] for q in range(h)), np.zeros(2 * W))
+                if h < i:
+                    self.factors[row] = left_over * self.inverses[own + h]
+                else:
+                    enough = left_over > np.maximum(DEPENDENT * self.products[row], 0.0)
+                    self.inverses[own + i, enough] = 1 / np.sqrt(left_over[enough])
+                    self.factors[row] = left_over * self.inverses[own + i]
 
     def _leave_tables(self) -> None:
         """Write what the tables stand for to the deviations and products that are followed."""
@@ -200,8 +213,8 @@ class Window:
         if not steady and self.clean[0] >= min(start, self.length) and start:
             self._leave_tables()
         done = search(*matrices, parts.into_state, parts.into_output, parts.course, parts.driven, parts.moving,
-                      *signals, r, parts.first, parts.size, parts.least, limit, tabled, self.table, self.products,
-                      self.xi, self.b, self.gram, self.grown, self.clock, statistic, self.peak, weight)
+                      *signals, r, parts.first, parts.size, parts.least, limit, tabled, self.table, self.factors,
+                      self.inverses, self.xi, self.b, self.gram, self.grown, self.clock, statistic, self.peak, weight)
         self.clean[0] = self.clean[0] + done if steady else 0
         recent = np.arange(max(done - self.length, 0), done)
         at = (start + recent) % self.length

@@ -76,7 +76,8 @@ def accumulate(v, source, target, count):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def search(A, C, gain, root, into_state, into_output, course, driven, moving, moving_state, moving_output, r,
-           first, size, least, limit, tabled, table, products, xi, b, gram, grown, clock, statistic, peak, weight):
+           first, size, least, limit, tabled, table, factors, inverses, xi, b, gram, grown, clock, statistic, peak,
+           weight):
     """Search the windows that end with each of T samples; stop after the first that exceeds a limit.
 
     Args:
@@ -98,7 +99,8 @@ def search(A, C, gain, root, into_state, into_output, course, driven, moving, mo
         limit: (C,) thresholds.
         tabled: whether signatures and products of the other columns are those of the tables.
         table: (D, l, 2 W) signatures, the oldest onset first, twice.
-        products: (pairs, 2 W) products of the columns of a candidate, the oldest onset first, twice.
+        factors: (pairs, 2 W) Cholesky factors of the products of a candidate, in the same order.
+        inverses: (D, 2 W) of their diagonals, zero for a column that explains nothing of its own.
         xi: (D, room, W) deviations, changed.
         b: (D, W) correlations with the innovations, changed.
         gram: (pairs, W) products of the columns of a candidate, changed.
@@ -182,20 +184,31 @@ def search(A, C, gain, root, into_state, into_output, course, driven, moving, mo
             for a in range(valid):
                 total[a] = 0.0
             moves = moving[own]
-            known = tabled and not moves
-            for i in range(d):
+            if tabled and not moves:
+                for i in range(d):
+                    target, source = z[i], b[own + i]
+                    for a in range(valid):
+                        target[a] = source[a]
+                    for h in range(i):
+                        x, y = factors[pair + h], z[h]
+                        for a in range(valid):
+                            target[a] -= x[shift + a] * y[a]
+                    pair += i + 1
+                    line = inverses[own + i]
+                    for a in range(valid):
+                        target[a] *= line[shift + a]
+                        total[a] += target[a] * target[a]
+            for i in range(0 if tabled and not moves else d):
                 for a in range(valid):
                     z[i, a] = b[own + i, a]
                 for h in range(i + 1):
-                    for o in range(0 if known else l):
+                    for o in range(l):
                         x, y, line = sig[own + i, o], sig[own + h, o], gram[pair]
                         for a in range(valid):
                             line[a] += x[a] * y[a]
                     at = i * widest + h
-                    line = products[pair] if known else gram[pair]
-                    back = shift if known else 0
                     for a in range(valid):
-                        low[at, a] = line[back + a]
+                        low[at, a] = gram[pair, a]
                     for q in range(h):
                         one, two = i * widest + q, h * widest + q
                         for a in range(valid):
@@ -208,7 +221,7 @@ def search(A, C, gain, root, into_state, into_output, course, driven, moving, mo
                         weight[t, c] = low[at, oldest] if k + 1 >= W else -1.0
                         for a in range(valid):
                             v = low[at, a]
-                            inverse[i, a] = 1.0 / np.sqrt(v) if v > DEPENDENT * line[back + a] and v > 0.0 else 0.0
+                            inverse[i, a] = 1.0 / np.sqrt(v) if v > DEPENDENT * gram[pair, a] and v > 0.0 else 0.0
                             low[at, a] = v * inverse[i, a]
                     pair += 1
                 for a in range(valid):

@@ -1,0 +1,164 @@
+"""Lines of a stream: the standard input, or a file that is still being written, rotated, cut or replaced."""
+
+import hashlib
+import os
+import sys
+import time as clock
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from optid.cli.terminal import note
+
+POLL = 0.1
+"""Seconds between looks at a file that is followed."""
+
+BLOCK = 1 << 16
+"""Bytes read at a time."""
+
+MARK = 256
+"""Bytes before the place reached by which a file is known again."""
+
+
+def standard_input() -> Iterator[tuple[list[bytes], str]]:
+    """Yield complete lines as they come, without their ends, and an empty remark."""
+    if sys.stdin.isatty():
+        note("reading from the terminal; end with Ctrl-D, or pipe a file: optid monitor model.json < stream.csv")
+    rest = b""
+    while part := os.read(sys.stdin.fileno(), BLOCK):
+        *whole, rest = (rest + part).split(b"\n")
+        if whole:
+            yield whole, ""
+    if rest:
+        yield [rest], ""
+
+
+class Followed:
+    """A file that is followed.
+
+    Attributes:
+        place: where the next line begins, in JSON types: path, offset, inode, and a hash of the bytes before it.
+    """
+
+    def __init__(self, path: Path, place: Mapping[str, Any] | None) -> None:
+        """Open a file.
+
+        Args:
+            path: of the file.
+            place: where to go on, of an earlier run.
+
+        Raises:
+            OSError: no such file.
+        """
+        self._path, self._old = path, dict(place) if place else None
+        with open(path, "rb") as file:
+            self.place: dict[str, Any] = {"path": str(path.resolve()), "offset": 0, "inode": _inode(file), "mark": ""}
+        self._tail = b""
+
+    def advance(self, count: int, lines: list[bytes]) -> None:
+        """Say that lines of so many bytes have been taken in."""
+        self._tail = (self._tail + b"".join(line + b"\n" for line in lines[-MARK:]))[-MARK:]
+        self.place |= {"offset": self.place["offset"] + count, "mark": _hash(self._tail)}
+
+    def lines(self, until_end: bool, *, partial: bool = True) -> Iterator[tuple[list[bytes], str]]:
+        """Yield complete lines, without their ends, and a remark where another file begins.
+
+        Args:
+            until_end: stop at the end of the file.
+            partial: whether a last line without an end counts.
+        """
+        remark, self._partial = "", partial
+        if self._old is not None:
+            found = self._found(self._old)
+            if found is None:
+                remark = f"{self._path} is not the file that was read before: it is read from its beginning"
+            else:
+                self._go_on(found, self._old)
+                yield from self._of(found, until_end or not _same(found, self._path))
+                if not _same(found, self._path):
+                    remark = f"{self._path} was rotated: the rest of {found.name} was read"
+                elif until_end:
+                    return
+                else:
+                    remark = self._remark
+        while True:
+            self._begin()
+            first = True
+            for raw in self._of(self._path, until_end):
+                yield raw[0], remark if first else ""
+                first = False
+            if until_end:
+                return
+            remark = self._remark
+
+    def _begin(self) -> None:
+        self.place |= {"offset": 0, "inode": os.stat(self._path).st_ino, "mark": ""}
+        self._tail = b""
+
+    def _go_on(self, found: Path, old: Mapping[str, Any]) -> None:
+        with open(found, "rb") as file:
+            file.seek(max(int(old["offset"]) - MARK, 0))
+            self._tail = file.read(min(MARK, int(old["offset"])))
+        self.place |= {"offset": int(old["offset"]), "inode": int(old["inode"]), "mark": old["mark"]}
+
+    def _found(self, old: Mapping[str, Any]) -> Path | None:
+        """The file that an earlier run read: under its name, or the name that a rotation gave it."""
+        for path in (self._path, *sorted(self._path.parent.glob(self._path.name + "?*"))):
+            if not path.is_file() or path.stat().st_size < int(old["offset"]):
+                continue
+            with open(path, "rb") as file:
+                file.seek(max(int(old["offset"]) - MARK, 0))
+                if _hash(file.read(min(MARK, int(old["offset"])))) == old["mark"] and \
+                        (path == self._path or _inode(file) == old["inode"]):
+                    return path
+        return None
+
+    def _of(self, path: Path, until_end: bool) -> Iterator[tuple[list[bytes], str]]:
+        """Yield lines of one file from the place on, until it ends or is no longer the file of that name."""
+        rest, self._remark = b"", ""
+        with open(path, "rb") as file:
+            file.seek(self.place["offset"])
+            self.place["inode"] = _inode(file)
+            while True:
+                part = file.read(BLOCK)
+                if part:
+                    *whole, rest = (rest + part).split(b"\n")
+                    if whole:
+                        yield whole, ""
+                    continue
+                if until_end:
+                    break
+                self._remark = self._other(file)
+                if self._remark:
+                    more = file.read()  # what came between the last look and the rotation
+                    if more and "cut" not in self._remark:
+                        *whole, rest = (rest + more).split(b"\n")
+                        if whole:
+                            yield whole, ""
+                    break
+                clock.sleep(POLL)
+        if rest and "cut" not in self._remark and (self._partial or self._remark):
+            yield [rest], ""
+
+    def _other(self, file: Any) -> str:
+        try:
+            now = os.stat(self._path)
+        except FileNotFoundError:  # between the two halves of a rotation
+            return ""
+        if now.st_ino != _inode(file):
+            return f"{self._path} was replaced: the new file is read from its beginning"
+        if now.st_size < file.tell():
+            return f"{self._path} was cut: it is read from its beginning"
+        return ""
+
+
+def _inode(file: Any) -> int:
+    return os.fstat(file.fileno()).st_ino
+
+
+def _same(one: Path, other: Path) -> bool:
+    return one.stat().st_ino == other.stat().st_ino
+
+
+def _hash(part: bytes) -> str:
+    return hashlib.sha256(part).hexdigest()[:16]
