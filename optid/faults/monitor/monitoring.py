@@ -131,7 +131,10 @@ class Monitor:
             if self.remark:
                 warnings.warn(self.remark, DataWarning, stacklevel=2)
         self._set(found, int(window), seed, {**RULES, **rules} | ({} if found.unknown else {"odd": np.inf}))
+        gains = {c.label for c in found.candidates if c.kind == "loss"}  # of sensors: among the kinds by default
         for label, why in self.skipped.items():
+            if label in gains:
+                continue
             warnings.warn(f"{label} is not monitored: {why}.", DataWarning, stacklevel=2)
         if thresholds is not None:
             self.calibration = self._given(thresholds, arl0)
