@@ -126,7 +126,7 @@ def test_what_is_wrong_with_the_table_is_said_by_name(folder):
     assert "has no column 'y2'" in known(folder, text="u1,u2,y1\n1,2,3\n", code=2)[1]
     assert "no header row" in known(folder, text="1,2,3,4\n", code=2)[1]
     assert "two columns named 'u1'" in known(folder, text="u1,u1,u2,y1,y2\n", code=2)[1]
-    assert known(folder, "--columns", *NAMES, text="1,2,3,4\n") == ("", "")
+    assert known(folder, "--columns", *NAMES, text="1,0.5,3,4\n") == ("", "")
     assert known(folder, "--delimiter", ";", "--decimal", ",", text="u1;u2;y1;y2\n0,5;1,0;2;3\n") == ("", "")
     assert "No such file" in known(folder, "--follow", "nowhere.csv", code=2)[1]
 

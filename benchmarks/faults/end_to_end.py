@@ -60,13 +60,12 @@ def one(arl0: float, window: int, fault: Fault, seed: int) -> tuple[int, int, bo
     u, y = stream(model, ONSET + AFTER + 200, seed, fault)
     alarm, named, right = -1, -1, False
     for k, (now, reading) in enumerate(zip(u, y)):
-        event = monitor.step(now, reading)
-        if event is None or k < ONSET:
-            continue
-        if event.kind == "alarm" and alarm < 0:
-            alarm = k - ONSET
-        if event.kind == "isolated" and alarm >= 0 and len(event.candidates) == 1:
-            named, right = k - ONSET, event.candidates[0][0].startswith(fault.name)
+        for event in monitor.step(now, reading) if k >= ONSET else ():
+            if event.kind == "alarm" and alarm < 0:
+                alarm = k - ONSET
+            if event.kind == "isolated" and alarm >= 0 and len(event.candidates) == 1 and named < 0:
+                named, right = k - ONSET, event.candidates[0][0].startswith(fault.name)
+        if named >= 0:
             break
     used = max(max(named, 0) + SETTLE, LEAST)
     end = min(ONSET + used, len(u))

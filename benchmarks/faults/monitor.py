@@ -39,18 +39,17 @@ def one(arl0: float, window: int, fault: Fault, seed: int) -> tuple[int, dict[in
     alarm, leads, named, later, leader = -1, {}, None, 0, ""
     quantiles = monitor.calibration.q
     for k, (now, reading) in enumerate(zip(u, y)):
-        event = monitor.step(now, reading)
-        if event is not None and event.kind == "alarm":
-            if k < ONSET:
-                return -2, {}, None, 0
-            if alarm < 0:
-                alarm = k
-            else:
-                later += 1
-        if event is not None and event.kind == "isolated":  # the last word on the first alarm
-            if later == 0:
+        for event in monitor.step(now, reading):
+            if event.kind == "alarm":
+                if k < ONSET:
+                    return -2, {}, None, 0
+                if alarm < 0:
+                    alarm = k
+                else:
+                    later += 1
+            if event.kind == "isolated" and later == 0:  # the last word on the first alarm
                 leader = event.candidates[0][0]
-                named = (event.candidates[0][0].startswith(fault.name), event.sample - ONSET)
+                named = (leader.startswith(fault.name), event.sample - ONSET)
         if alarm >= 0 and k - alarm in AFTER:
             gains = np.array(list(monitor.statistics.values())) - quantiles
             leads[k - alarm] = (leader or monitor.labels[int(np.argmax(gains))]).startswith(fault.name)

@@ -19,7 +19,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
-from optid.faults.monitor.columns import Columns, Window
+from optid.faults.monitor.columns import Columns, Window, matrices
 from optid.faults.whitening import Predictor
 
 ALARMS = 60
@@ -158,9 +158,8 @@ def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: 
         r: (T, l) whitened innovations.
     """
     kept = Window(columns, window, len(steady.A), np.eye(len(steady.C)), steady)
-    parts = tuple(np.ascontiguousarray(part, dtype=float) for part in (steady.A, steady.C, steady.K, steady.root))
-    _, statistic, _ = kept.advance(parts, columns.signals(f[:-1], f[1:]), np.ascontiguousarray(r),
-                                   np.full(len(columns.size), np.inf))
+    _, statistic, _ = kept.advance(matrices(steady), columns.signals(f[:-1], f[1:]),
+                                   np.ascontiguousarray(r), np.full(len(columns.size), np.inf))
     count = len(statistic) // window
     return statistic[: count * window].reshape(count, window, -1).max(axis=1)
 

@@ -10,11 +10,19 @@ from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
+Matrices = tuple[Array, Array, Array, Array]  # transition, output, gain and root of the search
+
 COURSES = {"bias": LASTING, "drift": DRIFT, "jump": JUMP, "spike": JUMP, "loss": DRIVEN, "stuck": LASTING}
 """The course of the columns of a kind; the loss of a stuck actuator, its last column, is driven."""
 
 SPARE = 8
 """Carried directions for which the search has room, beside twice the widest candidate."""
+
+
+def matrices(steady: Predictor) -> Matrices:
+    """Return what the search needs of a steady predictor."""
+    return (np.ascontiguousarray(steady.A), np.ascontiguousarray(steady.C), np.ascontiguousarray(steady.K),
+            np.ascontiguousarray(steady.root))
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +203,7 @@ class Window:
         rows = np.repeat(still[self.columns.first], self.columns.size * (self.columns.size + 1) // 2)
         self.gram[rows] = self.products[rows][:, at]
 
-    def advance(self, matrices: tuple[Array, ...], signals: tuple[Array, Array], r: Array, limit: Array,
+    def advance(self, matrices: Matrices, signals: tuple[Array, Array], r: Array, limit: Array,
                 shown: int | None = None) -> tuple[int, Array, Array]:
         """Search samples until one exceeds a limit; return how many, their statistics and weights (T, C).
 

@@ -39,7 +39,7 @@ def save(monitor: "Monitor", path: str | Path) -> Path:
         "rules": {**monitor.decisions.rules, "odd": min(monitor.decisions.rules["odd"], 1e300)},
         "source": monitor.source, "samples": monitor.samples, "remark": monitor.remark,
         "decisions": kept(monitor.decisions), "readings": monitor.checks.memory, "certain": plant.certain,
-        "directions": [vars(one) for one in plant.directions],
+        "directions": [vars(one) for one in plant.directions], "silent": found.predictor.silent,
     }
     arrays = {f"search_{name}": getattr(monitor.search, name) for name in Window.KEPT} | {"sines": found.sines}
     arrays |= {f"plant_{name}": getattr(plant, name) for name in PLANT}
@@ -73,7 +73,8 @@ def load(monitor: "Monitor", path: str | Path, functions: dict[str, Any] | None 
             )
             for i, c in enumerate(head["candidates"])
         )
-        steady = Predictor(*(arrays[f"predictor_{name}"] for name in PREDICTOR))
+        A, C, L, K, covariance, root = (arrays[f"predictor_{name}"] for name in PREDICTOR)
+        steady = Predictor(A, C, L, K, covariance, root, int(head["silent"]))
         found = Dictionary(model, steady, candidates, head["excluded"], arrays["sines"], head["unknown"])
         monitor._set(found, head["window"], head["seed"], head["rules"])
         monitor.calibration = Calibration.from_dict(head["calibration"])

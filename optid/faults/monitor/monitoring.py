@@ -14,7 +14,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.monitor.arl import Calibration, calibrate, held_levels
-from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
+from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of, matrices
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
 from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect
@@ -178,8 +178,7 @@ class Monitor:
         self.samples = 0
         self._functions, self._input_of = tabulated(model.nonlinearities), np.array(model.input_of, dtype=np.int64)
         self._output_of = np.array(model.output_of, dtype=np.int64)
-        parts = (steady.A, steady.C, steady.K, steady.root)
-        self._steady = tuple(np.ascontiguousarray(part, dtype=float) for part in parts)
+        self._steady = matrices(steady)
 
     def _simulated(
         self, f: Array, arl0: float, samples: int | None, extrapolate: bool, effect: Array | None
@@ -319,11 +318,11 @@ class Monitor:
         if plant.certain and not (np.isnan(y).any() or unsure.any()):
             x, r = plant.run(used[None], fed[None], y[None])
             plant.x, plant.before = x[1].copy(), used.copy()
-            matrices, white, shown = self._steady, r, None
+            parts, white, shown = self._steady, r, None
         else:
-            innovation, matrices, _ = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
+            innovation, parts, _ = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
             white, shown = innovation[None], int(np.count_nonzero(~np.isnan(y)))
-        _, statistic, weight = self.search.advance(matrices, moving, white, np.full(len(self.labels), np.inf), shown)
+        _, statistic, weight = self.search.advance(parts, moving, white, np.full(len(self.labels), np.inf), shown)
         self.samples += 1
         if unsure.any():
             decisions.begun = now + 1

@@ -81,7 +81,7 @@ class ReadingChecks:
         for c in range(u.shape[1]):
             self._range(c, u[:, c], outside[:, c], start, events)
         y, frozen = y.copy(), dict[int, int]()
-        repeating, blind = np.zeros(len(y), dtype=bool), np.isnan(u).any(axis=1)
+        repeating, blind = np.zeros(len(y), dtype=bool), np.asarray(np.isnan(u).any(axis=1))
         for o in range(y.shape[1]):
             self._sensor(o, y[:, o], blind, start, repeating, events, frozen)
         return Screened(y, outside | np.isnan(u), repeating, sorted(events, key=lambda e: e.sample), frozen)

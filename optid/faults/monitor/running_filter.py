@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
-from optid.faults.monitor.columns import SPARE, Columns, Window
+from optid.faults.monitor.columns import SPARE, Columns, Matrices, Window
 from optid.faults.monitor.search_kernel import DRIFT, JUMP, add_product, predict
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
@@ -121,7 +121,7 @@ class RunningFilter:
                 np.ascontiguousarray(steady.root), drive, y, direct, x, r)
         return x, r
 
-    def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, tuple[Array, ...], Array]:
+    def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices, Array]:
         """Take in one sample; return whitened innovation (l,), matrices of the search, and the prediction (l,).
 
         Args:
