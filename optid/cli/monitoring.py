@@ -150,6 +150,7 @@ def monitor(
             watcher = _resumed(state, plant, model)
         else:
             waiting.step("simulating healthy plants for the thresholds")
+            trusted = thresholds is None and not healthy and not identified
             origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
             watcher = _new(
                 plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
@@ -157,6 +158,9 @@ def monitor(
             )
             if sound is None and origin is not None:
                 _doubt(plant, origin)
+            elif trusted:
+                note("the thresholds take the model as exact and its innovations as white: name the record that it was "
+                     "identified from (--identified FILE...) and a later healthy one (--healthy FILE...)")
     for sentence in heard:
         note(sentence)
     _Watch(watcher, reader, follow, state, strict=strict, as_json=lines).run(until_end)
