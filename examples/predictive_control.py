@@ -43,6 +43,7 @@ def main():
     state = np.zeros(model.to_casadi().size1_in(0))
     u, predicted = controller(model, reference)(state)
     difference = float(np.max(np.abs(predicted - model.simulate(u))))
+    print(f"inputs between {u.min():.3f} and {u.max():.3f}, at most 1.4")
     print(f"thrust after {HORIZON} samples: {predicted[-1, 0]:.3f}, wanted {reference[-1]:.3f}")
     print(f"prediction against simulation: {difference:.1e}")
     return {"thrust": float(predicted[-1, 0]), "difference": difference}

@@ -67,7 +67,8 @@ def ss(data: Data, *, nx: int | str, block_rows: int | Sequence[int] | None = No
        ) -> Procedure:
     """Minimise the simulation error of a linear model with its states as variables.
 
-    Named variables: ``Theta``, ``output``, ``states``. Arguments as in `hammerstein_ss`, as are the errors raised.
+    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``offset``, ``output``, ``residual``, ``states``, ``x0``.
+    Arguments as in `hammerstein_ss`, as are the errors raised.
     """
     return _fit("ss", data, nx, block_rows=block_rows, weighting=weighting, offset=offset, feedthrough=feedthrough,
                 stability=stability, initial=initial, iterations=iterations, constraints=constraints)
@@ -80,7 +81,8 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
                    constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Hammerstein model, with output feedback or without, its states as variables.
 
-    Named variables: ``Theta``, ``output``, ``states``. Other arguments as in `formulations.state_space.hammerstein_ss`.
+    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``mu``, ``offset``, ``output``, ``residual``, ``states``,
+    ``x0``. Other arguments as in `formulations.state_space.hammerstein_ss`.
 
     Args:
         feedback_basis: polynomials or trigonometric functions.
@@ -106,8 +108,8 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         tries: int = 2, constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a model with functions of latent signals, its states as variables.
 
-    Named variables: ``Theta``, ``output``, ``states``. Other arguments as in `formulations.latent_signals.lfr`, errors
-    raised as in `hammerstein_ss`.
+    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``mu``, ``offset``, ``output``, ``residual``, ``states``,
+    ``x0``, ``z``. Other arguments as in `formulations.latent_signals.lfr`, errors raised as in `hammerstein_ss`.
 
     Args:
         latent_basis: polynomials or trigonometric functions.

@@ -155,7 +155,8 @@ def test_candidates_against_all_onsets_by_plain_programmes(found):
             assert covered == set(range(N)) and all(p.proved for p in result.proofs[c.label].values())
     assert "sensor:y2" in result.consistent and len(result.consistent) < len(few.candidates)
     whole = membership(found.model, data, 2.0, found, onsets="course", solver="highs")
-    assert set(whole.untested) == {"sensor:y1 noise", "sensor:y2 noise", "process:load noise"}
+    assert set(whole.untested) == {"sensor:y1 noise", "sensor:y2 noise", "process:load noise", "sensor:y1 loss",
+                                   "sensor:y2 loss"}
     assert set(result.consistent) <= set(whole.consistent)
     for text in (str(result), str(whole), str(result.proof)):
         assert max(map(len, text.splitlines())) <= 80

@@ -5,6 +5,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -323,7 +324,7 @@ running.run(STUDY, {str(link)!r}, execute=Hands(),
 def test_another_version_is_refused_before_anything_is_run(path, grid):
     grid([cell(0)])
     run(STUDY, path, execute=Hands())
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE meta SET value = '99' WHERE name = 'schema version'")
     grid([cell(1)])
     hands = Hands()
@@ -392,6 +393,7 @@ def test_a_real_study_from_python_to_its_frame():
 DRIVER = """
 import sys
 sys.path.insert(0, {tests!r})
+from contextlib import closing
 from functools import partial
 from study_trouble import behave, cell
 from optid.studies.execution import running, workers

@@ -88,9 +88,11 @@ def print_models(verdict: Any) -> None:
     from optid.studies.page import quality_table
 
     found = quality_table(verdict.quality)
-    table = Table(title=found.title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    table = Table(title=found.title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False,
+                  padding=(0, 1, 0, 0))
     for number, name in enumerate(found.head):
-        table.add_column(name, justify="left" if number < 2 else "right", overflow="fold")
+        table.add_column(name, justify="left" if number < 2 else "right", overflow="fold",
+                         min_width=max(map(len, name.split())))
     for row in found.rows:
         table.add_row(*map(Text, row))
     output().print(table)

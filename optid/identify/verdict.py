@@ -179,7 +179,7 @@ def _structure(model: Any, data: Data) -> list[Finding]:
     if found is None:
         return []
     saved = "" if found.passed else f", which saves {100 * found.saving:.2g} % of the residual variance"
-    return [Finding("structure", f"the record {found.finding}{saved} (p = {found.p_value:.2g})", found.passed,
+    return [Finding("structure", f"{found.finding}{saved} (p = {found.p_value:.2g})", found.passed,
                     found.saving > STRUCTURE)]
 
 

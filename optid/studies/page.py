@@ -180,7 +180,7 @@ def _claims(verdict: Verdict) -> Table | None:
 
 def quality_table(quality: Quality) -> Table:
     """Return the mean figures of the models of every formulation, and those on each data set where these are few."""
-    head = ("records solved", "simulation fit", "one-step fit", "parameter error", "nonlinearity error")
+    head = ("solved", "simulation fit", "one-step fit", "parameter error", "error of f")
     apart = len(quality.sets) > 1 and (len(quality.sets) + 1) * len(quality.formulations) <= LISTED
     rows = []
     for name in quality.formulations:
