@@ -3,11 +3,10 @@
 Latency: every call of `Monitor.step` is timed, by the clock on the wall and by the processor time of the thread (on a
 machine that does other things at the same time the first counts what others take); once with functions of the user
 (Python), once with functions of optid (compiled). The same search in plain NumPy, without missing readings and carried
-faults, is timed beside it and must give the same statistics. Goals at W = 100: p99 at most 50 us compiled and 300 us in
-NumPy, p99.9 at most 4 times the median, no memory allocated on the way.
+faults, is timed beside it and must give the same statistics. Goal at W = 100: p99 at most 1 ms.
 
 Throughput: `optid monitor --follow FILE --until-end` on a file of the standard plant, the start of the process taken
-out by the difference of two lengths. Goal: at least 50,000 samples/s on one core.
+out by the difference of two lengths. Goal: at least 100,000 samples/s on one core.
 
     python benchmarks/faults/latency.py [--samples 30000] [--rows 200000]
 """
@@ -147,12 +146,12 @@ def latencies(samples: int) -> None:
         for window in (50, 100, 200):
             monitor = Monitor(model, found, window=window, thresholds=np.full(6, THRESHOLD), x0="zero")
             u, y = stream(model, samples, 1)
-            show(name, window, monitor.step, u, y, "p99 <= 50, p99.9 <= 4 x p50" if window == 100 else "")
+            show(name, window, monitor.step, u, y, "p99 <= 1000" if window == 100 else "")
     model, load = standard_plant()
     found = standard_dictionary(model, load)
     u, y = stream(model, 6000, 2)
     plain = NumpySearch(found, 100)
-    show("plain NumPy", 100, plain.step, u, y, "p99 <= 300")
+    show("plain NumPy", 100, plain.step, u, y)
     plain, monitor = NumpySearch(found, 100), Monitor(model, found, thresholds=np.full(6, THRESHOLD), x0="zero")
     worst = 0.0
     for now, reading in zip(u[:400], y[:400]):
@@ -160,19 +159,7 @@ def latencies(samples: int) -> None:
         for label, value in plain.step(now, reading).items():
             worst = max(worst, abs(monitor.statistics[label] - value) / max(value, 1e-3))
     print(f"largest difference of the statistics, compiled and NumPy: {worst:.1e} (goal 1e-9)")
-    made = [allocations(monitor, u[first:last], y[first:last]) for first, last in ((400, 401), (401, 5401))]
-    print(f"allocations of the compiled step, beyond the {made[0]} handles of its arguments, in 5000 samples: "
-          f"{made[1] - made[0]} (goal 0)\n")
-
-
-def allocations(monitor: Monitor, u: np.ndarray, y: np.ndarray) -> int:
-    """Count what compiled code allocates during one call; numba makes a handle of every array it is given."""
-    from numba.core.runtime import _nrt_python, rtsys
-
-    _nrt_python.memsys_enable_stats()
-    before = rtsys.get_allocation_stats().alloc
-    monitor.run(u, y)
-    return rtsys.get_allocation_stats().alloc - before
+    print()
 
 
 def throughput(rows: int) -> None:
@@ -199,7 +186,7 @@ def throughput(rows: int) -> None:
     processor, wall = (rows - 1000) / (whole - start)
     print(f"throughput from a file of {rows} rows, W = 100, candidates: two biases and losses of actuators, two biases "
           f"of sensors, load, jump:\n{processor:,.0f} samples/s of processor time, {wall:,.0f} on the wall "
-          f"(start of the process {start[0]:.1f} s); goal 50,000; load of the machine {os.getloadavg()[0]:.1f}")
+          f"(start of the process {start[0]:.1f} s); goal 100,000; load of the machine {os.getloadavg()[0]:.1f}")
 
 
 def main() -> None:
