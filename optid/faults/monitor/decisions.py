@@ -229,7 +229,8 @@ class Decisions:
                 plant.release(own)
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
             left = sum(window.length * plant.directions[p].power * plant.P[n + p, n + p] for p in rows)
-            if 0 < left < self.rules["learned"]:
+            seen = min(plant.directions[p].age for p in rows) >= window.length
+            if seen and 0 < left < self.rules["learned"]:
                 for p in reversed(rows):
                     plant.forget(p, window, keep=True)
         return None

@@ -36,6 +36,7 @@ class Direction:
         growth: what its course grows by per sample.
         grown: its course at the next sample.
         power: energy that one unit leaves in one innovation, on average.
+        age: samples since it is carried.
     """
 
     owner: int
@@ -43,6 +44,7 @@ class Direction:
     growth: float
     grown: float
     power: float = 0.0
+    age: int = 0
 
 
 @dataclass(eq=False)
@@ -177,7 +179,8 @@ class RunningFilter:
         self.P = (self.P + self.P.T) / 2
         for p, one in enumerate(self.directions):
             response = root @ C[:, n + p]
-            one.power += (float(response @ response) - one.power) / 100
+            one.age += 1
+            one.power += (float(response @ response) - one.power) / min(one.age, 100)
         self.x, self.before = x, f
         self.certain = not q and self.strength * float(np.trace(self.P)) < CERTAIN
         if self.certain:
