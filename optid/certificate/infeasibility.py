@@ -80,7 +80,14 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
 
 def _feasible(members: Sequence[Any]) -> bool:
     problem = cp.Problem(cp.Minimize(0), list(members))
-    solve_quietly(problem)
+    for solver in ("CLARABEL", "SCS"):
+        try:
+            solve_quietly(problem, solver)
+            break
+        except cp.SolverError:  # it gave up; where both do, nothing is known, so nothing can be blamed
+            continue
+    else:
+        return True
     return problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)  # an inaccurate proof is one as well
 
 

@@ -144,8 +144,12 @@ class Store:
         """Return a copy in memory: what is done to it leaves the file as it is."""
         other = object.__new__(Store)
         other.path, other._connection = self.path, sqlite3.connect(":memory:", isolation_level=None)
-        with self._named("read"):
-            self._connection.backup(other._connection)
+        try:
+            with self._named("read"):
+                self._connection.backup(other._connection)
+        except BaseException:
+            other._connection.close()
+            raise
         return other
 
     # -- rows ------------------------------------------------------------------------------------------------------
