@@ -1,6 +1,7 @@
 """The database of a study: what goes in comes out, and what cannot be used is refused."""
 
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -155,7 +156,7 @@ def test_missing_database(path):
 
 def test_another_version_is_refused_for_reading_and_writing(path):
     append(path, rows(3))
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE meta SET value = '99' WHERE name = 'schema version'")
     for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished(path)):
         with pytest.raises(DatabaseError, match="schema version 99.*made by optid"):
@@ -163,7 +164,7 @@ def test_another_version_is_refused_for_reading_and_writing(path):
 
 
 def test_other_files_are_refused(path):
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("CREATE TABLE mine (x INTEGER)")
     for attempt in (lambda: read_rows(path), lambda: append(path, rows(1))):
         with pytest.raises(DatabaseError, match="not a database of studies"):
@@ -218,11 +219,11 @@ def test_damaged_databases_are_named_and_end_in_time(path, seed):
 
 def test_tables_and_values_of_another_shape_are_refused(path, tmp_path):
     append(path, rows(3))
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE rows SET started = 'yesterday'")
     with pytest.raises(DatabaseError, match="study.sqlite holds values that no run writes"):
         read_rows(path)
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("ALTER TABLE rows DROP COLUMN objective")
     with pytest.raises(DatabaseError, match="table rows does not have the columns of a study"):
         read_rows(path)

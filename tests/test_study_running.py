@@ -152,7 +152,7 @@ def test_outcomes_are_retried_on_request(path, grid):
     hands = Hands()
     assert [r["outcome"] for r in run(STUDY, path, execute=hands, retry=["crashed"])] == ["done"] * 4
     assert hands.ran == [0]
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         assert connection.execute("SELECT outcome FROM superseded").fetchall() == [("crashed",)]
     with pytest.raises(StudyError, match="Did you mean 'crashed'"):
         run(STUDY, path, execute=hands, retry=["crash"])
@@ -262,7 +262,7 @@ def test_two_runs_of_a_study_at_once_are_refused_and_two_studies_are_not(path, t
 @pytest.mark.parametrize("year, free", [(2026, True), (2999, False)])
 def test_a_run_on_another_machine_holds_its_study_while_it_writes_rows(path, grid, year, free):
     grid([cell(0)])
-    with Store(path, write=True), sqlite3.connect(path) as connection:
+    with Store(path, write=True), closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("INSERT INTO runs VALUES ('trouble', 'elsewhere', 1, '2026-01-01', ?)",
                            [f"{year}-01-01T00:00:00+00:00"])
     if free:
