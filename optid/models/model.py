@@ -33,6 +33,7 @@ class Model(Ports):
         input_units: one per input, "" where unknown.
         output_units: one per output, "" where unknown.
         gauge: how the scale between f and B is fixed; see `regauge`.
+        orders: the numbers of the structure by their names, na, nb, nk, nx.
         poles: complex, largest first.
         memory: samples at the start of a record that cannot be predicted.
         c0: offset of f where the data tell it from the constants of the equations, else None.
@@ -45,6 +46,7 @@ class Model(Ports):
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     gauge: str
+    orders: Any
     poles: Any
     memory: int
     structure: Any
