@@ -12,6 +12,7 @@ import optid
 from optid.examples import example
 
 HORIZON = 25
+LIMIT = 1.4
 
 
 def controller(model, reference):
@@ -29,7 +30,7 @@ def controller(model, reference):
     predict = ca.Function("predict", [x0, u], [predicted])
 
     def solve(state):
-        u = np.array(solver(x0=np.full(HORIZON, 0.3), lbx=-1.4, ubx=1.4, p=state)["x"])
+        u = np.array(solver(x0=np.full(HORIZON, 0.3), lbx=-LIMIT, ubx=LIMIT, p=state)["x"])
         return u, np.array(predict(state, u))
 
     return solve
@@ -43,7 +44,7 @@ def main():
     state = np.zeros(model.to_casadi().size1_in(0))
     u, predicted = controller(model, reference)(state)
     difference = float(np.max(np.abs(predicted - model.simulate(u))))
-    print(f"inputs between {u.min():.3f} and {u.max():.3f}, at most 1.4")
+    print(f"inputs between {u.min():.3f} and {u.max():.3f}, at most {LIMIT}")
     print(f"thrust after {HORIZON} samples: {predicted[-1, 0]:.3f}, wanted {reference[-1]:.3f}")
     print(f"prediction against simulation: {difference:.1e}")
     return {"thrust": float(predicted[-1, 0]), "difference": difference}

@@ -108,8 +108,9 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         tries: int = 2, constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a model with functions of latent signals, its states as variables.
 
-    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``mu``, ``offset``, ``output``, ``residual``, ``states``,
-    ``x0``, ``z``. Other arguments as in `formulations.latent_signals.lfr`, errors raised as in `hammerstein_ss`.
+    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``b latent``, ``mu``, ``mu latent``, ``offset``, ``output``,
+    ``residual``, ``signal of z``, ``states``, ``x0``, ``z``. Other arguments as in `formulations.latent_signals.lfr`,
+    errors raised as in `hammerstein_ss`.
 
     Args:
         latent_basis: polynomials or trigonometric functions.

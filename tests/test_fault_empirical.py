@@ -175,3 +175,27 @@ def test_a_healthy_record_of_the_noise_that_was_predicted_changes_little(found):
     assert taught.remark == ""
     assert np.all(taught.calibration.q >= plain.calibration.q * 0.95)
     assert np.all(taught.calibration.q <= plain.calibration.q * 1.3)
+
+
+def test_a_record_shorter_than_the_time_between_alarms_raises_the_thresholds_of_the_simulation(found):
+    how = {"arl0": 40_000, "samples": 400_000, "extrapolate": True}
+    plain = watching(found, **how)
+    white, coloured = (watching(found, **how, healthy=one) for one in (record(6000, 35), record(6000, 36, 1.5)))
+    assert white.calibration.extrapolated and coloured.calibration.arl0 == 40_000
+    assert np.max(white.calibration.q / plain.calibration.q) < 1.25
+    parts = Data.join(record(4000, 37, 1.5), record(2000, 38, 1.5))
+    np.testing.assert_allclose(watching(found, **how, healthy=parts).calibration.q, coloured.calibration.q, rtol=0.4)
+
+
+def test_a_monitor_of_losses_is_calibrated_along_the_inputs():
+    found = dictionary(plant(), kinds=["bias", "loss"])
+    plain, taught = (watching(found, arl0=500, **how) for how in ({}, {"healthy": record(2500, 39, 1.5)}))
+    assert taught.calibration.labels == plain.labels
+    other = record(6000, 41, 1.5)
+    counts = [sum(e.kind == "alarm" for e in monitor.run(other.u, other.y)) for monitor in (plain, taught)]
+    assert counts[1] <= 24 < counts[0], counts  # 12 are asked for
+
+
+def test_a_monitor_needs_a_healthy_record_of_some_length(found):
+    with pytest.raises(DataError, match="20 are needed"):
+        watching(found, arl0=3000, healthy=record(300, 40))

@@ -199,6 +199,7 @@ def test_dates_quotes_and_gaps():
     for text in ([*dates[:2], "3.5,1,2"], ["t,u,y", "0,1,2", "soon,1,2"]):
         found = reader().read(text)
         assert found.error == "" and found.y.ravel().tolist() == [2, 2]  # the row counts, its time is not known
+        assert [line for line, _ in found.bad] == [3] and "is no time stamp like those before" in found.bad[0][1]
 
 
 def test_reading_goes_on_where_it_stopped():

@@ -380,4 +380,4 @@ def test_a_study_of_one_solver_concludes_about_formulations_and_shows_their_tabl
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("seeds = 2", "seeds = 1"))
     found = run("study", "run", "rigs.toml", "-w", 1)
     assert found.exit_code == 0 and "Models: cannot tell" in found.stdout and "needs at least 6" in found.stdout
-    assert all(word in found.stdout for word in ("simulation", "error of f", "formulation"))
+    assert all(word in found.stdout for word in ("simulation", "error of f", "all 2", "2 of 2"))

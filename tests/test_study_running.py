@@ -393,7 +393,6 @@ def test_a_real_study_from_python_to_its_frame():
 DRIVER = """
 import sys
 sys.path.insert(0, {tests!r})
-from contextlib import closing
 from functools import partial
 from study_trouble import behave, cell
 from optid.studies.execution import running, workers

@@ -60,7 +60,9 @@ def one(arl0: float, window: int, fault: Fault, seed: int) -> tuple[int, int, bo
     u, y = stream(model, ONSET + AFTER + 200, seed, fault)
     alarm, named, right = -1, -1, False
     for k, (now, reading) in enumerate(zip(u, y)):
-        for event in monitor.step(now, reading) if k >= ONSET else ():
+        for event in monitor.step(now, reading):
+            if k < ONSET:
+                continue
             if event.kind == "alarm" and alarm < 0:
                 alarm = k - ONSET
             if event.kind == "isolated" and alarm >= 0 and len(event.candidates) == 1 and named < 0:

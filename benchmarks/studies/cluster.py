@@ -21,6 +21,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -138,21 +139,19 @@ def compare_statistics(client: Any, samples: int, folder: Path) -> bool:
     data = write_record(folder, (samples * 2 // 3, samples // 3), files=12, missing=0.002)
     folders = [folder / "run0", folder / "run1"]
     structure = {"na": 2, "nb": 10, "basis": "triangular:10"}
-    fits, grams, seconds = {}, {}, {}  # matrices in raw units: a fit scales a stream by what it has seen of it
-    for word in ("in memory", "parts here", "parts on the cluster"):
+    sources = {"in memory": lambda: data, "parts here": lambda: optid.open_stream(folders, dt=0.1),
+               "parts on the cluster": lambda: optid.open_stream(folders, dt=0.1, scheduler=client)}
+    fits, grams, seconds = {}, {}, {}
+    killer = Killer(client, (0.5, 1.0), most=1)
+    for word, source in sources.items():
         clock = time.perf_counter()
-        if word == "in memory":
-            fits[word] = optid.fit(data, **structure)
-            layout = Layout(2, (10,), (0,), (fits[word].model.nonlinearities[0].basis,), data.outputs, data.inputs)
-            grams[word] = collect(data, layout).gram
-        elif word == "parts here":
-            fits[word] = optid.fit(optid.open_stream(folders, dt=0.1), **structure)
-            grams[word] = collect(optid.open_stream(folders, dt=0.1), layout).gram
-        else:
-            with Killer(client, (0.5, 1.0), most=1) as killer:
-                fits[word] = optid.fit(optid.open_stream(folders, dt=0.1, scheduler=client), **structure)
-                grams[word] = collect(optid.open_stream(folders, dt=0.1, scheduler=client), layout).gram
+        with killer if word == "parts on the cluster" else nullcontext():
+            fits[word] = optid.fit(source(), **structure)
         seconds[word] = time.perf_counter() - clock
+    # in raw units: a fit scales a stream by what it has seen of it
+    layout = Layout(2, (10,), (0,), (fits["in memory"].model.nonlinearities[0].basis,), data.outputs, data.inputs)
+    for word, source in sources.items():
+        grams[word] = collect(source(), layout).gram
     print(f"\nfit         {samples} samples in 2 experiments, {fits['in memory'].figures['rows']} rows used, "
           f"{fits['in memory'].figures['condition']:.1f} condition; {killer.kills} Dask worker killed")
     whole = grams["in memory"]

@@ -150,7 +150,6 @@ def monitor(
             watcher = _resumed(state, plant, model)
         else:
             waiting.step("simulating healthy plants for the thresholds")
-            trusted = thresholds is None and not healthy and not identified
             origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
             watcher = _new(
                 plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
@@ -158,7 +157,7 @@ def monitor(
             )
             if sound is None and origin is not None:
                 _doubt(plant, origin)
-            elif trusted:
+            elif sound is None and thresholds is None:
                 note("the thresholds take the model as exact and its innovations as white: name the record that it was "
                      "identified from (--identified FILE...) and a later healthy one (--healthy FILE...)")
     for sentence in heard:
@@ -217,7 +216,7 @@ class _Watch:
 
     def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: Path | None, *, strict: bool,
                  as_json: bool) -> None:
-        from optid.cli.following import Followed, standard_input
+        from optid.cli.following import Followed
         from optid.errors import DataError
 
         self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
@@ -228,12 +227,13 @@ class _Watch:
                 raise DataError(f"{state} is the state of {kept['path']}, not of {follow}: name another file")
             reader.resume(watcher.source)
         self.file = None if follow is None else Followed(follow, None if kept is None else kept)
-        self._input = standard_input
 
     def run(self, until_end: bool) -> None:
+        from optid.cli.following import standard_input
+
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         # with a state the last line may still be completed, so that it is read by the next run
-        parts = self._input() if self.file is None else self.file.lines(until_end, partial=self.state is None)
+        parts = standard_input() if self.file is None else self.file.lines(until_end, partial=self.state is None)
         try:
             for raw, fresh in parts:
                 if fresh:

@@ -115,7 +115,7 @@ class ModelUncertainty:
             present: (N, l) whether a reading is there.
             free_start: whether the initial state was estimated from this very record, so that nothing is known of it.
         """
-        by_parameter, by_start = _sensitivities(self.model, self.predictor, part, x0, present, self.root)
+        by_parameter, by_start = sensitivities(self.model, self.predictor, part, x0, present, self.root)
         columns = [by_parameter]
         if free_start:
             sizes = np.linalg.norm(by_start, axis=0)
@@ -159,7 +159,7 @@ def model_uncertainty(
     information, readings, energy = np.zeros((count, count)), 0, 0.0
     for part, x0 in zip(raw.experiments, starts):
         present = ~np.isnan(part.y)
-        by_parameter, by_start = _sensitivities(gained, steady, part, x0, present, np.eye(count))
+        by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(count))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
         rest = by_parameter - basis @ (basis.T @ by_parameter)
@@ -262,7 +262,7 @@ def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], 
     return np.concatenate(parts), np.concatenate(steps), back
 
 
-def _sensitivities(
+def sensitivities(
     model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array
 ) -> tuple[Array, Array]:
     """Derivatives (N l, q) and (N l, n) of the whitened innovations along the columns of root and by the start."""

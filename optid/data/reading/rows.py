@@ -12,7 +12,7 @@ from optid.data.reading.csvfile import MISSING
 from optid.errors import DataError
 
 LARGEST = 1e100
-"""Larger numbers are no readings."""
+"""Larger numbers are no readings: what is computed from them a sample later must not overflow either."""
 
 
 class Rows(NamedTuple):
@@ -211,7 +211,8 @@ class RowReader:
         """Check the time stamps; cut before the first that is wrong, or fill the gaps."""
         error, stop = "", 0
         if self._clock is not None and len(lines):
-            values, lines, stamps, error, stop = self._checked(values, lines, stamps)
+            values, lines, stamps, error, stop, unread = self._checked(values, lines, stamps)
+            bad = sorted([*bad, *unread])
         if error:
             bad = [(line, text) for line, text in bad if line < stop]
             self.line = stop - 1
@@ -261,7 +262,7 @@ class RowReader:
     def _one_by_one(self, values: Array, lines: np.ndarray, stamps: list[str]) -> "_Checked":
         """Take rows whose time stamp cannot be read as rows without one."""
         kind = None if self._last is None else self._last.dtype
-        kept = list(stamps)
+        kept, unread = list(stamps), []
         for row, stamp in enumerate(stamps):
             try:
                 found = as_stamps([stamp], self._label) if stamp else None
@@ -271,11 +272,13 @@ class RowReader:
                 continue
             if not np.isfinite(found).all() or (kind is not None and found.dtype != kind):
                 kept[row] = ""  # the row is there, its time is not known
+                unread.append((int(lines[row]), f"{self._label}, line {lines[row]}: {stamp!r} is no time stamp like "
+                               "those before; the row counts as one without a stamp."))
             else:
                 kind = found.dtype
-        if kept == list(stamps):
+        if not unread:
             raise DataError(f"{self._label}: the time stamps of lines {lines[0]} to {lines[-1]} do not fit together.")
-        return self._checked(values, lines, kept)
+        return self._checked(values, lines, kept)._replace(unread=tuple(unread))
 
 
 class _Checked(NamedTuple):
@@ -286,6 +289,7 @@ class _Checked(NamedTuple):
     stamps: list[str]
     error: str = ""
     stop: int = 0
+    unread: tuple[tuple[int, str], ...] = ()
 
 
 def _is_number(text: str) -> bool:

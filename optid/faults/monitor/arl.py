@@ -19,7 +19,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
-from optid.faults.monitor.columns import Columns, Window, matrices
+from optid.faults.monitor.columns import Columns, Window, search_matrices
 from optid.faults.whitening import Predictor
 
 ALARMS = 60
@@ -158,7 +158,7 @@ def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: 
         r: (T, l) whitened innovations.
     """
     kept = Window(columns, window, len(steady.A), np.eye(len(steady.C)), steady)
-    _, statistic, _ = kept.advance(matrices(steady), columns.signals(f[:-1], f[1:]),
+    _, statistic, _ = kept.advance(search_matrices(steady), columns.signals(f[:-1], f[1:]),
                                    np.ascontiguousarray(r), np.full(len(columns.size), np.inf))
     count = len(statistic) // window
     return statistic[: count * window].reshape(count, window, -1).max(axis=1)
@@ -174,11 +174,12 @@ def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
     """
     goal = -np.expm1(-length / arl0)
     level = goal / largest.shape[1]  # as if the candidates had nothing in common
+    few = goal * len(largest) < 0.9 * FEWEST  # too few to count: this level is on the safe side
     for _ in range(30):
         q = np.array([tail(column, level) for column in largest.T])
         alarms, quiet = onsets(np.any(largest > q, axis=1))
         share = alarms / max(quiet, 1)
-        if alarms < FEWEST or abs(share / goal - 1) < 0.005:
+        if few or not alarms or abs(share / goal - 1) < 0.005:
             break
         level *= goal / share
     return q, alarms

@@ -19,7 +19,7 @@ SPARE = 8
 """Carried directions for which the search has room, beside twice the widest candidate."""
 
 
-def matrices(steady: Predictor) -> Matrices:
+def search_matrices(steady: Predictor) -> Matrices:
     """Return what the search needs of a steady predictor."""
     return (np.ascontiguousarray(steady.A), np.ascontiguousarray(steady.C), np.ascontiguousarray(steady.K),
             np.ascontiguousarray(steady.root))
@@ -57,6 +57,11 @@ class Columns:
     def count(self) -> int:
         """Number D of columns."""
         return len(self.course)
+
+    @property
+    def pairs(self) -> np.ndarray:
+        """(C,) products of the columns of a candidate with one another; the kernel keeps them in this order."""
+        return self.size * (self.size + 1) // 2
 
     def of(self, number: int) -> slice:
         """Columns of a candidate."""
@@ -145,7 +150,7 @@ class Window:
     def __post_init__(self) -> None:
         D, C, W = self.columns.count, len(self.columns.size), self.length
         self.xi, self.b, self.grown = np.zeros((D, self.room, W)), np.zeros((D, W)), np.zeros(W)
-        self.gram = np.zeros((int(np.sum(self.columns.size * (self.columns.size + 1) // 2)), W))
+        self.gram = np.zeros((int(self.columns.pairs.sum()), W))
         self.whitened, self.readings = np.zeros((W, self.columns.into_output.shape[1])), np.zeros(W)
         self.statistic, self.peak, self.weight = np.zeros(C), np.zeros(C, dtype=np.int64), np.full(C, -1.0)
         self.clock, self.clean = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
@@ -181,7 +186,7 @@ class Window:
             self.deviations[:, :, place] = xi
         self.factors, self.inverses = np.zeros_like(self.products), np.zeros((parts.count, 2 * W))
         for number, d in enumerate(parts.size):
-            own, start = int(parts.first[number]), int(np.sum((parts.size * (parts.size + 1) // 2)[:number]))
+            own, start = int(parts.first[number]), int(parts.pairs[:number].sum())
             at = {(i, h): start + i * (i + 1) // 2 + h for i in range(d) for h in range(i + 1)}
             for (i, h), row in at.items():
                 left_over = self.products[row] - sum(
@@ -200,7 +205,7 @@ class Window:
         n = self.deviations.shape[1]
         self.xi[still] = 0.0
         self.xi[still, :n] = self.deviations[still][:, :, at]
-        rows = np.repeat(still[self.columns.first], self.columns.size * (self.columns.size + 1) // 2)
+        rows = np.repeat(still[self.columns.first], self.columns.pairs)
         self.gram[rows] = self.products[rows][:, at]
 
     def advance(self, matrices: Matrices, signals: tuple[Array, Array], r: Array, limit: Array,
@@ -241,7 +246,7 @@ class Window:
         if self.clean[0] >= min(int(self.clock[0]), self.length):
             self._leave_tables()
         d = own.stop - own.start
-        start = int(np.sum((self.columns.size * (self.columns.size + 1) // 2)[:number]))
+        start = int(self.columns.pairs[:number].sum())
         whole = np.zeros((d, d))
         whole[np.tril_indices(d)] = self.gram[start : start + d * (d + 1) // 2, slot]
         whole = whole + np.tril(whole, -1).T

@@ -10,7 +10,8 @@ class Event:
 
     Attributes:
         kind: "alarm", "isolated" (the set of candidates shrank to one, or did not in time), "cleared", "untestable" (a
-            whole loss of the actuator would go unnoticed, or be taken for a constant) or "testable" (again).
+            whole loss of the actuator would go unnoticed, or be taken for a constant), "testable" (again), "outside"
+            (an input left the identified range) or "inside" (again).
         sample: when, counted from the first sample that the monitor saw.
         candidates: (label, posterior), most probable first, those of the 95 % set; ("unknown", 1.0) where nothing
             explains the alarm.
@@ -35,10 +36,8 @@ class Event:
             names = [label if p >= 0.995 else f"{label} ({p:.0%})" for label, p in self.candidates[:3]]
             more = len(self.candidates) - len(names)
             text += ": " + ", ".join(names) + (f" and {more} more" if more else "")
-        if self.kind == "untestable":
-            text += f" since {self.onset}"
-        elif self.onset is not None:
-            text += f", since {self.onset}"
+        if self.onset is not None:
+            text += f"{'' if self.kind == 'untestable' else ','} since {self.onset}"
         if self.size:
             text += ", size " + " ".join(f"{value:.4g}" for value in self.size)
         return text + (f" ({self.note})" if self.note else "")

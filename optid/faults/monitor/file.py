@@ -39,7 +39,8 @@ def save(monitor: "Monitor", path: str | Path) -> Path:
         "rules": {**monitor.decisions.rules, "odd": min(monitor.decisions.rules["odd"], 1e300)},
         "source": monitor.source, "samples": monitor.samples, "remark": monitor.remark,
         "decisions": kept(monitor.decisions), "readings": monitor.checks.memory, "certain": plant.certain,
-        "directions": [vars(one) for one in plant.directions], "silent": found.predictor.silent,
+        "directions": [vars(one) | {"deviation": np.ravel(one.deviation).tolist()} for one in plant.directions],
+        "silent": found.predictor.silent,
     }
     arrays = {f"search_{name}": getattr(monitor.search, name) for name in Window.KEPT} | {"sines": found.sines}
     arrays |= {f"plant_{name}": getattr(plant, name) for name in PLANT}

@@ -9,10 +9,10 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.monitor.arl import Calibration, block_maxima
-from optid.faults.nuisance import ModelUncertainty, _sensitivities
+from optid.faults.nuisance import ModelUncertainty, sensitivities
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, Whitened, health, whiten
-from optid.models import HammersteinSS, NoiseCovariances
+from optid.models import NoiseCovariances
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def parameter_effect(known: ModelUncertainty, data: Data) -> tuple[Array, Array]
     for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
-        by_parameter, _ = _sensitivities(known.model, known.predictor, here, x0, there, known.root)
+        by_parameter, _ = sensitivities(known.model, known.predictor, here, x0, there, known.root)
         effects.append(by_parameter.reshape(*here.y.shape, -1))
         inputs.append(known.model.expanded(here.u))
     return np.concatenate(effects), np.nan_to_num(np.concatenate(inputs))
@@ -110,18 +110,12 @@ def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dict
         return np.vstack([part, np.zeros((more, part.shape[1]))])
 
     noise = NoiseCovariances(K @ covariance @ K.T, covariance, K @ covariance, covariance)
-    wider = _with_states(model, A, C, K, padded, noise, more)
+    wider = replace(model, A=A, B=padded(model.B), C=C, E=padded(model.E), L=padded(model.L), K=K, noise=noise,
+                    offset_x=np.concatenate([model.offset_x, np.zeros(more)]))
     lower = np.linalg.inv(np.linalg.cholesky(covariance))
     predictor = Predictor(A, C, wider.L, K, covariance, np.tril(lower))
     candidates = tuple(replace(c, into_state=padded(c.into_state)) for c in found.candidates)
     return replace(found, model=wider, predictor=predictor, candidates=candidates)
-
-
-def _with_states(model: HammersteinSS, A: Array, C: Array, K: Array, padded: object, noise: NoiseCovariances, more: int
-                 ) -> HammersteinSS:
-    assert callable(padded)
-    return replace(model, A=A, B=padded(model.B), C=C, E=padded(model.E), L=padded(model.L), K=K, noise=noise,
-                   offset_x=np.concatenate([model.offset_x, np.zeros(more)]))
 
 
 def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:

@@ -3,7 +3,7 @@
 import hashlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.monitor.arl import Calibration, calibrate, held_levels
-from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of, matrices
+from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of, search_matrices
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
 from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect
@@ -39,15 +39,6 @@ BLOCK = 4096
 """Samples searched at a time."""
 
 _KNOWN: dict[str, Calibration] = {}
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """What a monitor is made of before it knows its thresholds: the candidates it looks for, and the others."""
-
-    dictionary: Dictionary
-    labels: tuple[str, ...]
-    skipped: dict[str, str]
 
 
 class Monitor:
@@ -131,11 +122,9 @@ class Monitor:
             if self.remark:
                 warnings.warn(self.remark, DataWarning, stacklevel=2)
         self._set(found, int(window), seed, {**RULES, **rules} | ({} if found.unknown else {"odd": np.inf}))
-        gains = {c.label for c in found.candidates if c.kind == "loss"}  # of sensors: among the kinds by default
-        for label, why in self.skipped.items():
-            if label in gains:
-                continue
-            warnings.warn(f"{label} is not monitored: {why}.", DataWarning, stacklevel=2)
+        for c in found.candidates:
+            if c.label in self.skipped and c.kind != "loss":  # the gains of sensors are among the kinds by default
+                warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
         if thresholds is not None:
             self.calibration = self._given(thresholds, arl0)
         else:
@@ -178,7 +167,7 @@ class Monitor:
         self.samples = 0
         self._functions, self._input_of = tabulated(model.nonlinearities), np.array(model.input_of, dtype=np.int64)
         self._output_of = np.array(model.output_of, dtype=np.int64)
-        self._steady = matrices(steady)
+        self._steady = search_matrices(steady)
 
     def _simulated(
         self, f: Array, arl0: float, samples: int | None, extrapolate: bool, effect: Array | None
@@ -320,7 +309,7 @@ class Monitor:
             plant.x, plant.before = x[1].copy(), used.copy()
             parts, white, shown = self._steady, r, None
         else:
-            innovation, parts, _ = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
+            innovation, parts = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
             white, shown = innovation[None], int(np.count_nonzero(~np.isnan(y)))
         _, statistic, weight = self.search.advance(parts, moving, white, np.full(len(self.labels), np.inf), shown)
         self.samples += 1

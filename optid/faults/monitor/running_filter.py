@@ -35,8 +35,9 @@ class Direction:
         column: of the candidates.
         growth: what its course grows by per sample.
         grown: its course at the next sample.
-        power: energy that one unit leaves in one innovation, on average.
+        power: energy that one unit, left out, leaves in one innovation, on average.
         age: samples since it is carried.
+        deviation: (n,) what one unit, left out, has done to the state of the steady predictor.
     """
 
     owner: int
@@ -45,6 +46,7 @@ class Direction:
     grown: float
     power: float = 0.0
     age: int = 0
+    deviation: Any = 0.0
 
 
 @dataclass(eq=False)
@@ -123,8 +125,8 @@ class RunningFilter:
                 np.ascontiguousarray(steady.root), drive, y, direct, x, r)
         return x, r
 
-    def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices, Array]:
-        """Take in one sample; return whitened innovation (l,), matrices of the search, and the prediction (l,).
+    def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
+        """Take in one sample; return the whitened innovation (l,) and the matrices of the search.
 
         Args:
             f: (r,) functions of the inputs.
@@ -178,7 +180,9 @@ class RunningFilter:
         self.P = forget @ self.P @ forget.T + left @ steady.covariance @ left.T + (blind * spread) @ blind.T
         self.P = (self.P + self.P.T) / 2
         for p, one in enumerate(self.directions):
-            response = root @ C[:, n + p]
+            raw = H[:, p] + (model.C @ one.deviation if one.age else 0.0)
+            response = steady.root @ raw
+            one.deviation = J[:, p] - steady.K @ raw + (steady.A @ one.deviation if one.age else 0.0)
             one.age += 1
             one.power += (float(response @ response) - one.power) / min(one.age, 100)
         self.x, self.before = x, f
@@ -187,7 +191,7 @@ class RunningFilter:
             self.P = np.zeros((n, n))
         missing = gain.copy()
         missing[:n] -= lost
-        return r, (A, C, missing, root), predicted
+        return r, (A, C, missing, root)
 
     def carry(self, number: int, window: Window) -> float:
         """Correct the state by the estimate of a candidate and carry it; return the energy left in the state alone."""
