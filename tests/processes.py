@@ -26,6 +26,6 @@ def cell_workers(pid):
 def wait_for(condition, seconds=180.0):
     """Wait until it holds; an AssertionError where it does not in time."""
     until = time.monotonic() + seconds
-    while not condition() and time.monotonic() < until:
+    while not condition():
+        assert time.monotonic() < until
         time.sleep(0.02)
-    assert condition()

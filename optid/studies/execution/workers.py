@@ -130,7 +130,6 @@ class Pool:
         """End all workers."""
         self._end_workers()
         if self._pool is not None:
-            self._pool.stop()
             self._pool.join()
         self._notes.cleanup()
 
@@ -221,6 +220,8 @@ class Pool:
 
     def _end_workers(self) -> None:
         """Kill every worker with its children; pebble itself waits seconds for one that does not listen."""
+        if self._pool is not None:
+            self._pool.stop()  # else it replaces them
         for path in self._folder.glob("*.words"):
             _kill_group(int(path.stem))
 
