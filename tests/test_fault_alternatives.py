@@ -48,6 +48,7 @@ def test_the_likelihood_of_a_sensor_gain_is_that_of_a_kalman_filter_with_another
     assert grid.logs[0, 1] == pytest.approx(logs[1] - logs[0], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.sampled(1)
 def test_the_interval_of_a_sensor_gain_covers():
     model, u, inside = small(), levels(COUNT, 0), 0

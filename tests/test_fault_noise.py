@@ -84,6 +84,7 @@ def test_noise_is_named_and_measured(found, fault, label):
         assert max(map(len, text.splitlines())) <= 80
 
 
+@pytest.mark.slow
 def test_healthy_windows_alarm_as_often_as_asked(found):
     search = noise_search(found, white(found, 0))
     levels_ = search.healthy(4000, 1)

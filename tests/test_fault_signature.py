@@ -71,6 +71,7 @@ def test_atoms_explain_what_the_scan_says(found, limits, missing):
         np.testing.assert_allclose(signatures(s, atom.label, atom.onsets), dense, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_atoms_of_losses_and_of_an_uncertain_model(found):
     u, u2 = levels(400, 9), levels(N, 4)
     model = found.model

@@ -60,6 +60,7 @@ def test_energies_are_those_of_dense_least_squares(found, missing):
     assert set(test.untested) == {"state", "sensor:y1 noise", "sensor:y2 noise", "process:load noise"}
 
 
+@pytest.mark.slow
 def test_the_true_place_has_uniform_p_values_whatever_the_course(found):
     rng, p_values = np.random.default_rng(0), {"actuator:u1": [], "sensor:y2": []}
     for run in range(120):

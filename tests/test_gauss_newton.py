@@ -91,6 +91,7 @@ def test_constraints_that_no_candidate_direction_meets():
     assert np.allclose(fit.model.b[0] / fit.model.b[0][0], [1.0, -2.0, 0.5])
 
 
+@pytest.mark.slow
 def test_three_channels_with_constraints():
     functions = tuple(nonlinearity(Triangular(4), seed, (-1, 1)) for seed in range(3))
     true = HammersteinTF([-0.8], ([1.0, 0.5], [-0.7, 0.2], [0.4, 0.4]), functions, (0, 0, 0), 0.1)

@@ -240,6 +240,7 @@ def test_the_class_of_a_simulated_plant_is_found(cubic, expected):
     assert found.reasons[0].startswith("linear: ") and any("input functions" in reason for reason in found.reasons)
 
 
+@pytest.mark.slow
 def test_processes_find_the_same(short):
     data = plant(300, cubic=0.5, noise=0.05)
     alone, together = (identify(data, classes=KINDS[:2], workers=count) for count in (1, 2))
@@ -262,6 +263,7 @@ def test_a_budget_ends_the_search(short):
     assert found.stopped == "the budget of 0.001 s" and found.chosen.candidate.kind == LINEAR
 
 
+@pytest.mark.slow
 def test_constraints_hold_for_what_is_chosen(short):
     data = plant(400, cubic=0.5, noise=0.05)
     found = identify(data, classes=[INPUTS], constraints=["monotone:increasing", "gain:20"], workers=1)

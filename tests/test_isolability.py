@@ -104,6 +104,7 @@ def test_family_thresholds_of_independent_and_of_equal_statistics(rate):
     np.testing.assert_allclose(same, chi2.isf(rate, 2), rtol=0.03)
 
 
+@pytest.mark.slow
 def test_the_standard_plant_needs_the_deflections_measured_before(standard_study):
     _, _, _, study = standard_study
     detectable = (study.detectable * study.unit)[:5]

@@ -229,6 +229,7 @@ def test_forgotten_initial_states_leave_no_subnormal_numbers():
     assert np.all(block[-1, :2] == 0) and small.min() > 1e-160
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*steps gain less than")
 def test_a_long_record_is_fitted_in_stages():
     """A saturation between two linear systems, 12,000 samples: the noise is reached."""

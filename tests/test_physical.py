@@ -69,6 +69,7 @@ def test_two_tanks_are_found_within_their_errors(tanks):
     assert np.asarray(fit.model.simulate(new.data, x0="fit")) == pytest.approx(new.truth["noise_free"], abs=0.1)
 
 
+@pytest.mark.slow
 def test_shorter_steps_come_nearer_to_the_differential_equation():
     case = example("two_tanks", n=300)
     clean = Data(case.data.u, case.truth["noise_free"][:300], 1.0)
@@ -160,6 +161,7 @@ def test_gaps_experiments_and_two_outputs():
     assert len(fit.model.simulate(Data([p.u for p in parts], y), x0="fit")) == 2
 
 
+@pytest.mark.slow
 def test_constraints_on_parameters_and_states_have_prices():
     data = bent()
     free = quiet(data, CUBIC)

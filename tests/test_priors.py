@@ -69,6 +69,7 @@ def test_the_fit_is_the_posterior_mean(word):
     assert fit.solution.status.value == "optimal"
 
 
+@pytest.mark.slow
 def test_it_is_better_than_least_squares():
     errors = {word: [np.linalg.norm(optid.fit(record(seed), "fir", nb=50, nk=1, prior=word).model.impulse_response(100)
                                     [:, 0, 0] - G) for seed in range(4)] for word in ("none", "tc", "dc", "ss")}

@@ -217,6 +217,7 @@ def test_refit_beats_the_healthy_model_and_the_wrong_part(healthy, faults):
     assert np.median(fits["right"]) > 95 > np.median(fits["healthy"]) > np.median(fits["wrong"])
 
 
+@pytest.mark.slow
 def test_all_parameters_overtake_when_the_healthy_model_is_off(healthy, faults):
     rng = np.random.default_rng(5)
     off = replace(healthy, **{name: getattr(healthy, name) * (1 + 0.03 * rng.standard_normal(getattr(

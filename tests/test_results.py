@@ -134,6 +134,7 @@ def test_a_stream_keeps_no_samples_to_predict(tmp_path):
         _ = fit.residuals
 
 
+@pytest.mark.slow
 def test_joblib_workers_return_fits():
     joblib = pytest.importorskip("joblib")
     data = _noisy()

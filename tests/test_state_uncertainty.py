@@ -58,6 +58,7 @@ def test_a_change_of_the_states_changes_nothing():
         assert again[1:] == pytest.approx(row[1:], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_coloured_errors_scatter_the_estimate():
     """Errors with a long memory: the standard error is that of repeated experiments, not that of white errors."""
     quantity = [lambda m: m.static_gain(0.0)]

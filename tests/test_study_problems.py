@@ -63,6 +63,7 @@ def written(tmp_path_factory):
     return place / "out", write_problems(place / "study.sqlite", place / "out")
 
 
+@pytest.mark.slow
 def test_every_convex_programme_is_written(written):
     out, lines = written
     kinds = {line["formulation"]: line["kind"] for line in lines}
@@ -72,6 +73,7 @@ def test_every_convex_programme_is_written(written):
     assert {path.stem for path in out.glob("*.mps")} == {line["name"] for line in lines if line["kind"] in ("LP", "QP")}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("solver", ["clarabel", "scs", "highs"])
 def test_bare_solvers_agree_with_the_verified_objectives(written, solver):
     pytest.importorskip("highspy" if solver == "highs" else solver)

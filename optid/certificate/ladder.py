@@ -21,6 +21,7 @@ from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, red
 from optid.structures.whitening import block_slices, invert_triangular
 
 TOLERANCE = 1e-8
+SAME = 1e-12  # difference of two points, as residuals relative to the target, below which they are one
 PARTS = (0.9, 0.7, 0.5, 0.25, 0.0)
 SHRINKS = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 EFFORTS = ("instant", "ascent", "sdp")
@@ -135,7 +136,26 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
     """
     if effort not in EFFORTS:
         raise StructureError(f"effort must be one of {EFFORTS}, not {effort!r}")
-    cones, linear = cones or {}, linear or Linear.none(len(problem.target))
+    if not cones and (linear is None or not len(linear.right)):
+        return _remembered(problem, point, effort, steps, max_size)
+    return _climb(problem, point, cones or {}, linear or Linear.none(len(problem.target)), effort, steps, max_size)
+
+
+def _remembered(problem: RankOne, point: Point, effort: str, steps: int, max_size: int) -> Certification:
+    """Certify without constraints; a proof stands for every later question about the same point."""
+    z = point.lift()
+    for known, found in problem.proofs:
+        if np.linalg.norm(problem.root @ (z - known)) <= SAME * np.linalg.norm(problem.target):
+            return found
+    found = _climb(problem, point, {}, Linear.none(len(z)), effort, steps, max_size)
+    if found.bound.proved:
+        problem.proofs[:] = [(z, found)]
+    return found
+
+
+def _climb(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: Linear, effort: str, steps: int,
+           max_size: int) -> Certification:
+    """Certify rung by rung, up to the last one asked for or the first that proves the point."""
     check_constraints(cones, linear, problem)
     case = prepare(problem, point, cones, linear)
     if not case.core.shapes and not len(linear.right):

@@ -27,6 +27,7 @@ FORGOTTEN = 1e-12
 STEPS = 50
 SETTLED = 1e-20
 """A step that promises less than this share of the squared error is the last one."""
+DIGITS = 1e-15  # of the outputs; a step that promises less than their square is the last one, too
 
 ROUNDING = 1e-14
 SIMULATORS = ("predict", "measured_feedback", "free")
@@ -144,6 +145,7 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
     affine = not job.model.latent and (
         not job.model.feedback or (job.known is not None and not np.isnan(job.known).any()))
     root, cost = _linearised(job, y, unit, x, whole=not affine)
+    rounding = DIGITS**2 * float(np.nansum((y / unit) ** 2))
     for _ in range(STEPS):
         step = scaled_least_squares(root[:, :n], root[:, n])
         if affine:
@@ -160,7 +162,7 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
         else:
             return x
         x, root, cost = trial, near, lower
-        if expected <= SETTLED * cost:
+        if expected <= SETTLED * cost + rounding:
             return x
     return x
 

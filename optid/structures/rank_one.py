@@ -8,6 +8,7 @@ eliminated; what remains is written in coordinates where its Gram matrix is near
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +65,11 @@ class RankOne:
     def core(self) -> "Core":
         """The reduction that keeps nothing in the core (`reduce`): start, solver and proof share it."""
         return reduce(self)
+
+    @cached_property
+    def proofs(self) -> list[tuple[Array, Any]]:
+        """The last point (n,) that was proved optimal, with its certification, so that nobody proves it again."""
+        return []
 
     def value(self, z: Array) -> float:
         """Objective at the lifted vector z (n,)."""
