@@ -119,6 +119,11 @@ def finite(values: Any, name: str) -> np.ndarray:
     return array
 
 
+def compact(array: Any) -> np.ndarray:
+    """Return an array in the one form that kernels are compiled for: float64, contiguous, not marked as read-only."""
+    return np.require(array, dtype=float, requirements="CW")
+
+
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
     """Refuse integers (N, channels) beyond 2**53, which float64 cannot hold; see `check_finite`.
 

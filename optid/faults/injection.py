@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.data.record import one_or_all
 from optid.errors import DataError, StructureError
 from optid.faults.faults import ADDITIVE, Fault, channel_of, place_of
@@ -121,7 +121,7 @@ def trajectory(
     table, which = (plan.A[:1], np.zeros(len(inputs), dtype=np.int64)) if plan.A.strides[0] == 0 else (
         plan.A, np.arange(len(inputs)))
     ended, at = march_faulty(
-        model.parts, np.ascontiguousarray(table), which, drive, direct, plan.w, plan.gain, plan.shift, plan.v,
+        model.parts, compact(table), which, drive, direct, plan.w, plan.gain, plan.shift, plan.v,
         plan.fixed, plan.hold, feedback == "true", x, states, readings,
     )
     if ended != INSIDE:

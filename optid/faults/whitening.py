@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.data.record import Data, Experiment
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models.experiments import in_units_of
@@ -79,7 +79,7 @@ class Predictor:
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
         response = np.empty(into_output.shape)
         parts = (self.A, self.C, self.K, self.L, into_state, into_output)
-        A, C, K, L, x, y = (np.ascontiguousarray(part, dtype=float) for part in parts)
+        A, C, K, L, x, y = map(compact, parts)
         kernels.respond(A, C, K, L, shown, x, y, response)
         return response
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.errors import StructureError
 from optid.models.feedback_tables import tabulated
 from optid.models.kalman import kalman_gain
@@ -152,7 +152,7 @@ def _parts(A: Array, C: Array, gain: Array, injection: Array | None = None) -> P
     injected = np.zeros((n, l)) if injection is None else injection
     none = [np.zeros(shape) for shape in ((n, 0), (l, 0), (n, 0), (n, 0), (l, 0), (0, n))]
     matrices = A, none[0], C, none[1], none[2], injected, gain, *none[3:]
-    return Parts._make([*map(np.ascontiguousarray, matrices), np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
+    return Parts._make([*map(compact, matrices), np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
 
 
 def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
@@ -164,7 +164,7 @@ def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
 
     (count, l), n = y.shape, x.size  # noqa: E741
     idle, outputs = np.zeros((count, 0)), np.empty((count, l))
-    stretch = Stretch(np.zeros((count, n)), np.zeros((count, l)), idle, np.ascontiguousarray(y), idle,
+    stretch = Stretch(np.zeros((count, n)), np.zeros((count, l)), idle, compact(y), idle,
                       np.full(l, -np.inf), np.full(l, np.inf))
     outputs[march(parts, stretch, x, outputs, states)[1] :] = np.inf
     return outputs

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.models.recursions import late_njit, lfilter
 
 PRESENT, MISSING, DEAD = 0, 1, 2
@@ -44,8 +44,8 @@ def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 
     drive (N,) is what is known besides, None for zero; NaN is a missing sample of either. The innovations of the first
     `start` samples count as zero, and these samples are not predicted.
     """
-    known = np.zeros(len(s)) if drive is None else np.ascontiguousarray(drive, dtype=float)
-    samples, c, d = np.ascontiguousarray(s, dtype=float), np.array(c, dtype=float), np.array(d, dtype=float)
+    known = np.zeros(len(s)) if drive is None else compact(drive)
+    samples, c, d = compact(s), np.array(c, dtype=float), np.array(d, dtype=float)
     if not start and np.isfinite(samples).all() and np.isfinite(known).all():  # C e = D s - drive, nothing to compile
         whole = np.concatenate([[1.0], c])
         e = lfilter(np.concatenate([[1.0], d]), whole, samples) - lfilter(np.ones(1), whole, known)

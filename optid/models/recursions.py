@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import get_lapack_funcs
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 
 SHORT = 5000
 """Samples up to which a triangular solution takes less time than the import of scipy.signal."""
@@ -52,7 +52,7 @@ def autoregression(a: Array, right: Array) -> Array:
     if right.shape[1] == 1:
         return lfilter([1.0], np.concatenate([[1.0], a.ravel()]), right)
     with np.errstate(all="ignore"):
-        return late_njit(_march)(np.ascontiguousarray(a), np.ascontiguousarray(right))
+        return late_njit(_march)(compact(a), compact(right))
 
 
 def predict_regression(a: Array, right: Array, y: Array, horizon: int, memory: int) -> Array:

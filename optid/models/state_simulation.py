@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.errors import DataError
 from optid.models.experiments import check_inputs, scaled_least_squares, signal_units
 from optid.models.state_signals import Direct, Parts, Signals, Stretch
@@ -234,7 +234,7 @@ def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
     for j, (function, o) in enumerate(zip(model.feedback, model.output_of)):
         g[:, j] = np.nan if job.known is None else function(y[:, o])
     driven = (f @ model.B.T + model.offset_x, f @ model.D.T + model.offset_y, g, y, u @ model.Dz.T + model.offset_z)
-    return Stretch._make([*(np.ascontiguousarray(signal) for signal in driven), job.low, job.high])
+    return Stretch._make([*map(compact, driven), job.low, job.high])
 
 
 def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signals:
@@ -253,7 +253,7 @@ def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signal
     if np.any(job.gain) or (missing.any() and (model.feedback or np.any(model.L))):
         own = model.returned(outputs) if missing.any() else 0.0
         returned = np.where(missing[:, None, :], own, -job.gain)
-    return Signals(returned, slopes, np.zeros((len(states), 0)))
+    return Signals(compact(returned), slopes, np.zeros((len(states), 0)))
 
 
 def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, states: Array) -> None:
@@ -265,7 +265,7 @@ def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, stat
     from optid.models.state_kernels import LEFT, REFUSED
     from optid.models.state_kernels import march as run_over
 
-    parts = job.model.parts._replace(K=job.gain)
+    parts = job.model.parts._replace(K=compact(job.gain))
     if not parts.tables.compiled and (job.model.latent or np.isnan(stretch.feedback).any()):
         ended, at = _march_by_steps(job.model, parts, stretch, x, outputs, states)
     else:

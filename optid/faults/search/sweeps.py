@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.errors import DataError, StructureError
 from optid.faults.scheduled import change
 from optid.faults.signatures import Candidate, Dictionary
@@ -126,7 +126,7 @@ class Sweep:
 
         seen = r if self.nuisance is None else self.nuisance(r)
         result = np.empty((self.window, self.blocks.group.size))
-        correlate(self.tables, np.ascontiguousarray(seen, dtype=float), result)
+        correlate(self.tables, compact(seen), result)
         return result
 
     def statistic(self, correlations: Array) -> Array:
@@ -147,7 +147,7 @@ class Sweep:
         if self.nuisance is not None:
             shown = np.moveaxis(self.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
         result, blocks = np.empty((len(windows), len(self.tested))), self.blocks
-        many(self.tables, np.ascontiguousarray(shown, dtype=float), blocks.first, blocks.sizes, self.roots,
+        many(self.tables, compact(shown), blocks.first, blocks.sizes, self.roots,
              blocks.places, self.tested, result)
         return result
 
@@ -265,7 +265,7 @@ def _along(tables: Tables, nuisance: "Nuisance", columns: int) -> Array:
     window = tables.of.size
     result, one = np.empty((window, nuisance.s.size, columns)), np.empty((window, columns))
     for i, (axis, s) in enumerate(zip(nuisance.U.T, nuisance.s)):
-        correlate(tables, np.ascontiguousarray(axis.reshape(window, -1)), one)
+        correlate(tables, compact(axis.reshape(window, -1)), one)
         result[:, i] = np.sqrt(1 - 1 / (1 + s**2)) * one
     return result
 
@@ -317,8 +317,8 @@ def _tables(
     kinds = np.array([ORDERS.get(c.kind, 0) for c in chosen for _ in range(c.dimension)])
     count = [int(np.sum(kinds == i)) for i in range(3)]
     tables = Tables(
-        of, np.ascontiguousarray(steady.A + gains @ steady.C), np.ascontiguousarray(steady.C, dtype=float), whitening,
-        np.ascontiguousarray(h), np.ascontiguousarray(e), count[0] + count[1], count[1], count[0],
+        of, compact(steady.A + gains @ steady.C), compact(steady.C), compact(whitening), compact(h), compact(e),
+        count[0] + count[1], count[1], count[0],
     )
     return Blocks(first, dimensions, places, group), tables
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.identify.subspace.imputation import clipping_range
 from optid.statistics.expansion import Expansion
 
@@ -31,7 +31,7 @@ def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c
         start += family.size
     simulated = []
     open_loop = expansion.without_feedback()
-    a, c = np.ascontiguousarray(a), np.ascontiguousarray(c)
+    a, c = compact(a), compact(c)
     for record in records:
         out, x = np.empty((len(record), l)), np.zeros(n)
         for first in range(0, len(record), CHUNK):
