@@ -94,7 +94,7 @@ def test_damaged_streams(tmp_path, monkeypatch, kind):
 
 
 @pytest.mark.parametrize("kind", ["mat", "mat-packed", "mat-7.3"])
-@pytest.mark.parametrize("count", [6, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [3, pytest.param(200, marks=pytest.mark.slow)])
 def test_damaged_mat_files(tmp_path, kind, count):
     path = good_file(kind, tmp_path)
     assert outcome(path, lambda: read_record(path)) == "read"

@@ -40,6 +40,7 @@ def noise(found, count=60, seed=0):
 # -- posterior ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(st.floats(0.0, 60.0), st.floats(0.05, 20.0))
 def test_the_marginal_likelihood_is_the_integral_over_the_magnitude(energy, gram):
     """l = b^2 / G; the integrand is exp(b nu - G nu^2 / 2) N(nu; 0, g / G)."""

@@ -88,6 +88,7 @@ def test_atoms_of_losses_and_of_an_uncertain_model(found):
 # -- the programme -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("seed", range(6))
 def test_something_is_active_exactly_when_the_search_alarms(found, limits, seed):
     size = 0.1 * seed
@@ -98,6 +99,7 @@ def test_something_is_active_exactly_when_the_search_alarms(found, limits, seed)
     assert result.largest == pytest.approx(np.sqrt(np.nanmax(s.statistic / q)), rel=1e-9)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("missing", [0.0, 0.2])
 def test_own_solver_and_conic_solvers_agree(found, limits, missing):
     s = two(found, missing=missing)

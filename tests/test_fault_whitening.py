@@ -193,6 +193,7 @@ def whiten_with(model, data, identified, uncertainty=None):
     return whiten(model, data, scale=steady, uncertainty=uncertainty)
 
 
+@pytest.mark.slow
 def test_a_fitted_record_is_scaled_by_its_degrees_of_freedom():
     """Innovations of the record a model was fitted to are too small; those of other records are of unit size."""
     model, ratios = small(), []

@@ -116,6 +116,7 @@ def test_the_optimum_against_a_simulation_written_out(seed):
     assert [row[2] for row in fit.uncertainty.table()] == pytest.approx(np.sqrt(np.diag(covariance))[:4], rel=0.25)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("scale", [1e-6, 1e5])
 def test_units_change_nothing(scale):
     data = bent()

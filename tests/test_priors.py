@@ -92,6 +92,7 @@ def test_constraints_hold_and_have_a_price():
     assert [price.name for price in fit.prices] == ["late"] and fit.prices[0].active > 0
 
 
+@pytest.mark.slow
 def test_several_channels_functions_and_missing_samples():
     rng = np.random.default_rng(4)
     u = rng.normal(size=(400, 2))

@@ -532,6 +532,7 @@ def test_the_compiled_controller_solves_the_programme(m):
         assert np.all((move.u >= -1.2) & (move.u <= 1.2))
 
 
+@pytest.mark.slow
 def test_the_nlp_agrees_with_the_programme_in_v(healthy):
     smooth = replace(healthy, nonlinearities=tuple(
         Nonlinearity(Polynomial(3, (-1.2, 1.2)), mu) for mu in (np.array([1.4, 0.0, 0.2]), np.array([1.0, 0.0, -0.1]))))

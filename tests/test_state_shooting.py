@@ -58,11 +58,13 @@ def same(data, case, solver="ipopt", **changes):
     return ours, theirs
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", CASES)
 def test_ipopt_finds_the_optimum_of_the_descents(case):
     same(record(case), case)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES)
 def test_subspace_starts_without_a_descent(case):
     data = record(case, noise=0.5, seed=1)
@@ -75,6 +77,7 @@ def test_subspace_starts_without_a_descent(case):
     assert ours.program.objective.value > (1 + 1e-9) * ours.solution.objective
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("weighting", ["auto", "determinant"])
 def test_gaps_and_several_experiments(weighting):
     data = record("two by two", (200, 150), noise=0.2, gaps=0.1)

@@ -329,6 +329,7 @@ def test_a_start_of_the_user_is_taken():
     assert "start 1" in fit.figures["starts"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 6, 11])
 def test_outputs_of_different_noise_do_not_lead_to_the_border(seed):
     """Weights from the outputs instead of the errors ended at a zero of the noise on the unit circle, far off."""

@@ -236,10 +236,7 @@ class Program:
             else:  # a point just outside the variable's own bounds is to be judged, not refused
                 variable.save_value(array)
         for name, expression in self.derived.items():
-            found = np.asarray(expression.value)
-            if found.dtype == object:
-                raise ValueError(f"{name!r} has no value at this point")
-            self.variables[name].save_value(found)
+            self.variables[name].value = np.asarray(expression.value)
 
     def values(self) -> dict[str, np.ndarray]:
         """Return a copy of what the CVXPY variables hold, without variables that hold nothing."""

@@ -104,7 +104,7 @@ def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
 def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
     """Run a back end from the programme's start; whatever happens to it is an answer."""
     program.clear_duals()
-    if settings.warm and program.start and back_end.classes:  # others take the start itself
+    if settings.warm and program.start:
         program.assign(program.start)
     try:
         return run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
