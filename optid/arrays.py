@@ -121,7 +121,7 @@ def finite(values: Any, name: str) -> np.ndarray:
 
 def compact(array: Any) -> np.ndarray:
     """Return an array in the one form that kernels are compiled for: float64, contiguous, not marked as read-only."""
-    return np.require(array, dtype=float, requirements="CW")
+    return np.require(array, dtype=float, requirements=["C", "W"])
 
 
 def check_integers(array: np.ndarray, labels: Sequence[str], first: int = 0, *, limits: bool = True) -> None:
