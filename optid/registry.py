@@ -62,11 +62,15 @@ def render(result: Any, form: str = "text", *arguments: Any, **options: Any) -> 
         options: of the renderer.
 
     Raises:
-        LookupFailed: no such renderer; the message has the nearest name.
+        LookupFailed: the result has no such form; the message lists those that it has.
     """
-    name = f"{type(result).__name__}.{form}"
-    if form == "html" and name not in registered(RENDERERS):
+    kind, known = type(result).__name__, registered(RENDERERS)
+    name = f"{kind}.{form}"
+    if form == "html" and name not in known:
         return f"<pre>{escape(render(result))}</pre>"
+    if name not in known:
+        has = ", ".join(sorted(each.partition(".")[2] for each in known if each.startswith(f"{kind}.")))
+        raise LookupFailed(f"{kind} has no form {form!r}; it has {has or 'none'}.")
     return entry_point(RENDERERS, name).load()(result, *arguments, **options)
 
 

@@ -67,7 +67,7 @@ def test_words_that_are_wrong(text, error, words):
 
 
 def test_a_result_without_a_renderer_is_refused_by_name():
-    with pytest.raises(LookupFailed, match="no renderer is called 'Data.text'"):
+    with pytest.raises(LookupFailed, match="Data has no form 'text'; it has figure"):
         render(record())
 
 
