@@ -15,7 +15,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.arrays import one_of
+from optid.arrays import check_weight, one_of
 from optid.bases.basis import Basis
 from optid.certificate.lifting import certify_nuclear, certify_rank_one
 from optid.data.record import Data
@@ -150,8 +150,7 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
         RankError: the record does not determine the parameters.
     """
     one_of("gauge", gauge, FIXED)
-    if not weight >= 0:
-        raise StructureError(f"the weight of the nuclear norm must not be negative; got {weight!r}")
+    check_weight(weight, "weight (of the nuclear norm)")
     return pose_with_loss(loss, data, partial(_relaxed, builders=constraints, gauge=gauge, weight=float(weight)),
                           convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
 

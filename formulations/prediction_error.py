@@ -30,12 +30,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.arrays import check_integer
+from optid.arrays import check_integer, one_of
 from optid.bases import Bases
 from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.identify.arguments import enough_rows
-from optid.identify.gauges import scale_fixed
+from optid.identify.gauges import FIXED, scale_fixed
 from optid.identify.prediction_error.noise_starts import starts_of
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.search import entry, search
@@ -82,6 +82,7 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
         RankError: too few samples for the unknowns, a basis function that no sample excites, or inputs that the record
             does not tell apart.
     """
+    one_of("gauge", gauge, FIXED)
     return _procedure("hammerstein_bj.exact", data, na, nb, nk, basis, nc, check_integer(nd, "nd", 0),
                       constraints, gauge, offset, starts, seed)
 
@@ -105,6 +106,7 @@ def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomia
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are the
     errors raised.
     """
+    one_of("gauge", gauge, FIXED)
     return _procedure("hammerstein_oe.exact", data, na, nb, nk, basis, 0, 0, constraints, gauge, offset, starts, seed)
 
 
@@ -126,6 +128,7 @@ def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases 
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``mu``, ``offset``. Arguments as in `hammerstein_bj`, as are the
     errors raised, except for that of a record without stretches.
     """
+    one_of("gauge", gauge, FIXED)
     return _procedure("hammerstein_armax.exact", data, na, nb, nk, basis, nc, None, constraints, gauge, offset, starts,
                       seed)
 

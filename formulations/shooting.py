@@ -27,10 +27,11 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.prediction_error import Orders, transfer_model
+from optid.arrays import one_of
 from optid.bases import Bases
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.gauges import scale_fixed
+from optid.identify.gauges import FIXED, scale_fixed
 from optid.identify.prediction_error.plant_starts import arx_start, iterated
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
@@ -60,6 +61,7 @@ def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk:
     Arguments as in `formulations.prediction_error.hammerstein_bj`, as are the errors raised; constraints may be any
     smooth ones in the named variables. A record that is too long is refused (`StructureError`).
     """
+    one_of("gauge", gauge, FIXED)
     criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset)
     if criterion.data.n_samples > LIMIT:
         raise StructureError(

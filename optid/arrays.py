@@ -83,11 +83,12 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
 
 def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
                   error: type[OptidError] = StructureError) -> int:
-    """Return an integer argument as an int; raise `error` for anything else and outside low to high (None: any)."""
-    top = value if high is None else high
+    """Return an integer argument as an int; raise `error` for anything else and outside low to high (None: 2^31)."""
+    top = 2**31 if high is None else high
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not low <= value <= top:
         kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
-        kind = kind if high is None else f"an integer from {low} to {high}"
+        if high is not None or (isinstance(value, int) and value > top):
+            kind = f"an integer from {low} to {top}"
         raise error(f"{name} must be {kind}; got {value!r}.")
     return int(value)
 
@@ -96,6 +97,12 @@ def check_probability(value: Any, name: str) -> None:
     """Refuse an argument that is no probability strictly between 0 and 1 (`StructureError`)."""
     if not 0 < value < 1:
         raise StructureError(f"{name}={value!r}; a probability between 0 and 1 is needed.")
+
+
+def check_weight(value: Any, name: str) -> None:
+    """Refuse the weight of a penalty that is not a nonnegative number (`StructureError`)."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 <= value <= LARGEST:
+        raise StructureError(f"{name}={value!r}: a nonnegative number is needed.")
 
 
 def one_of(name: str, value: Any, known: Sequence[str]) -> None:

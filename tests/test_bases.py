@@ -297,7 +297,7 @@ def test_parse(text, basis):
         ("triangle:4", LookupFailed, "triangular"),
         ("triangular", StructureError, "triangular:10"),
         ("triangular:x", StructureError, "cannot be read"),
-        ("triangular:0", StructureError, "positive integer"),
+        ("triangular:0", StructureError, "an integer from 1 to 5000"),
         ("triangular:4:colour=red", StructureError, "colour"),
         ("triangular:4:outside=mirror", StructureError, "clamp"),
         ("triangular:4:degree=2", StructureError, "degree"),

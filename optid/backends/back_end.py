@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.errors import StructureError
 from optid.program.solution import Status
 from optid.program.structure import Structure
 
@@ -33,6 +34,12 @@ class Settings:
     warm: bool = True
     verbose: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, value, top in (("accuracy", self.accuracy, 1.0), ("time_limit", self.time_limit, np.inf)):
+            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if not (number and 0 < value < top) and not (name == "time_limit" and value in (None, np.inf)):
+                raise StructureError(f"{name}={value!r}: a number above 0{' and below 1' * (top == 1)} is needed")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ from optid.errors import DataError, StructureError
 Outside = Literal["clamp", "linear", "extrapolate", "error"]
 OUTSIDE = ("clamp", "linear", "extrapolate", "error")
 
+MOST = 5000  # functions of a basis; it has matrices of their number squared
+
 
 class Basis:
     """A family of P functions eta(u) without the constant, on an interval of the input.
@@ -40,7 +42,7 @@ class Basis:
 
     def __post_init__(self) -> None:
         for name, (smallest, meaning) in self._sizes.items():
-            check_integer(getattr(self, name), f"The number of {meaning}", smallest)
+            check_integer(getattr(self, name), f"The number of {meaning}", smallest, MOST)
         one_of("outside", self.outside, OUTSIDE)
         if self.interval is None:
             return

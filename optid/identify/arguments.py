@@ -15,7 +15,7 @@ ROWS_PER_UNKNOWN = 1.1
 
 def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
     """Expand a scalar to one integer per input and check it."""
-    values = [value] * len(inputs) if isinstance(value, int | np.integer) else list(value)
+    values = list(value) if isinstance(value, list | tuple | np.ndarray) else [value] * len(inputs)
     if len(values) != len(inputs):
         raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
     return tuple(check_integer(entry, f"{name} of input {channel!r}", low) for channel, entry in zip(inputs, values))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.arrays import LARGEST
 from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
@@ -120,6 +121,9 @@ def _present(role: str, name: str, records: Sequence[np.ndarray]) -> np.ndarray:
         remedy = ("nothing can be identified from it; excite the input or drop the channel" if role == "input" else
                   "there is nothing to explain; check the column")
         raise DataError(f"{role} {name!r} is constant ({x[0]:g}): {remedy}")
+    if np.ptp(x) < 1 / LARGEST:
+        raise DataError(f"{role} {name!r} varies by {np.ptp(x):.1e}, whose square is zero in floating point: give it "
+                        "in another unit")
     return x
 
 

@@ -151,6 +151,9 @@ class Program:
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
             for name, group in named(built, default).items():
+                group = tuple(limit for limit in group if limit.member.size)  # a straight line has no curvature
+                if not group:
+                    continue
                 if name in constraints:
                     raise StructureError(f"there are two constraints named {name!r}; give each a name of its own")
                 for member in (limit.member for limit in group):

@@ -12,13 +12,12 @@ import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from optid.arrays import check_integer, one_of
+from optid.arrays import check_integer, check_weight, one_of
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.streams import Stream
-from optid.errors import StructureError
 from optid.identify.arguments import per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
@@ -192,8 +191,8 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     one_of("prior", prior, ("none", "tc", "dc", "ss"))
     layout = Layout(na=order, nb=nbs, nk=nks, bases=inner_bases(bases, units), outputs=tuple(outputs),
                     inputs=tuple(inputs))
-    if ridge < 0 or curvature < 0:
-        raise StructureError(f"penalty weights must not be negative: ridge={ridge}, curvature={curvature}")
+    check_weight(ridge, "ridge")
+    check_weight(curvature, "curvature")
     statistics = collect(data, layout, weights=weights)
     unit = units.y_scale[0] ** degree
     share = energy_unit(units) / unit

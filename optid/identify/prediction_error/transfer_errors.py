@@ -6,13 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from optid.arrays import Array, check_integer, one_of
+from optid.arrays import Array, check_integer
 from optid.bases import Linear, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.identify.arguments import enough_rows, one_output, outputs_present, per_channel
-from optid.identify.gauges import FIXED
 from optid.identify.prediction_error.descent import Criterion
 from optid.models import noise_filter, roots
 from optid.models.gauges import gauge_factor
@@ -124,8 +123,6 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     Arguments and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A and ``gauge``
     for a linear model. Without ``offset`` nothing is centred.
     """
-    if gauge is not None:
-        one_of("gauge", gauge, FIXED)
     data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
     layout = Layout(check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),
                     per_channel("nk", nk, data.inputs, low=0), (Linear(),) * data.m, data.outputs, data.inputs)
