@@ -6,6 +6,7 @@ from dataclasses import fields
 from functools import cache
 from html import escape
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,6 +16,7 @@ FORMULATIONS = "optid.formulations"
 CONSTRAINTS = "optid.constraints"
 FAULTS = "optid.fault_formulations"
 RENDERERS = "optid.renderers"
+OURS = "formulations"  # the package beside optid
 _NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults",
           RENDERERS: "renderer"}
 
@@ -29,7 +31,7 @@ def formulation(name: str | Callable[..., Any]) -> tuple[str, Callable[..., Any]
     """Return (name, callable) of a formulation given by name or as a callable; errors as of `entry_point`."""
     if callable(name):
         return getattr(name, "__name__", "formulation"), name
-    return name, entry_point(FORMULATIONS, name).load()
+    return name, _loaded(FORMULATIONS, name)
 
 
 def entry_point(group: str, name: str) -> EntryPoint:
@@ -44,9 +46,24 @@ def entry_point(group: str, name: str) -> EntryPoint:
     return known[name]
 
 
+def _loaded(group: str, name: str) -> Any:
+    """Load an entry point; one of ours that another package of the same name hides is refused with its place."""
+    point = entry_point(group, name)
+    try:
+        return point.load()
+    except (ImportError, AttributeError) as error:
+        package = point.module.partition(".")[0]
+        found = find_spec(package)
+        places = [] if found is None else [Path(place) for place in found.submodule_search_locations or [found.origin]]
+        if package != OURS or Path(__file__).parents[1] / OURS in places:
+            raise
+        raise LookupFailed(f"{name!r} is in the package {OURS!r} of optid, which another one hides: {places[0]}. "
+                           "Rename that, or remove its folder from the path of Python.") from error
+
+
 def fault_formulation(name: str) -> Callable[..., Any]:
     """Return a programme about a fault by its name; errors as of `entry_point`."""
-    return entry_point(FAULTS, name).load()
+    return _loaded(FAULTS, name)
 
 
 def render(result: Any, form: str = "text", *arguments: Any, **options: Any) -> Any:
@@ -113,7 +130,7 @@ def named_constraint(text: str) -> Any:
         StructureError: arguments it does not take.
     """
     word, *arguments = text.split(":")
-    build = entry_point(CONSTRAINTS, word).load()
+    build = _loaded(CONSTRAINTS, word)
     positional: list[Any] = []
     keywords: dict[str, Any] = {}
     for argument in ":".join(arguments).split(",") if arguments else []:

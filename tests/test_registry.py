@@ -1,5 +1,9 @@
 """Formulations and constraints by name."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 from problems import BASIS, record
 
@@ -95,3 +99,13 @@ def test_a_callable_is_its_own_formulation():
 def test_a_word_in_place_of_a_number_is_named(text, argument):
     with pytest.raises(StructureError, match=f"{argument} must be a number, not"):
         named_constraint(text)
+
+
+def test_another_package_of_our_name_is_told(tmp_path):
+    (tmp_path / "formulations").mkdir()
+    (tmp_path / "formulations" / "__init__.py").write_text("")
+    program = "import optid, numpy as np; optid.fit(optid.Data(np.arange(9.0), np.arange(9.0)), 'arx', na=1, nb=1)"
+    done = subprocess.run([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": str(tmp_path)},
+                          capture_output=True, text=True, cwd=tmp_path)
+    assert "'arx' is in the package 'formulations' of optid, which another one hides" in done.stderr, done.stderr
+    assert str(tmp_path) in done.stderr
