@@ -54,8 +54,8 @@ def _loaded(group: str, name: str) -> Any:
     except (ImportError, AttributeError) as error:
         package = point.module.partition(".")[0]
         found = find_spec(package)
-        places = [] if found is None else [Path(place) for place in found.submodule_search_locations or [found.origin]]
-        if package != OURS or Path(__file__).parents[1] / OURS in places:
+        places = list(found.submodule_search_locations or [str(found.origin)]) if found else []
+        if package != OURS or not places or str(Path(__file__).parents[1] / OURS) in places:
             raise
         raise LookupFailed(f"{name!r} is in the package {OURS!r} of optid, which another one hides: {places[0]}. "
                            "Rename that, or remove its folder from the path of Python.") from error

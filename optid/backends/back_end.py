@@ -17,6 +17,10 @@ if TYPE_CHECKING:  # programmes import CVXPY, which the list of solvers does not
     from optid.program.program import Program
 
 
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
+
+
 @dataclass(frozen=True)
 class Settings:
     """What is asked of a solver, in words that do not depend on the solver.
@@ -36,10 +40,10 @@ class Settings:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for name, value, top in (("accuracy", self.accuracy, 1.0), ("time_limit", self.time_limit, np.inf)):
-            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-            if not (number and 0 < value < top) and not (name == "time_limit" and value in (None, np.inf)):
-                raise StructureError(f"{name}={value!r}: a number above 0{' and below 1' * (top == 1)} is needed")
+        if not _is_number(self.accuracy) or not 0 < self.accuracy < 1:
+            raise StructureError(f"accuracy={self.accuracy!r}: a number between 0 and 1 is needed")
+        if self.time_limit is not None and (not _is_number(self.time_limit) or not self.time_limit > 0):
+            raise StructureError(f"time_limit={self.time_limit!r}: a positive number of seconds is needed")
 
 
 @dataclass(frozen=True)
