@@ -63,6 +63,7 @@ def test_the_diagnosis_is_that_of_the_readme(model, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*outside the interval")
 def test_the_lines_of_python_in_the_readme_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     data = example("thruster").data
