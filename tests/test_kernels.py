@@ -1,6 +1,8 @@
 """Compiled functions are explicit scalar loops: a single assignment of an array to a slice costs seconds to compile."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -65,3 +67,23 @@ def test_compiled_functions_are_scalar_loops(path):
     found = [f"{function.name}, line {node.lineno}: {what}" for function in jitted(ast.parse(path.read_text()))
              for node, what in slow_to_compile(function)]
     assert not found, "\n".join(found)
+
+
+def test_kernels_are_compiled_for_one_form_of_arrays():
+    """Arrays that are read-only, or not contiguous, would be compiled for once more, which costs seconds each."""
+    program = """
+import warnings, numpy as np, optid
+from optid.models import state_kernels as kernels
+warnings.simplefilter("ignore")
+rng = np.random.default_rng(0)
+u, y = rng.uniform(-1, 1, (200, 1)), np.zeros((200, 1))
+for k in range(1, 200):
+    y[k] = 0.5 * y[k - 1] + np.tanh(u[k - 1]) - 0.1 * y[k - 1] ** 2 + 0.01 * rng.standard_normal()
+for criterion in ("simulation", "prediction"):
+    fit = optid.fit(optid.Data(u, y), "hammerstein_ss.exact", nx=1, basis="polynomial:3", criterion=criterion,
+                    feedback_basis="polynomial:2")
+    fit.verdict, fit.model.noise, fit.predict(optid.Data(u, y), horizon=3), fit.simulate(u)
+print(*(len(kernel.signatures) for kernel in (kernels.march, kernels.sensitivities)))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.split() == ["1", "1"], done.stdout + done.stderr[-2000:]
