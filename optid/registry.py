@@ -17,8 +17,7 @@ CONSTRAINTS = "optid.constraints"
 FAULTS = "optid.fault_formulations"
 RENDERERS = "optid.renderers"
 OURS = "formulations"  # the package beside optid
-_NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults",
-          RENDERERS: "renderer"}
+_NOUNS = {FORMULATIONS: "formulation", CONSTRAINTS: "constraint", FAULTS: "programme about faults"}
 
 
 @cache
@@ -88,7 +87,7 @@ def render(result: Any, form: str = "text", *arguments: Any, **options: Any) -> 
     if name not in known:
         has = ", ".join(sorted(each.partition(".")[2] for each in known if each.startswith(f"{kind}.")))
         raise LookupFailed(f"{kind} has no form {form!r}; it has {has or 'none'}.")
-    return entry_point(RENDERERS, name).load()(result, *arguments, **options)
+    return known[name].load()(result, *arguments, **options)
 
 
 class Rendered:

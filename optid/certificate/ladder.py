@@ -21,7 +21,7 @@ from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, red
 from optid.structures.whitening import block_slices, invert_triangular
 
 TOLERANCE = 1e-8
-SAME = 1e-12  # difference of two points, as residuals relative to the target, below which they are one
+SAME = 1e-10  # relative difference of two objectives below which a proof of one is a proof of the other
 PARTS = (0.9, 0.7, 0.5, 0.25, 0.0)
 SHRINKS = (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 EFFORTS = ("instant", "ascent", "sdp")
@@ -142,14 +142,14 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
 
 
 def _remembered(problem: RankOne, point: Point, effort: str, steps: int, max_size: int) -> Certification:
-    """Certify without constraints; a proof stands for every later question about the same point."""
-    z = point.lift()
-    for known, found in problem.proofs:
-        if np.linalg.norm(problem.root @ (z - known)) <= SAME * np.linalg.norm(problem.target):
+    """Certify without constraints; a bound holds everywhere, and so proves every point of the same objective."""
+    value = problem.value(point.lift())
+    for reached, found in problem.proofs:
+        if abs(value - reached) <= SAME * reached:
             return found
-    found = _climb(problem, point, {}, Linear.none(len(z)), effort, steps, max_size)
+    found = _climb(problem, point, {}, Linear.none(len(problem.target)), effort, steps, max_size)
     if found.bound.proved:
-        problem.proofs[:] = [(z, found)]
+        problem.proofs[:] = [(value, found)]
     return found
 
 

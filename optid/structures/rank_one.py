@@ -67,8 +67,8 @@ class RankOne:
         return reduce(self)
 
     @cached_property
-    def proofs(self) -> list[tuple[Array, Any]]:
-        """The last point (n,) that was proved optimal, with its certification, so that nobody proves it again."""
+    def proofs(self) -> list[tuple[float, Any]]:
+        """The objective that was proved to be the least one, with its certification, so that nobody proves it again."""
         return []
 
     def value(self, z: Array) -> float:
