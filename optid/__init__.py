@@ -3,7 +3,10 @@
 The public names are loaded on first use, so that ``import optid`` stays fast.
 """
 
-from optid.lazy import on_first_use
+import threading
+from typing import Any
+
+from optid.lazy import import_cvxpy, on_first_use
 
 __version__ = "0.1.0"
 
@@ -34,4 +37,13 @@ _MODULES = {name: name for name in ("signals", "bases", "errors", "examples", "p
     "plots": "show.plots", "report": "show.report", "identify": "identify", "noise": "identify.noise",
     "tracking": "identify.tracking"}
 
-__getattr__, __dir__ = on_first_use(__name__, _HOME, _MODULES)
+_POSED = {name for home in ("program.program", "solving.solve", "identify.fitting", "identify.selection")
+          for name in _HOME[home]}
+
+_load, __dir__ = on_first_use(__name__, _HOME, _MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _POSED and threading.active_count() == 1:
+        import_cvxpy()
+    return _load(name)

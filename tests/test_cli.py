@@ -437,6 +437,16 @@ def test_help_needs_nothing_heavy():
     assert result.stdout.strip() == "[]"
 
 
+def test_cvxpy_is_imported_without_the_packages_it_hardly_needs():
+    code = (
+        "import sys, optid; optid.fit; print('cvxpy' in sys.modules, 'scipy.stats' in sys.modules);"
+        "from cvxpy.atoms.quantum_rel_entr import entropy; import scipy.stats;"
+        "print(entropy([0.5, 0.5]) == scipy.stats.entropy([0.5, 0.5]))"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["True", "False", "True"]
+
+
 def test_an_error_goes_to_the_error_stream(tmp_path):
     result = program("fit", tmp_path / "nothing.csv", *ORDERS)
     assert result.returncode == 2 and result.stdout == ""

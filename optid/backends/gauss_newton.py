@@ -21,7 +21,8 @@ from optid.program.limits import EQUALITIES, INEQUALITIES, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise, starts
-from optid.structures.least_squares import RankOneStructure, fit_multipliers, rank_one_of
+from optid.structures.least_squares import RankOneStructure, rank_one_of
+from optid.structures.multipliers import fit_multipliers
 from optid.structures.rank_one import Point
 
 STEPS = 100

@@ -23,7 +23,8 @@ from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
 from optid.program.structure import variable_size
-from optid.structures.least_squares import LeastSquaresStructure, least_distance
+from optid.structures.least_squares import LeastSquaresStructure
+from optid.structures.multipliers import least_distance
 
 CLOSED = 1e-6
 """Relative gap up to which a convex programme counts as solved to its optimum."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from optid.errors import StructureError
-from optid.structures.least_squares import fit_multipliers
+from optid.structures.multipliers import fit_multipliers
 from optid.structures.rank_one import Array, Point, RankOne
 
 ACTIVE = 1e-6  # a row counts as active when its slack is below this fraction of the size of its terms

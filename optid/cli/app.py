@@ -17,9 +17,10 @@ from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Example, Files, Rep
 from optid.cli.ordering import order
 from optid.cli.reformulating import reformulate
 from optid.cli.results import command_line, conclude
-from optid.cli.startup import check_names, import_cvxpy
+from optid.cli.startup import check_names
 from optid.cli.studies import study
 from optid.cli.terminal import FILES, Command, Group, Waiting, hearing, say
+from optid.lazy import import_cvxpy
 
 app = typer.Typer(
     cls=Group,

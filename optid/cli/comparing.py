@@ -13,10 +13,11 @@ from rich.text import Text
 
 from optid.cli.derived import DEFAULT, FittingCommand
 from optid.cli.options import MODEL, RECORD, SOLVER, Example, Files, Report, Seed, reads_a_record
-from optid.cli.startup import check_names, import_cvxpy
+from optid.cli.startup import check_names
 from optid.cli.studies import NOTHING_SOLVED, Accept, Workers, follow_progress
 from optid.cli.terminal import note, output, say
 from optid.errors import LookupFailed
+from optid.lazy import import_cvxpy
 from optid.registry import formulation as look_up
 
 STUDY = "The study"

@@ -7,8 +7,9 @@ import typer
 
 from optid.cli.options import MODEL, RECORD, RESULT, SOLVER, Example, Files, Report, Seed, reads_a_record
 from optid.cli.results import command_line, conclude
-from optid.cli.startup import check_constraints, check_solver, import_cvxpy
+from optid.cli.startup import check_constraints, check_solver
 from optid.cli.terminal import FILES, Waiting, hearing
+from optid.lazy import import_cvxpy
 
 BUDGET = 60.0
 

@@ -1,15 +1,8 @@
-"""What a command does before its heavy imports: refuse words that nothing is called, and keep the imports short."""
+"""What a command does before its heavy imports: refuse words that nothing is called."""
 
-import sys
 from collections.abc import Iterable
-from importlib import import_module
-from types import ModuleType
-from typing import Any
 
 from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point
-
-POSTPONED = {"scipy.stats": "entropy", "scipy.signal": "fftconvolve", "scipy.optimize._shgo": "shgo"}
-"""What CVXPY imports, itself or through scipy.optimize, for one function each; all take as long as the rest of it."""
 
 
 def check_names(formulation: str, constraints: Iterable[str] | None, solver: str = "auto") -> None:
@@ -37,25 +30,3 @@ def check_solver(solver: str) -> None:
         from optid.backends.choice import find
 
         find(solver)
-
-
-def import_cvxpy() -> None:
-    """Import CVXPY without the large packages of which it needs one function each (`POSTPONED`)."""
-    stubs = {name: _stub(name, function) for name, function in POSTPONED.items() if name not in sys.modules}
-    sys.modules.update(stubs)
-    try:
-        import_module("cvxpy")
-    finally:
-        for name in stubs:
-            del sys.modules[name]
-
-
-def _stub(name: str, function: str) -> ModuleType:
-    """Return a module whose one function imports the true one when it is called."""
-
-    def call(*arguments: Any, **keywords: Any) -> Any:
-        return getattr(import_module(name), function)(*arguments, **keywords)
-
-    stub = ModuleType(name)
-    setattr(stub, function, call)
-    return stub

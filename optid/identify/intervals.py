@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from optid.arrays import Array, check_integer
-from optid.structures.least_squares import least_distance
+from optid.structures.multipliers import least_distance
 
 DRAWS = 8192  # random draws of an interval under inequalities: their noise is about 0.7 % of its width
 SETS = 64  # sets of active rows that are tried for all points; where there are many more, each point finds its own
