@@ -155,7 +155,7 @@ def check_arguments(name: str, function: Callable[..., Any], arguments: Mapping[
     Raises:
         StructureError: with the nearest known argument.
     """
-    parameters = inspect.signature(function).parameters
+    parameters = _parameters(function)
     if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         return
     known = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY]
@@ -169,8 +169,13 @@ def check_arguments(name: str, function: Callable[..., Any], arguments: Mapping[
 
 def defaults(function: Callable[..., Any]) -> dict[str, Any]:
     """Return the arguments of a formulation that may be left out, with their values then."""
-    parameters = inspect.signature(function).parameters.values()
-    return {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY and p.default is not p.empty}
+    keywords = (p for p in _parameters(function).values() if p.kind is p.KEYWORD_ONLY)
+    return {p.name: p.default for p in keywords if p.default is not p.empty}
+
+
+@cache
+def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(function).parameters
 
 
 def _number(text: str) -> Any:

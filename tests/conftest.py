@@ -1,6 +1,9 @@
 """Shared test set-up: deterministic property tests, the folder with real data, a Dask cluster."""
 
 import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy is loaded: threads of workers compete
+
 from collections import Counter
 from pathlib import Path
 

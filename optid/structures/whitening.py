@@ -13,7 +13,7 @@ from scipy.linalg import get_lapack_funcs
 
 from optid.arrays import Array
 
-_trtri, _trtrs = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
+_potrf, _trtri, _trtrs = get_lapack_funcs(("potrf", "trtri", "trtrs"), dtype=float)
 
 TINY = np.finfo(float).tiny
 
@@ -38,7 +38,9 @@ def _factor(matrix: Array) -> tuple[Array, Array]:
     """Lower Cholesky factor and inverse; a whisper of the identity keeps the coordinates invertible."""
     shifted = matrix.copy()
     shifted.flat[:: len(matrix) + 1] += 1e-13 * max(float(matrix.trace()) / len(matrix), TINY)
-    factor = np.linalg.cholesky(shifted)
+    factor, info = _potrf(shifted, lower=1, clean=1)
+    if info:
+        raise np.linalg.LinAlgError(f"the matrix is not positive definite at row {info - 1}")
     inverse = invert_triangular(factor)
     return factor, inverse.T @ inverse
 
