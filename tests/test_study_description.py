@@ -13,7 +13,7 @@ import optid
 from optid.errors import LookupFailed, StudyError
 from optid.examples import EXAMPLES
 from optid.studies import grid
-from optid.studies.definition import study_file
+from optid.studies.definition import entries, study_file
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.sources.records import load
 from optid.studies.sources.systems import SYSTEMS, simulate
@@ -364,6 +364,7 @@ def test_round_trip_of_the_small_study():
 
 
 _NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\r"), min_size=1, max_size=12).filter(str.strip)
+_OPTIONS = _NAMES.filter(lambda name: name not in entries.SETTINGS)  # those are refused where options stand
 _SHARES = st.floats(1e-12, 0.5)
 
 
@@ -376,7 +377,7 @@ def _lists(entries, **size):
 @given(name=_NAMES, labels=st.lists(_NAMES, min_size=2, max_size=2, unique=True), warm=st.booleans(),
        accuracy=_lists(_SHARES, min_size=1), noise=_lists(st.floats(0, 1e3)),
        seeds=_lists(st.integers(0, 2**40), min_size=1, max_size=5),
-       options=st.dictionaries(_NAMES, st.integers() | st.floats(allow_nan=False) | _NAMES | st.booleans()
+       options=st.dictionaries(_OPTIONS, st.integers() | st.floats(allow_nan=False) | _NAMES | st.booleans()
                                | st.datetimes() | st.dates() | st.times()))
 def test_round_trip_of_any_study(name, labels, accuracy, seeds, noise, warm, options):
     study = Study(

@@ -31,7 +31,7 @@ _TOP = ("name", "accuracy", "time_limit", "memory_limit", "repetitions", "warm",
 _DATA = ("name", "file", "system", "samples", "noise", *READING)
 _FORMULATION = ("name", "formulation", "constraints", "data")
 _SOLVER = ("name", "solver", "accuracy", "options")
-_SETTINGS = tuple(p.name for p in inspect.signature(solve).parameters.values() if p.kind is not p.VAR_KEYWORD)
+SETTINGS = tuple(p.name for p in inspect.signature(solve).parameters.values() if p.kind is not p.VAR_KEYWORD)
 """What solving has arguments for: among the options of a solver, these would override what its rows say."""
 
 _KINDS: tuple[tuple[type | tuple[type, ...], str, str], ...] = (
@@ -310,7 +310,7 @@ def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> Sol
         problems.add((*path, "options"), f"must be a table, {{ key = value }}; {shown(options)} is not")
         options = {}
     for key in options:
-        if key in _SETTINGS:
+        if key in SETTINGS:
             where = f"write {key} = ... beside solver" if key == "accuracy" else "it is a key of the study" \
                 if key in _TOP else "the study sets it for every solver"
             problems.add((*path, "options", key), f"options are the solver's own, and {key!r} is none: {where}")
