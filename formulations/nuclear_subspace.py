@@ -38,8 +38,8 @@ from optid.solving.solve import Evidence, Procedure
 from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem, Predictor
 
 FORMS = ("predictor", "projection", "instruments")
+# weights tried by default, each the inverse of a noise variance relative to the variance of the outputs
 WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
-"""Weights tried by default, each the inverse of a noise variance relative to the variance of the outputs."""
 
 
 def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",

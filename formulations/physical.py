@@ -33,15 +33,9 @@ from optid.solving.solve import Procedure
 
 Array = np.ndarray
 
-LIMIT = 20_000
-"""States at all steps of integration up to which the programme is posed."""
-
-REWEIGHTED = 3
-"""Times that outputs are weighted anew by their errors."""
-
-LEAST = 1e-2
-"""Parameters start from no less than this share of their usual size."""
-
+LIMIT = 20_000  # states at all steps of integration up to which the programme is posed
+REWEIGHTED = 3  # times that outputs are weighted anew by their errors
+LEAST = 1e-2  # parameters start from no less than this share of their usual size
 NO_BOUND = "the equations are not convex: no lower bound is known"
 
 

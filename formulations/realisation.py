@@ -33,8 +33,8 @@ from optid.program.units import energy_unit, outer_bases
 from optid.program.view import View
 from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
 
+# multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme
 RELAXED = 150
-"""Multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme."""
 
 
 def realisation_programme(realisation: Realisation, plan: Plan) -> Program:

@@ -43,12 +43,8 @@ from optid.program.view import View
 
 Array = np.ndarray
 
-REFLECTION = 1 - 1e-7
-"""Largest modulus of a reflection coefficient."""
-
-LIMIT = 20_000
-"""Samples up to which the programme is posed: beyond, factorisations and CVXPY's own work take minutes."""
-
+REFLECTION = 1 - 1e-7  # largest modulus of a reflection coefficient
+LIMIT = 20_000  # samples up to which the programme is posed: beyond, factorisations and CVXPY's own work take minutes
 NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known"
 
 

@@ -54,11 +54,9 @@ from optid.statistics.linearised import Linearised
 
 Array = np.ndarray
 
-LIMIT = 5_000
-"""Samples up to which the programme is posed."""
-
+LIMIT = 5_000  # samples up to which the programme is posed
+# relative difference between the objective and the squared errors of a run of the model that is rounding
 SAME_RUN = 1e-6
-"""Relative difference between the objective and the squared errors of a run of the model that is rounding."""
 
 
 def ss(data: Data, *, nx: int | str, block_rows: int | Sequence[int] | None = None, weighting: str = "auto",

@@ -25,23 +25,14 @@ from optid.program.program import Program
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.unknowns import Unknowns
 
+# singular value of the scaled sensitivities, relative to the largest, below which parameters cannot be told apart
 NO_EFFECT = 1e-7
-"""Singular value of the scaled sensitivities, relative to the largest, below which parameters cannot be told apart."""
-
-BINDING = 1e-6
-"""Slack of a constraint, relative to the largest, below which it binds."""
-
-NAMED = 0.1
-"""Share of the largest entry of a direction without effect from which on a parameter is named."""
-
+BINDING = 1e-6  # slack of a constraint, relative to the largest, below which it binds
+NAMED = 0.1  # share of the largest entry of a direction without effect from which on a parameter is named
+# errors and sensitivities, relative to the spread of the output, beyond which a run does not count as finite
 WILD = 1e50
-"""Errors and sensitivities, relative to the spread of the output, beyond which a run does not count as finite."""
-
-FLOOR = 1e-14
-"""Share of the energy of an output below which its errors are rounding."""
-
-SPREAD = 4.0
-"""Factor by which random starts differ from the given one at most."""
+FLOOR = 1e-14  # share of the energy of an output below which its errors are rounding
+SPREAD = 4.0  # factor by which random starts differ from the given one at most
 
 
 @dataclass(frozen=True)
@@ -72,19 +63,12 @@ class PhysicalUnknowns(Unknowns):
 
 @dataclass(frozen=True, eq=False)
 class PhysicalErrors(Criterion):
-    """The weighted simulation errors of equations on a record.
+    """The weighted simulation errors of equations on a record."""
 
-    Attributes:
-        data: the record in raw units; no input is missing.
-        equations: the user's.
-        weight: (l, l) diagonal weight of the errors.
-        usual: sizes of the states, then of the parameters.
-    """
-
-    data: Data
-    equations: Equations
-    weight: Array
-    usual: Array = field(repr=False)
+    data: Data  # the record in raw units; no input is missing
+    equations: Equations  # the user's
+    weight: Array  # (l, l) diagonal weight of the errors
+    usual: Array = field(repr=False)  # sizes of the states, then of the parameters
     gauge: ClassVar[str] = "none"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @classmethod

@@ -9,8 +9,8 @@ from optid.arrays import Array, as_samples, is_scalar_list
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 
+# inputs (N, m), outputs (N, l) or None, and the words that name the experiment in a message
 Record = tuple[Array, Array | None, str]
-"""Inputs (N, m), outputs (N, l) or None, and the words that name the experiment in a message."""
 
 
 def in_units_of(model: Any, data: Data) -> Data:

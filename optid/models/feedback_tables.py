@@ -22,25 +22,15 @@ FREE, CLAMPED, REFUSED, LINEAR = 0, 1, 2, 3
 
 
 class Tables(NamedTuple):
-    """s nonlinearities in the form the kernels read.
+    """s nonlinearities in the form the kernels read."""
 
-    Attributes:
-        kind: (s,) one of USER, CELLS, LEGENDRE, TRIGONOMETRIC.
-        low: (s,) lower end of the interval.
-        high: (s,) upper end of the interval.
-        outside: (s,) FREE, CLAMPED, REFUSED or LINEAR beyond the interval.
-        cells: (s,) number of cells, or of coefficients.
-        rate: (s,) angle per unit of the argument (trigonometric sums).
-        numbers: (s, cells, degree + 1) coefficients, highest power first in the position within the cell.
-    """
-
-    kind: np.ndarray
-    low: Array
-    high: Array
-    outside: np.ndarray
-    cells: np.ndarray
-    rate: Array
-    numbers: Array
+    kind: np.ndarray  # (s,) one of USER, CELLS, LEGENDRE, TRIGONOMETRIC
+    low: Array  # (s,) lower end of the interval
+    high: Array  # (s,) upper end of the interval
+    outside: np.ndarray  # (s,) FREE, CLAMPED, REFUSED or LINEAR beyond the interval
+    cells: np.ndarray  # (s,) number of cells, or of coefficients
+    rate: Array  # (s,) angle per unit of the argument (trigonometric sums)
+    numbers: Array  # (s, cells, degree + 1) coefficients, highest power first in the position within the cell
 
     @property
     def compiled(self) -> bool:

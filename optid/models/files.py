@@ -15,8 +15,8 @@ from optid.errors import ModelFileError, StructureError
 FORMAT = "optid model"
 VERSION = 1
 
+# what builds a model from the content of its file, by the kind written there; every class enters itself
 KINDS: dict[str, Callable[[dict[str, Any], dict[str, Any] | None], Any]] = {}
-"""What builds a model from the content of its file, by the kind written there; every class enters itself."""
 
 
 def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:

@@ -15,27 +15,16 @@ LONGEST_STEP, SETTLED = 400, 0.02
 
 @dataclass(frozen=True, eq=False)
 class StaticFunction:
-    """One static function of a model.
+    """One static function of a model."""
 
-    Attributes:
-        word: its name in equations and tables: "f", "f_valve", "f2_valve", "g_level".
-        nonlinearity: the function.
-        channel: index of its argument among the inputs, the outputs, or the latent signals.
-        name: name of that channel.
-        unit: its unit, "" where unknown.
-        family: the attribute of the model that holds it: "nonlinearities", "feedback" or "latent".
-        index: its place there.
-        model: the model.
-    """
-
-    word: str
-    nonlinearity: Nonlinearity
-    channel: int
-    name: str
-    unit: str
-    family: str
-    index: int
-    model: Any = field(repr=False)
+    word: str  # its name in equations and tables: "f", "f_valve", "f2_valve", "g_level"
+    nonlinearity: Nonlinearity  # the function
+    channel: int  # index of its argument among the inputs, the outputs, or the latent signals
+    name: str  # name of that channel
+    unit: str  # its unit, "" where unknown
+    family: str  # the attribute of the model that holds it: "nonlinearities", "feedback" or "latent"
+    index: int  # its place there
+    model: Any = field(repr=False)  # the model
 
     @property
     def is_linear(self) -> bool:

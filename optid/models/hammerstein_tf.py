@@ -24,11 +24,9 @@ from optid.models.model import Model, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.recursions import autoregression, predict_regression
 
+# share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured
 TINY_SUM = 1e-6
-"""Share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured."""
-
-FORGOTTEN = 1e-12
-"""A free response below this share of its start no longer informs about the initial state."""
+FORGOTTEN = 1e-12  # a free response below this share of its start no longer informs about the initial state
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -17,18 +17,11 @@ from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
 from optid.models.state_signals import Direct, Parts, Signals, Stretch
 
-STEPS = 50
-"""Steps at most."""
-
+STEPS = 50  # steps at most
+# damping at least, relative to the diagonal of the information, where a step gained little of what it promised
 FIRM = 0.01
-"""Damping at least, relative to the diagonal of the information, where a step gained little of what it promised."""
-
-ARRIVED = 2e-5
-"""Gain of the log-likelihood of no account; half a unit is one standard error of a parameter."""
-
-NUMBERS = 200_000
-"""Entries of the sensitivities formed at a time."""
-
+ARRIVED = 2e-5  # gain of the log-likelihood of no account; half a unit is one standard error of a parameter
+NUMBERS = 200_000  # entries of the sensitivities formed at a time
 NO_FUNCTIONS = tabulated(())
 
 

@@ -8,8 +8,7 @@ import numpy as np
 from optid.arrays import Array, finite
 from optid.errors import StructureError
 
-ROUNDING = -1e-4
-"""Smallest eigenvalue of a correlation matrix that may be a rounding error of an estimate."""
+ROUNDING = -1e-4  # smallest eigenvalue of a correlation matrix that may be a rounding error of an estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +77,11 @@ def _congruent(turn: Array, matrix: Array) -> Array:
 
 
 class Kalman(NamedTuple):
-    """The steady predictor x+ = A x + ... + K (y - C x - ...).
+    """The steady predictor x+ = A x + ... + K (y - C x - ...)."""
 
-    Attributes:
-        K: (n, l) gain.
-        innovation: (l, l) covariance of y - C x - ....
-        error: (n, n) covariance of the error of the predicted state.
-    """
-
-    K: Array
-    innovation: Array
-    error: Array
+    K: Array  # (n, l) gain
+    innovation: Array  # (l, l) covariance of y - C x - ....
+    error: Array  # (n, n) covariance of the error of the predicted state
 
 
 def kalman_gain(A: Array, C: Array, Q: Array, R: Array, S: Array | None = None) -> Kalman:

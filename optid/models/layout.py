@@ -17,24 +17,16 @@ class Layout(Ports):
 
     The coefficients of input c are vec(Theta_c), Theta_c (P_c, nb_c), column by column.
 
-    Attributes:
-        na: number of output lags.
-        nb: number of input lags, one per input.
-        nk: delay in samples, one per input.
-        bases: one basis per input, with its interval.
-        outputs: names of the l outputs.
-        inputs: names of the m inputs.
-
     Raises:
         StructureError: a negative order, or lists that do not have one entry per input.
     """
 
-    na: int
-    nb: tuple[int, ...]
-    nk: tuple[int, ...]
-    bases: tuple[Basis, ...]
-    outputs: tuple[str, ...]
-    inputs: tuple[str, ...]
+    na: int  # number of output lags
+    nb: tuple[int, ...]  # number of input lags, one per input
+    nk: tuple[int, ...]  # delay in samples, one per input
+    bases: tuple[Basis, ...]  # one basis per input, with its interval
+    outputs: tuple[str, ...]  # names of the l outputs
+    inputs: tuple[str, ...]  # names of the m inputs
 
     def __post_init__(self) -> None:
         if not self.inputs or not self.outputs:

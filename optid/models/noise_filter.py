@@ -18,23 +18,16 @@ from optid.models.recursions import late_njit, lfilter
 
 PRESENT, MISSING, DEAD = 0, 1, 2
 
-WARMING = 10
-"""Times the lags of a record that is begun with held samples, during which its innovations count as zero."""
+WARMING = 10  # times the lags of a record that is begun with held samples, during which its innovations count as zero
 
 
 class Filtered(NamedTuple):
-    """What one pass of the noise filter over a record finds, each (N,).
+    """What one pass of the noise filter over a record finds, each (N,)."""
 
-    Attributes:
-        innovations: zero where they cannot be computed.
-        filled: the samples, the missing ones replaced by their predictions.
-        predicted: one step ahead; NaN where that is impossible.
-        state: PRESENT where there is an innovation, MISSING where the prediction stands for the sample, DEAD elsewhere.
-    """
-
-    innovations: Array
-    filled: Array
-    predicted: Array
+    innovations: Array  # zero where they cannot be computed
+    filled: Array  # the samples, the missing ones replaced by their predictions
+    predicted: Array  # one step ahead; NaN where that is impossible
+    # PRESENT where there is an innovation, MISSING where the prediction stands for the sample, DEAD elsewhere
     state: Any
 
 

@@ -11,8 +11,7 @@ from optid.bases import Basis, Linear
 from optid.bases import from_dict as basis_from_dict
 from optid.errors import StructureError
 
-CHUNK = 65536
-"""Samples evaluated at a time, so that no table of samples x functions is formed."""
+CHUNK = 65536  # samples evaluated at a time, so that no table of samples x functions is formed
 
 
 @dataclass(frozen=True, eq=False)

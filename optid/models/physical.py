@@ -18,9 +18,7 @@ from optid.models.model import Model, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_simulation import allowed_range
 
-CHUNK = 1024
-"""Samples run at a time."""
-
+CHUNK = 1024  # samples run at a time
 NEWTON = {"abstol": 1e-13, "abstolStep": 1e-13, "max_iter": 50, "error_on_fail": False, "show_eval_warnings": False}
 
 
@@ -241,19 +239,12 @@ def _number(value: float | None, open_end: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Equations compiled for simulation; the inputs of a step are those at its beginning and its end.
+    """Equations compiled for simulation; the inputs of a step are those at its beginning and its end."""
 
-    Attributes:
-        right: (x, u, p) -> (right, y); beyond the bounds of a state it is as at the bound.
-        steps: steps of integration in a sampling time; 0 for equations in discrete time.
-        hold: what an input does between its samples.
-        dt: sampling time.
-    """
-
-    right: Any
-    steps: int
-    hold: str
-    dt: float
+    right: Any  # (x, u, p) -> (right, y); beyond the bounds of a state it is as at the bound
+    steps: int  # steps of integration in a sampling time; 0 for equations in discrete time
+    hold: str  # what an input does between its samples
+    dt: float  # sampling time
 
     @classmethod
     @cache

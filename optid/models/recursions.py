@@ -10,8 +10,7 @@ from scipy.linalg import get_lapack_funcs
 
 from optid.arrays import Array, compact
 
-SHORT = 5000
-"""Samples up to which a triangular solution takes less time than the import of scipy.signal."""
+SHORT = 5000  # samples up to which a triangular solution takes less time than the import of scipy.signal
 
 
 @cache

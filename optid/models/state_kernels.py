@@ -14,11 +14,9 @@ of `optid.models.state_signals` and `optid.models.feedback_tables`. Compiled at 
 import numpy as np
 from numba import njit
 
+# how a run ended: to the last sample, out of the range allowed, beyond the interval of a basis that refuses
 INSIDE, LEFT, REFUSED = 0, 1, 2
-"""How a run ended: to the last sample, out of the range allowed, beyond the interval of a basis that refuses."""
-
-FORGOTTEN = 1e-150
-"""Derivatives of the state below this size count as zero."""
+FORGOTTEN = 1e-150  # derivatives of the state below this size count as zero
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

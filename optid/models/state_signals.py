@@ -10,57 +10,32 @@ from optid.models.feedback_tables import Tables
 
 
 class Parts(NamedTuple):
-    """A model: x+ = A x + B f(u) + E g(y) + L y + Ez h(z) + K e, y = C x + D f(u) + Fz h(z) + e, z = Cz x + ....
+    """A model: x+ = A x + B f(u) + E g(y) + L y + Ez h(z) + K e, y = C x + D f(u) + Fz h(z) + e, z = Cz x + ...."""
 
-    Attributes:
-        A: (n, n).
-        B: (n, r).
-        C: (l, n).
-        D: (l, r).
-        E: (n, s).
-        L: (n, l).
-        K: (n, l).
-        Ez: (n, k) what the latent functions add to the next state.
-        Fz: (l, k) what they add to the output.
-        Cz: (k, n) the states in their arguments.
-        output_of: (s,) output that every feedback function acts on.
-        tables: of the s feedback functions, then of the k latent ones.
-    """
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    E: Array
-    L: Array
-    K: Array
-    Ez: Array
-    Fz: Array
-    Cz: Array
-    output_of: np.ndarray
-    tables: Tables
+    A: Array  # (n, n)
+    B: Array  # (n, r)
+    C: Array  # (l, n)
+    D: Array  # (l, r)
+    E: Array  # (n, s)
+    L: Array  # (n, l)
+    K: Array  # (n, l)
+    Ez: Array  # (n, k) what the latent functions add to the next state
+    Fz: Array  # (l, k) what they add to the output
+    Cz: Array  # (k, n) the states in their arguments
+    output_of: np.ndarray  # (s,) output that every feedback function acts on
+    tables: Tables  # of the s feedback functions, then of the k latent ones
 
 
 class Stretch(NamedTuple):
-    """What drives T samples of a run.
+    """What drives T samples of a run."""
 
-    Attributes:
-        drive: (T, n) what the inputs and the constant add to the next state.
-        direct: (T, l) what they add to the output.
-        feedback: (T, s) g of the measured outputs, NaN where the model's output is to be fed back.
-        y: (T, l) measured outputs, NaN where there is none.
-        z: (T, k) what the inputs and the constant add to the arguments of the latent functions.
-        low: (l,) lower end of the range that the outputs must not leave.
-        high: (l,) upper end.
-    """
-
-    drive: Array
-    direct: Array
-    feedback: Array
-    y: Array
-    z: Array
-    low: Array
-    high: Array
+    drive: Array  # (T, n) what the inputs and the constant add to the next state
+    direct: Array  # (T, l) what they add to the output
+    feedback: Array  # (T, s) g of the measured outputs, NaN where the model's output is to be fed back
+    y: Array  # (T, l) measured outputs, NaN where there is none
+    z: Array  # (T, k) what the inputs and the constant add to the arguments of the latent functions
+    low: Array  # (l,) lower end of the range that the outputs must not leave
+    high: Array  # (l,) upper end
 
     def part(self, samples: slice) -> "Stretch":
         """Return the stretch cut to some samples."""
@@ -68,20 +43,13 @@ class Stretch(NamedTuple):
 
 
 class Direct(NamedTuple):
-    """What every unknown changes directly, entry by entry: ``target[row, column] += gain * values[signal]``.
+    """What every unknown changes directly, entry by entry: ``target[row, column] += gain * values[signal]``."""
 
-    Attributes:
-        row: (e,) latent function, output or state that changes.
-        column: (e,) column of the unknown among the sensitivities.
-        signal: (e,) column of `Signals.values`.
-        gain: (e,).
-        ends: (4,) the entries of latent functions, those of outputs and those of the next state lie between them.
-    """
-
-    row: np.ndarray
-    column: np.ndarray
-    signal: np.ndarray
-    gain: Array
+    row: np.ndarray  # (e,) latent function, output or state that changes
+    column: np.ndarray  # (e,) column of the unknown among the sensitivities
+    signal: np.ndarray  # (e,) column of `Signals.values`
+    gain: Array  # (e,)
+    # (4,) the entries of latent functions, those of outputs and those of the next state lie between them
     ends: np.ndarray
 
     @classmethod
@@ -99,15 +67,10 @@ class Direct(NamedTuple):
 
 
 class Signals(NamedTuple):
-    """The run of T samples about which it is linearised.
+    """The run of T samples about which it is linearised."""
 
-    Attributes:
-        returned: (T, n, l) derivative of the next state with respect to the output that comes back through the
-            correction and the feedback; (0, n, l) where nothing does.
-        slopes: (T, k) derivatives of the latent functions.
-        values: (T, s) what the entries of `Direct` multiply.
-    """
-
+    # (T, n, l) derivative of the next state with respect to the output that comes back through the correction and the
+    # feedback; (0, n, l) where nothing does
     returned: Array
-    slopes: Array
-    values: Array
+    slopes: Array  # (T, k) derivatives of the latent functions
+    values: Array  # (T, s) what the entries of `Direct` multiply

@@ -15,18 +15,12 @@ from optid.models.experiments import check_inputs, scaled_least_squares, signal_
 from optid.models.state_signals import Direct, Parts, Signals, Stretch
 from optid.models.state_space import StateSpace
 
-STRETCH = 16384
-"""Samples expanded at a time."""
-
-FAR = 100.0
-"""A simulation that leaves this many times the range of the data has diverged."""
-
+STRETCH = 16384  # samples expanded at a time
+FAR = 100.0  # a simulation that leaves this many times the range of the data has diverged
+# a derivative with respect to the initial state below this share of its largest value no longer informs
 FORGOTTEN = 1e-12
-"""A derivative with respect to the initial state below this share of its largest value no longer informs."""
-
 STEPS = 50
-SETTLED = 1e-20
-"""A step that promises less than this share of the squared error is the last one."""
+SETTLED = 1e-20  # a step that promises less than this share of the squared error is the last one
 DIGITS = 1e-15  # of the outputs; a step that promises less than their square is the last one, too
 
 ROUNDING = 1e-14
@@ -34,27 +28,16 @@ SIMULATORS = ("predict", "measured_feedback", "free")
 
 
 class Run(NamedTuple):
-    """One record under one simulator.
+    """One record under one simulator."""
 
-    Attributes:
-        model: the model.
-        u: (N, m) inputs.
-        y: (N, l) outputs; NaN where there are none.
-        known: those that the simulator may see, NaN elsewhere; None for a free run.
-        gain: (n, l) gain of the correction.
-        low: (l,) lower end of the range allowed.
-        high: (l,) upper end.
-        label: words that name the experiment in a message.
-    """
-
-    model: StateSpace
-    u: Array
-    y: Array
-    known: Array | None
-    gain: Array
-    low: Array
-    high: Array
-    label: str
+    model: StateSpace  # the model
+    u: Array  # (N, m) inputs
+    y: Array  # (N, l) outputs; NaN where there are none
+    known: Array | None  # those that the simulator may see, NaN elsewhere; None for a free run
+    gain: Array  # (n, l) gain of the correction
+    low: Array  # (l,) lower end of the range allowed
+    high: Array  # (l,) upper end
+    label: str  # words that name the experiment in a message
 
 
 def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limits: Any, label: str) -> Run:

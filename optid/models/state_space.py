@@ -21,17 +21,15 @@ from optid.models.model import Model, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_signals import Parts
 
+# shapes of the matrices: n states, m inputs, l outputs, r functions of the inputs, s of the outputs, k latent ones
 MATRICES = {
     "A": "nn", "B": "nr", "C": "ln", "D": "lr", "E": "ns", "L": "nl", "K": "nl", "offset_x": "n", "offset_y": "l",
     "Ez": "nk", "Fz": "lk", "Cz": "kn", "Dz": "km", "offset_z": "k",
 }
-"""Shapes of the matrices: n states, m inputs, l outputs, r functions of the inputs, s of the outputs, k latent ones."""
-
 COVARIANCES = {"Q": "nn", "R": "ll", "S": "nl", "innovation": "ll"}
 
 NEWTON_STEPS = 100
-RESTS = 1e-12
-"""A state that moves by less than this share of its size rests."""
+RESTS = 1e-12  # a state that moves by less than this share of its size rests
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,15 +8,13 @@ import numpy as np
 from optid.models.functions import latent_names, static_functions
 from optid.models.state_space import MATRICES
 
-READABLE = 4
-"""Most states whose equations are written out."""
-
+READABLE = 4  # most states whose equations are written out
+# the matrices of every equation in the order in which they are written, and what they multiply
 TERMS = {
     "x": {"A": "x", "B": "f", "E": "g", "L": "y", "Ez": "h", "offset_x": "", "K": "e"},
     "y": {"C": "x", "D": "f", "Fz": "h", "offset_y": ""},
     "z": {"Cz": "x", "Dz": "u", "offset_z": ""},
 }
-"""The matrices of every equation in the order in which they are written, and what they multiply."""
 
 
 def signed_terms(terms: Iterable[tuple[float, str]], digits: int = 4) -> str:

@@ -13,29 +13,19 @@ from optid.bases.basis import spread
 from optid.errors import DataError, RankError, StructureError
 from optid.models.layout import Layout
 
-CHUNK = 32768
-"""Samples summed up at a time: their basis functions stay in the processor's cache."""
-
-PIECE = 4096
-"""Samples evaluated at a time: so do the intermediate results."""
-
+CHUNK = 32768  # samples summed up at a time: their basis functions stay in the processor's cache
+PIECE = 4096  # samples evaluated at a time: so do the intermediate results
+# chunks, at least, that one thread takes at a time: longer ones do not occupy all threads in a common record
 BLOCKS = 4
-"""Chunks, at least, that one thread takes at a time: longer ones do not occupy all threads in a common record."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where the samples of groups of signals stand in a row; every group enters at lags of its own.
+    """Where the samples of groups of signals stand in a row; every group enters at lags of its own."""
 
-    Attributes:
-        lags: lags of every group.
-        columns: (lags, signals) columns of every group.
-        constant: column of the constant.
-    """
-
-    lags: tuple[range, ...]
-    columns: tuple[NDArray[np.int32], ...]
-    constant: int
+    lags: tuple[range, ...]  # lags of every group
+    columns: tuple[NDArray[np.int32], ...]  # (lags, signals) columns of every group
+    constant: int  # column of the constant
 
     @classmethod
     def of(cls, layout: Layout) -> "Frame":
@@ -59,17 +49,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals that enter the rows at the same lags: the outputs, or the functions of one input.
+    """Signals that enter the rows at the same lags: the outputs, or the functions of one input."""
 
-    Attributes:
-        first: (T,) position of the first function that does not vanish.
-        weights: (T, s) values from there on.
-        size: number of signals.
-    """
-
-    first: NDArray[np.int32]
-    weights: Array
-    size: int
+    first: NDArray[np.int32]  # (T,) position of the first function that does not vanish
+    weights: Array  # (T, s) values from there on
+    size: int  # number of signals
 
     @classmethod
     def dense(cls, values: Array) -> "Signals":
@@ -84,22 +68,15 @@ class Signals:
 
 @dataclass(frozen=True)
 class Block:
-    """Samples of a stretch of time, with zeros before, behind and in place of missing ones.
+    """Samples of a stretch of time, with zeros before, behind and in place of missing ones."""
 
-    Attributes:
-        frame: the rows.
-        groups: the signals of every group.
-        valid: (R,) rows that touch neither a missing sample nor the zeros around; row r looks back from sample
-            reach + r of the signals.
-        weights: (R,) weights of the rows, or None for ones.
-        candidates: rows that would be used, were no sample missing.
-    """
-
-    frame: Frame
-    groups: tuple[Signals, ...]
+    frame: Frame  # the rows
+    groups: tuple[Signals, ...]  # the signals of every group
+    # (R,) rows that touch neither a missing sample nor the zeros around; row r looks back from sample reach + r of the
+    # signals
     valid: NDArray[np.bool_]
-    weights: Array | None
-    candidates: int
+    weights: Array | None  # (R,) weights of the rows, or None for ones
+    candidates: int  # rows that would be used, were no sample missing
 
     def entries(self, rows: NDArray[np.intp]) -> Iterator[tuple[Signals, NDArray[np.int32], NDArray[np.intp]]]:
         """Yield every group at every lag: its signals, its columns (size,) and its samples (K,) in some rows."""

@@ -7,11 +7,8 @@ import numpy as np
 from optid.arrays import Array
 from optid.statistics.hankel import hankel_statistics
 
-FADED = 1e-3
-"""Share of its largest coefficient below which the response of a noise filter has ended."""
-
-LONGEST = 4096
-"""Samples of such a response at most."""
+FADED = 1e-3  # share of its largest coefficient below which the response of a noise filter has ended
+LONGEST = 4096  # samples of such a response at most
 
 
 def long_autoregression(errors: Sequence[Array], lags: int) -> tuple[Array, Array]:

@@ -20,14 +20,11 @@ from optid.errors import DataError, DataWarning, RankError
 from optid.statistics.factors import ROUNDING, root_of_rows
 from optid.statistics.hankel import hankel_statistics
 
+# part of a function outside the span of {1, y} and of the other functions, relative to it, that is not rounding
 SMALLEST = 1e-6
-"""Part of a function outside the span of {1, y} and of the other functions, relative to it, that is not rounding."""
-
+# part of the feedback functions outside {1, y}, relative to their spread, below which the user is warned
 NEARLY_LINEAR = 0.05
-"""Part of the feedback functions outside {1, y}, relative to their spread, below which the user is warned."""
-
-LINEAR = 1e-3
-"""The same part below which the fit is refused."""
+LINEAR = 1e-3  # the same part below which the fit is refused
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,22 +32,14 @@ class Feedback:
     """The functions of one output that enter the state equation, in orthonormal coordinates on the record.
 
     zeta_r = V^T zeta(y_o) - intercept - slope y, of unit variance and uncorrelated with {1, y}.
-
-    Attributes:
-        output: index o of the output.
-        basis: its basis, with an interval.
-        vectors: (Q, r) V; r < Q where the basis contains functions that are linear on the record.
-        intercept: (r,).
-        slope: (r, l).
-        share: spread left after the orthogonalisation, relative to the spread of the functions.
     """
 
-    output: int
-    basis: Basis
-    vectors: Array
-    intercept: Array
-    slope: Array
-    share: float
+    output: int  # index o of the output
+    basis: Basis  # its basis, with an interval
+    vectors: Array  # (Q, r) V; r < Q where the basis contains functions that are linear on the record
+    intercept: Array  # (r,)
+    slope: Array  # (r, l)
+    share: float  # spread left after the orthogonalisation, relative to the spread of the functions
 
     @property
     def size(self) -> int:
@@ -64,21 +53,13 @@ class Feedback:
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """Turns raw channels [u | y (| simulated y)] into signals [eta | zeta_r | y (| zeta_r of the simulated y)].
+    """Turns raw channels [u | y (| simulated y)] into signals [eta | zeta_r | y (| zeta_r of the simulated y)]."""
 
-    Attributes:
-        inputs: one basis per input, with intervals.
-        feedback: feedback functions, at most one family per output.
-        input_names: names of the m inputs.
-        output_names: names of the l outputs.
-        simulated: whether simulated outputs follow the measured ones.
-    """
-
-    inputs: tuple[Basis, ...]
-    feedback: tuple[Feedback, ...]
-    input_names: tuple[str, ...]
-    output_names: tuple[str, ...]
-    simulated: bool = False
+    inputs: tuple[Basis, ...]  # one basis per input, with intervals
+    feedback: tuple[Feedback, ...]  # feedback functions, at most one family per output
+    input_names: tuple[str, ...]  # names of the m inputs
+    output_names: tuple[str, ...]  # names of the l outputs
+    simulated: bool = False  # whether simulated outputs follow the measured ones
 
     @property
     def m(self) -> int:

@@ -20,11 +20,9 @@ from optid.statistics.blocks import Block, Frame, Signals, rows_present, stretch
 from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, dependent_column, root_of_gram
 from optid.statistics.sums import Factor, Sums
 
-Expand = Callable[[Array], Array]
-"""From raw channels (T, c) to signals (T, d), sample by sample."""
-
+Expand = Callable[[Array], Array]  # from raw channels (T, c) to signals (T, d), sample by sample
+# samples expanded at a time: they stay in the processor's cache. Eight of these chunks are summed up at a time
 CHUNK = 4096
-"""Samples expanded at a time: they stay in the processor's cache. Eight of these chunks are summed up at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,21 +30,14 @@ class HankelStatistics:
     """Second moments of [1; s(k) - centre; ...; s(k + rows - 1) - centre] over all complete windows k.
 
     Position 0 is the constant; signal c at block row i has position 1 + i d + c (`at`).
-
-    Attributes:
-        rows: number of block rows.
-        names: names of the d signals.
-        centre: (d,) subtracted from the signals beforehand.
-        gram: (1 + rows d, 1 + rows d) sum over the windows, in squared units of the signals.
-        candidates: number of windows there would be, were no sample missing.
-        factor: upper triangular R with R^T R = gram from a streamed QR decomposition; None when there was none.
     """
 
-    rows: int
-    names: tuple[str, ...]
-    centre: Array
-    gram: Array
-    candidates: int
+    rows: int  # number of block rows
+    names: tuple[str, ...]  # names of the d signals
+    centre: Array  # (d,) subtracted from the signals beforehand
+    gram: Array  # (1 + rows d, 1 + rows d) sum over the windows, in squared units of the signals
+    candidates: int  # number of windows there would be, were no sample missing
+    # upper triangular R with R^T R = gram from a streamed QR decomposition; None when there was none
     factor: Array | None = None
 
     @property

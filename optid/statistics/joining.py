@@ -24,15 +24,10 @@ from optid.statistics.sums import Total
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Neighbouring parts: the sums over the rows inside them, and their ends.
+    """Neighbouring parts: the sums over the rows inside them, and their ends."""
 
-    Attributes:
-        total: the sums.
-        ends: experiment, first and last samples [u | y] of every part; as many samples as the lags reach back, or all
-            there are.
-    """
-
-    total: Total
+    total: Total  # the sums
+    # experiment, first and last samples [u | y] of every part; as many samples as the lags reach back, or all there are
     ends: tuple[tuple[int, Array, Array], ...]
 
 

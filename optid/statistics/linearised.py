@@ -14,35 +14,26 @@ import numpy as np
 from optid.arrays import Array
 from optid.statistics.factors import add_to_root, any_root_of_gram, conditioning
 
+# condition number of the scaled sensitivities beyond which the Gram matrix, which squares it, has too few digits
 CONDITION_LIMIT = 1e6
-"""Condition number of the scaled sensitivities beyond which the Gram matrix, which squares it, has too few digits."""
 
 
+# Gram matrix, QR decomposition (slower, twice the digits), or "qr" where the condition number asks for it
 Method = Literal["auto", "gram", "qr"]
-"""Gram matrix, QR decomposition (slower, twice the digits), or "qr" where the condition number asks for it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Errors (model less record) near a point: ``|e(x + dx)|² = |root dx_s + pull|² + states + remainder``.
+    """Errors (model less record) near a point: ``|e(x + dx)|² = |root dx_s + pull|² + states + remainder``."""
 
-    Attributes:
-        root: (p, p) upper triangular factor for the shared unknowns, initial states eliminated.
-        pull: (p,) compressed errors.
-        states: (X, S, e) of every experiment: its initial state moves by ``-X^+ (S dx_s + e)``.
-        remainder: what no step changes.
-        rows: outputs present.
-        condition: estimated condition number of the column-scaled factor.
-        method: "gram" or "qr".
-    """
-
-    root: Array
-    pull: Array
+    root: Array  # (p, p) upper triangular factor for the shared unknowns, initial states eliminated
+    pull: Array  # (p,) compressed errors
+    # (X, S, e) of every experiment: its initial state moves by ``-X^+ (S dx_s + e)``
     states: tuple[tuple[Array, Array, Array], ...]
-    remainder: float
-    rows: int
-    condition: float
-    method: Literal["gram", "qr"]
+    remainder: float  # what no step changes
+    rows: int  # outputs present
+    condition: float  # estimated condition number of the column-scaled factor
+    method: Literal["gram", "qr"]  # "gram" or "qr"
 
     @property
     def exact(self) -> bool:

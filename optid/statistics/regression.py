@@ -25,16 +25,13 @@ if TYPE_CHECKING:
     from optid.data.record import Data
     from optid.data.streams import Stream
 
+# condition number of the scaled regressor beyond which the Gram matrix, which squares it, has too few digits left
 CONDITION_LIMIT = 1e7
-"""Condition number of the scaled regressor beyond which the Gram matrix, which squares it, has too few digits left."""
-
+# share of an output that least squares leaves, below which its difference of sums has too few digits left
 LEAST_REMAINDER = 1e-6
-"""Share of an output that least squares leaves, below which its difference of sums has too few digits left."""
-
+# bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
+# long for the next chunk; to take every page of it from the system again costs as much as half of the arithmetic
 RETAINED = 1 << 24
-"""Bytes allocated and freed once before a pass. From then on the C library of Linux keeps freed memory up to twice as
-long for the next chunk; to take every page of it from the system again costs as much as half of the arithmetic."""
-
 ROWS_PER_COLUMN = 1.1
 KEPT = 0.5
 
@@ -44,19 +41,13 @@ class Statistics:
     """Sufficient statistics of the regression: all that least squares needs to know of a record.
 
     Statistics of one layout add up exactly: `a + b` are those of both records.
-
-    Attributes:
-        layout: the columns.
-        gram: (n + l, n + l) Gram matrix of [Phi | Y], in squared data units.
-        rows: rows used.
-        candidates: rows that would have been used, had no sample been missing.
-        factor: upper triangular R with R^T R = gram, from a streamed QR decomposition; None when there was none.
     """
 
-    layout: Layout
-    gram: Array
-    rows: int
-    candidates: int
+    layout: Layout  # the columns
+    gram: Array  # (n + l, n + l) Gram matrix of [Phi | Y], in squared data units
+    rows: int  # rows used
+    candidates: int  # rows that would have been used, had no sample been missing
+    # upper triangular R with R^T R = gram, from a streamed QR decomposition; None when there was none
     factor: Array | None = None
 
     def __add__(self, other: "Statistics") -> "Statistics":

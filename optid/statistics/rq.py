@@ -20,32 +20,23 @@ from optid.errors import RankError, StructureError
 from optid.statistics.hankel import HankelStatistics, dependent_signal
 
 FORMS = ("projection", "correlation")
-TINY = 1e-12
-"""Smallest singular value of the scaled R11, relative to the largest, that is not rounding."""
+TINY = 1e-12  # smallest singular value of the scaled R11, relative to the largest, that is not rounding
 
 
 @dataclass(frozen=True, eq=False)
 class RQ:
-    """The blocks of the second RQ decomposition.
+    """The blocks of the second RQ decomposition."""
 
-    Attributes:
-        r22: (y, r) outputs projected on the instruments, with the regressors removed: Gamma times the projected states.
-        residual: (y, y) triangular factor of the outputs' part outside the instruments and regressors.
-        gain: (y, p) H = R21 R11^-1 in units of the signals.
-        condition: condition number of the projected regressors, their rows scaled to the norm of the regressors
-            themselves: it grows with the record where instruments and regressors are not correlated.
-        discarded: directions of the regressors that a tolerance left out.
-        triangle: (z, z) triangular factor of the instruments.
-        projected: (p, z) regressors on the orthonormal instruments, and (y, z) outputs.
-    """
-
+    # (y, r) outputs projected on the instruments, with the regressors removed: Gamma times the projected states
     r22: Array
-    residual: Array
-    gain: Array
+    residual: Array  # (y, y) triangular factor of the outputs' part outside the instruments and regressors
+    gain: Array  # (y, p) H = R21 R11^-1 in units of the signals
+    # condition number of the projected regressors, their rows scaled to the norm of the regressors themselves: it grows
+    # with the record where instruments and regressors are not correlated
     condition: float
-    discarded: int
-    triangle: Array
-    projected: tuple[Array, Array]
+    discarded: int  # directions of the regressors that a tolerance left out
+    triangle: Array  # (z, z) triangular factor of the instruments
+    projected: tuple[Array, Array]  # (p, z) regressors on the orthonormal instruments, and (y, z) outputs
 
     @cached_property
     def decomposition(self) -> tuple[Array, Array, Array]:

@@ -34,27 +34,18 @@ from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 if TYPE_CHECKING:
     from optid.data.record import Data
 
-CHUNK = 4096
-"""Samples whose sensitivities are formed at a time: they stay in the processor's cache."""
-
+CHUNK = 4096  # samples whose sensitivities are formed at a time: they stay in the processor's cache
+# values of basis functions that are kept between linearisations: as many as stay in the processor's cache
 TABLE = 1 << 18
-"""Values of basis functions that are kept between linearisations: as many as stay in the processor's cache."""
-
-FORGOTTEN = 1e-13
-"""Share of its peak below which the response to the initial state no longer informs about it."""
+FORGOTTEN = 1e-13  # share of its peak below which the response to the initial state no longer informs about it
 
 
 @dataclass(frozen=True, eq=False)
 class TransferPredictor:
-    """The predictor of a record.
+    """The predictor of a record."""
 
-    Attributes:
-        data: the record; missing outputs drop out of all sums.
-        unknowns: their order.
-    """
-
-    data: "Data"
-    unknowns: TransferUnknowns
+    data: "Data"  # the record; missing outputs drop out of all sums
+    unknowns: TransferUnknowns  # their order
 
     def compress(self, point: TransferPoint, gauge: Array | None = None, method: Method = "auto") -> Linearised:
         """Predict over all experiments and compress the errors (predicted less measured) with their sensitivities.

@@ -21,11 +21,8 @@ from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknown
 if TYPE_CHECKING:
     from optid.data.record import Data
 
-HUGE = 1e250
-"""Sum of squared sensitivities beyond which a run counts as one that leaves its range."""
-
-NUMBERS = 500_000
-"""Entries of the sensitivities formed at a time."""
+HUGE = 1e250  # sum of squared sensitivities beyond which a run counts as one that leaves its range
+NUMBERS = 500_000  # entries of the sensitivities formed at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,21 +31,15 @@ class StatePredictor:
 
     Where an output is missing its error is left out, nothing is corrected by it, and the model's own output is fed
     back.
-
-    Attributes:
-        data: the record; every input present.
-        unknowns: their order.
-        model: (point) -> `StateSpace`; the matrix that carries its state must be stable.
-        weight: (l, l) positive definite: the errors count as e^T weight e; where outputs are missing, with the inverse
-            of the block of its inverse.
-        limits: range that the outputs of every experiment must not leave, from `allowed_range`; None for none.
     """
 
-    data: "Data"
-    unknowns: StateUnknowns
-    model: Callable[[StatePoint], Any]
+    data: "Data"  # the record; every input present
+    unknowns: StateUnknowns  # their order
+    model: Callable[[StatePoint], Any]  # (point) -> `StateSpace`; the matrix that carries its state must be stable
+    # (l, l) positive definite: the errors count as e^T weight e; where outputs are missing, with the inverse of the
+    # block of its inverse
     weight: Array
-    limits: Any = None
+    limits: Any = None  # range that the outputs of every experiment must not leave, from `allowed_range`; None for none
 
     def compress(self, x: Array, gauge: Array | None = None, method: Method = "auto") -> Linearised:
         """Run over all experiments from the unknowns x and compress the errors with their sensitivities.

@@ -15,31 +15,21 @@ from optid.models.state_signals import Direct
 from optid.statistics.expansion import Expansion
 from optid.statistics.unknowns import Unknowns
 
+# criterion -> simulator of a model whose errors it counts
 SIMULATORS = {"simulation": "free", "measured feedback": "measured_feedback", "prediction": "predict"}
-"""Criterion -> simulator of a model whose errors it counts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Latent:
-    """A static function h of a latent signal z = Cz x + Dz u + constant, and what is unknown of it.
+    """A static function h of a latent signal z = Cz x + Dz u + constant, and what is unknown of it."""
 
-    Attributes:
-        basis: its basis, with an interval.
-        vectors: (P, r) h = basis @ vectors @ c, c unknown; see `beyond_affine`.
-        feeds: whether Ez is unknown; zero where not.
-        direct: whether Fz is unknown; where not, it is one at `output`.
-        output: index of an output that h is added to as it is, and that alone; -1 for none.
-        moved: whether the inputs act on z: Dz is unknown; zero where not.
-        row: (n + m + 1,) known row [Cz, Dz, constant] of the argument, with coefficients one; None where both are
-            unknown.
-    """
-
-    basis: Basis
-    vectors: Array
-    feeds: bool = True
-    direct: bool = False
-    output: int = -1
-    moved: bool = True
+    basis: Basis  # its basis, with an interval
+    vectors: Array  # (P, r) h = basis @ vectors @ c, c unknown; see `beyond_affine`
+    feeds: bool = True  # whether Ez is unknown; zero where not
+    direct: bool = False  # whether Fz is unknown; where not, it is one at `output`
+    output: int = -1  # index of an output that h is added to as it is, and that alone; -1 for none
+    moved: bool = True  # whether the inputs act on z: Dz is unknown; zero where not
+    # (n + m + 1,) known row [Cz, Dz, constant] of the argument, with coefficients one; None where both are unknown
     row: Array | None = None
 
     @property
@@ -70,11 +60,11 @@ def beyond_affine(basis: Basis, points: int = 64) -> Array:
     return found
 
 
+# shapes of the arrays of a point: n states, l outputs, m inputs, s feedback and k latent functions, E experiments
 SHAPES = {
     "A": "nn", "C": "ln", "K": "nl", "offset": "l", "b": "nm", "d": "lm", "e": "ns", "x0": "En", "Ez": "nk", "Fz": "lk",
     "Cz": "kn", "Dz": "km", "offset_z": "k",
 }
-"""Shapes of the arrays of a point: n states, l outputs, m inputs, s feedback and k latent functions, E experiments."""
 
 
 def _straight_at_ends(basis: Basis) -> Array:
@@ -88,68 +78,39 @@ def _straight_at_ends(basis: Basis) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class StatePoint:
-    """Values of the unknowns.
+    """Values of the unknowns."""
 
-    Attributes:
-        A: (n, n).
-        C: (l, n).
-        K: (n, l); zero where it is not unknown.
-        offset: (l,).
-        mus: (P_c,) one array per input.
-        b: (n, m).
-        d: (l, m); zero where an input has no feedthrough.
-        nus: (Q_f,) one array per family of feedback functions.
-        e: (n, s).
-        x0: (E, n).
-        cs: (r_i,) one array per latent function.
-        Ez: (n, k).
-        Fz: (l, k).
-        Cz: (k, n).
-        Dz: (k, m).
-        offset_z: (k,).
-    """
-
-    A: Array
-    C: Array
-    K: Array
-    offset: Array
-    mus: tuple[Array, ...]
-    b: Array
-    d: Array
-    nus: tuple[Array, ...]
-    e: Array
-    x0: Array
-    cs: tuple[Array, ...]
-    Ez: Array
-    Fz: Array
-    Cz: Array
-    Dz: Array
-    offset_z: Array
+    A: Array  # (n, n)
+    C: Array  # (l, n)
+    K: Array  # (n, l); zero where it is not unknown
+    offset: Array  # (l,)
+    mus: tuple[Array, ...]  # (P_c,) one array per input
+    b: Array  # (n, m)
+    d: Array  # (l, m); zero where an input has no feedthrough
+    nus: tuple[Array, ...]  # (Q_f,) one array per family of feedback functions
+    e: Array  # (n, s)
+    x0: Array  # (E, n)
+    cs: tuple[Array, ...]  # (r_i,) one array per latent function
+    Ez: Array  # (n, k)
+    Fz: Array  # (l, k)
+    Cz: Array  # (k, n)
+    Dz: Array  # (k, m)
+    offset_z: Array  # (k,)
 
 
 @dataclass(frozen=True, eq=False)
 class StateUnknowns(Unknowns):
-    """The unknowns as one vector; the initial states come last.
+    """The unknowns as one vector; the initial states come last."""
 
-    Attributes:
-        n: number of states.
-        expansion: functions of the inputs and of the outputs fed back.
-        experiments: number of experiments.
-        feedthrough: one per input.
-        criterion: whose errors are meant, one of `SIMULATORS`; K is unknown for "prediction", and zero otherwise.
-        constant: whether the offset is unknown; where not, it is zero.
-        latent: functions of latent signals.
-        linear_output: whether C is unknown; where not, it is zero.
-    """
-
-    n: int
-    expansion: Expansion
-    experiments: int
-    feedthrough: tuple[bool, ...]
+    n: int  # number of states
+    expansion: Expansion  # functions of the inputs and of the outputs fed back
+    experiments: int  # number of experiments
+    feedthrough: tuple[bool, ...]  # one per input
+    # whose errors are meant, one of `SIMULATORS`; K is unknown for "prediction", and zero otherwise
     criterion: str = "simulation"
-    constant: bool = True
-    latent: tuple[Latent, ...] = ()
-    linear_output: bool = True
+    constant: bool = True  # whether the offset is unknown; where not, it is zero
+    latent: tuple[Latent, ...] = ()  # functions of latent signals
+    linear_output: bool = True  # whether C is unknown; where not, it is zero
 
     @property
     def innovations(self) -> bool:

@@ -17,20 +17,11 @@ from optid.arrays import Array
 from optid.statistics.blocks import Block, Frame, Signals
 from optid.statistics.factors import add_to_root
 
-FORMED = 2048
-"""Rows that are formed at once where a dense product is the cheapest way."""
-
-WIDE = 128
-"""Signals times samples of the blocks of dense signals whose products are taken at once."""
-
-SMALL = 3e7
-"""Products in a sum of dense rows up to which loading compiled loops (half a second) does not pay."""
-
-TINY = 5e6
-"""Products in a sum of dense rows up to which nothing is faster."""
-
-SAFE = 1e3
-"""Energy subtracted from a column over energy left: beyond it more than three digits would be lost."""
+FORMED = 2048  # rows that are formed at once where a dense product is the cheapest way
+WIDE = 128  # signals times samples of the blocks of dense signals whose products are taken at once
+SMALL = 3e7  # products in a sum of dense rows up to which loading compiled loops (half a second) does not pay
+TINY = 5e6  # products in a sum of dense rows up to which nothing is faster
+SAFE = 1e3  # energy subtracted from a column over energy left: beyond it more than three digits would be lost
 
 
 def windows_of(signals: Array, rows: int) -> Array:

@@ -10,19 +10,12 @@ from optid.models.layout import Layout
 
 
 class Unknowns:
-    """Where every part stands in the vector x; a subclass names the parts.
+    """Where every part stands in the vector x; a subclass names the parts."""
 
-    Attributes:
-        experiments: number of experiments.
-        memory: size of an initial state.
-        innovations: whether the errors are those of predictions rather than of simulations.
-        shapes: shape of every shared part in the order of x.
-    """
-
-    experiments: int
-    memory: int
-    innovations: bool
-    shapes: dict[str, tuple[int, ...]]
+    experiments: int  # number of experiments
+    memory: int  # size of an initial state
+    innovations: bool  # whether the errors are those of predictions rather than of simulations
+    shapes: dict[str, tuple[int, ...]]  # shape of every shared part in the order of x
 
     @cached_property
     def slices(self) -> dict[str, slice]:
@@ -61,45 +54,28 @@ class Unknowns:
 
 @dataclass(frozen=True, eq=False)
 class TransferPoint:
-    """Values of the unknowns of a transfer-function model.
+    """Values of the unknowns of a transfer-function model."""
 
-    Attributes:
-        a: (na,) coefficients of A.
-        mus: (P_c,) coefficients of f_c, one array per input.
-        bs: (nb_c,) coefficients of B_c, one array per input.
-        offset: constant of the equation.
-        x0: (E, n) what the past of every experiment adds to its first n equations.
-        c: (nc,) coefficients of C.
-        d: (nd,) coefficients of D; A where D is A.
-    """
-
-    a: Array
-    mus: tuple[Array, ...]
-    bs: tuple[Array, ...]
-    offset: float
-    x0: Array
-    c: Array = field(default_factory=lambda: np.zeros(0))
-    d: Array = field(default_factory=lambda: np.zeros(0))
+    a: Array  # (na,) coefficients of A
+    mus: tuple[Array, ...]  # (P_c,) coefficients of f_c, one array per input
+    bs: tuple[Array, ...]  # (nb_c,) coefficients of B_c, one array per input
+    offset: float  # constant of the equation
+    x0: Array  # (E, n) what the past of every experiment adds to its first n equations
+    c: Array = field(default_factory=lambda: np.zeros(0))  # (nc,) coefficients of C
+    d: Array = field(default_factory=lambda: np.zeros(0))  # (nd,) coefficients of D; A where D is A
 
 
 @dataclass(frozen=True)
 class TransferUnknowns(Unknowns):
-    """The unknowns of ``A x = sum_c B_c f_c(u_c) + d, y = x + (C/D) e``: [a; mu0; b0; mu1; ...; offset; c; d; x0].
+    """The unknowns of ``A x = sum_c B_c f_c(u_c) + d, y = x + (C/D) e``: [a; mu0; b0; mu1; ...; offset; c; d; x0]."""
 
-    Attributes:
-        layout: orders and bases of the plant; one output.
-        experiments: number of experiments.
-        free: whether the coefficients of every nonlinearity are unknown; where not, mu is one (`Linear`).
-        constant: whether the offset is unknown; where not, it is zero.
-        nc: order of C.
-        nd: order of D; None where D is A (ARX, ARMAX). Then there are no initial states among the unknowns.
-    """
-
-    layout: Layout
-    experiments: int
+    layout: Layout  # orders and bases of the plant; one output
+    experiments: int  # number of experiments
+    # whether the coefficients of every nonlinearity are unknown; where not, mu is one (`Linear`)
     free: tuple[bool, ...]
-    constant: bool = True
-    nc: int = 0
+    constant: bool = True  # whether the offset is unknown; where not, it is zero
+    nc: int = 0  # order of C
+    # order of D; None where D is A (ARX, ARMAX). Then there are no initial states among the unknowns
     nd: int | None = 0
 
     @property

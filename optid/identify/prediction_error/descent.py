@@ -13,57 +13,35 @@ from optid.data.record import Data
 from optid.statistics.linearised import Linearised, Method
 from optid.statistics.unknowns import Unknowns
 
-STATIONARY = 1e-12
-"""Share of the sum of squares that a full step would still gain, below which a descent has arrived."""
-
-EXACT = 1e-24
-"""Sum of squared errors, as a share of the energy of the record, that counts as zero."""
-
+STATIONARY = 1e-12  # share of the sum of squares that a full step would still gain, below which a descent has arrived
+EXACT = 1e-24  # sum of squared errors, as a share of the energy of the record, that counts as zero
 STEPS = 100
 
-CREEPING = 5
-"""Steps over which progress is measured."""
-
+CREEPING = 5  # steps over which progress is measured
+# relative gain of a full step below which a start counts as arrived; only the best of them descends further
 COMPARED = 1e-6
-"""Relative gain of a full step below which a start counts as arrived; only the best of them descends further."""
-
+# damping, relative to the squared sensitivities, beneath which steps need more digits than a Gram matrix has
 DAMPED = 1e-7
-"""Damping, relative to the squared sensitivities, beneath which steps need more digits than a Gram matrix has."""
-
+# damping that remains where errors are nonlinear in the states: a Gram matrix then serves all steps but the last
 GRAM = 1e-14
-"""Damping that remains where errors are nonlinear in the states: a Gram matrix then serves all steps but the last."""
-
-AGREE = 1e-4
-"""Relative difference of the sums of squares within which two starts have arrived at the same optimum."""
-
+AGREE = 1e-4  # relative difference of the sums of squares within which two starts have arrived at the same optimum
+# share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
+# where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best
 EXPLAINED = 0.1
-"""Share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
-where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best."""
-
-ROUNDING = 1e-9
-"""Relative difference of two sums of squares that were added up in different ways."""
-
+ROUNDING = 1e-9  # relative difference of two sums of squares that were added up in different ways
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as stable:0.999")
 
 
 class Criterion(ABC):
-    """A sum of squared errors in a vector x of unknowns, of which the last ones are initial states.
+    """A sum of squared errors in a vector x of unknowns, of which the last ones are initial states."""
 
-    Attributes:
-        data: the record.
-        unknowns: the order of x.
-        gauge: how the scale between mu and b is fixed.
-        weight: (l, l) weight of the errors.
-        unit: what one unit of the sum of squares is in units of the record.
-        bends: whether the errors are nonlinear in the initial states, so that steps of these are damped, too.
-    """
-
-    data: Data
-    unknowns: Unknowns
-    gauge: str
-    weight: Array
-    unit: float = 1.0
+    data: Data  # the record
+    unknowns: Unknowns  # the order of x
+    gauge: str  # how the scale between mu and b is fixed
+    weight: Array  # (l, l) weight of the errors
+    unit: float = 1.0  # what one unit of the sum of squares is in units of the record
+    # whether the errors are nonlinear in the initial states, so that steps of these are damped, too
     bends: bool = False
 
     @property
@@ -117,25 +95,15 @@ class Criterion(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """Where a descent arrived.
+    """Where a descent arrived."""
 
-    Attributes:
-        x: the unknowns.
-        at: the errors there.
-        steps: number of linearisations.
-        converged: whether a full step would gain no more than `STATIONARY`.
-        reason: why it stopped where it did not converge.
-        start: name of the start it came from.
-        border: whether it stopped because every better point is inadmissible.
-    """
-
-    x: Array
-    at: Linearised
-    steps: int
-    converged: bool
-    reason: str = ""
-    start: str = ""
-    border: bool = False
+    x: Array  # the unknowns
+    at: Linearised  # the errors there
+    steps: int  # number of linearisations
+    converged: bool  # whether a full step would gain no more than `STATIONARY`
+    reason: str = ""  # why it stopped where it did not converge
+    start: str = ""  # name of the start it came from
+    border: bool = False  # whether it stopped because every better point is inadmissible
 
     @property
     def value(self) -> float:

@@ -21,37 +21,23 @@ from optid.identify.prediction_error.descent import COMPARED, Descent, descend
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
 
-RANKED = 3_000
-"""Samples on which directions are ranked and tried."""
-
+RANKED = 3_000  # samples on which directions are ranked and tried
+# samples of the descents before the one on the whole record; the model without functions is fitted to the first
 STAGES = (8_000, 20_000)
-"""Samples of the descents before the one on the whole record; the model without functions is fitted to the first."""
-
-MARGIN = 1.15
-"""Interval of a basis, as a multiple of the range of z at the start."""
-
-CELLS = 12
-"""Cells up to which a spline is searched as it is; of more, half as many."""
-
+MARGIN = 1.15  # interval of a basis, as a multiple of the range of z at the start
+CELLS = 12  # cells up to which a spline is searched as it is; of more, half as many
+# states of a model up to which its factors are tried; modulus from which a zero is one at infinity; radius at which
+# responses are compared, off the poles that lie on the unit circle
 LARGEST, FAR, OFF = 8, 1e3, 1.05
-"""States of a model up to which its factors are tried; modulus from which a zero is one at infinity; radius at which
-responses are compared, off the poles that lie on the unit circle."""
-
-SAME = 0.999
-"""Ratio of the gains of two directions above which they count as the same."""
-
+SAME = 0.999  # ratio of the gains of two directions above which they count as the same
 SHORT = 12
+# number of descents that the best directions start, or that go on, and their steps
 HEATS = ((10, SHORT), (5, 30), (2, 60))
-"""Number of descents that the best directions start, or that go on, and their steps."""
-
+# relative fall over a few steps below which descents stop: in the search, on the whole of a long or short record
 PACE = {"search": 1e-2, "long": 3e-3, "short": 0.0}
-"""Relative fall over a few steps below which descents stop: in the search, on the whole of a long or short record."""
-
-SIZES = (1.0, 0.3, 0.05)
-"""Shares of the Gauss-Newton step from which a descent may start."""
-
+SIZES = (1.0, 0.3, 0.05)  # shares of the Gauss-Newton step from which a descent may start
+# what a function is shrunk to where a longer record would take the run out of its range
 SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)
-"""What a function is shrunk to where a longer record would take the run out of its range."""
 
 
 def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 32,

@@ -17,11 +17,8 @@ from optid.models import roots
 from optid.statistics.hankel import hankel_statistics
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
-MORE = 8
-"""Lags that a long model has beyond those of the model whose innovations it is to show."""
-
-PLANTS = 4
-"""Starts, at most, of the output-error fit whose plant is the start of a Box-Jenkins model."""
+MORE = 8  # lags that a long model has beyond those of the model whose innovations it is to show
+PLANTS = 4  # starts, at most, of the output-error fit whose plant is the start of a Box-Jenkins model
 
 
 def starts_of(criterion: TransferErrors, number: int, seed: int) -> Iterable[tuple[str, Array]]:

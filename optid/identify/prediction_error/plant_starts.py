@@ -26,14 +26,9 @@ from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 from optid.structures.bilinear import minimise
 from optid.structures.lifted_regression import lifted_problem, positions
 
-PASSES = 8
-"""Passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all."""
-
-WIDE = 6
-"""Functions, over all inputs, up to which the subspace start is worth its cost."""
-
-RADIUS = 0.98
-"""Poles of a start lie inside this radius, so that its simulation forgets within the record."""
+PASSES = 8  # passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all
+WIDE = 6  # functions, over all inputs, up to which the subspace start is worth its cost
+RADIUS = 0.98  # poles of a start lie inside this radius, so that its simulation forgets within the record
 
 
 def plant_starts(criterion: TransferErrors, seed: int) -> Iterator[tuple[str, Array]]:

@@ -22,28 +22,15 @@ from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.linearised import Linearised
 
+# share of the sum of squares that a full step may still gain, as measured through a back end, whose accuracy limits it
 CONFIRMED = 1e-8
-"""Share of the sum of squares that a full step may still gain, as measured through a back end, whose accuracy limits
-it."""
-
+# share that counts as nothing where programme after programme promises as little: a curved boundary is followed
 STALLED = 1e-5
-"""Share that counts as nothing where programme after programme promises as little: a curved boundary is followed."""
-
-INSIDE = 1e-6
-"""Relative violation up to which a point satisfies the constraints."""
-
-NOWHERE = 1e-9
-"""Relative violation that is rounding; a step to more than that pays for it."""
-
-ROUNDING = 1e-14
-"""Share of the energy of the record below which differences of sums of squares are rounding."""
-
-PATIENCE = 5
-"""Undamped programmes in all that may promise no more than `STALLED` before it counts as nothing."""
-
-PARTS = 10
-"""Halvings of an undamped step that are tried where no damped one descends."""
-
+INSIDE = 1e-6  # relative violation up to which a point satisfies the constraints
+NOWHERE = 1e-9  # relative violation that is rounding; a step to more than that pays for it
+ROUNDING = 1e-14  # share of the energy of the record below which differences of sums of squares are rounding
+PATIENCE = 5  # undamped programmes in all that may promise no more than `STALLED` before it counts as nothing
+PARTS = 10  # halvings of an undamped step that are tried where no damped one descends
 NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
 

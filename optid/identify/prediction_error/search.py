@@ -16,17 +16,13 @@ from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models.roots import contained
 from optid.statistics.linearised import Linearised
 
+# samples, from the middle of the record, on which starts are compared; the winner descends on the whole record
 SEARCH = 5_000
-"""Samples, from the middle of the record, on which starts are compared; the winner descends on the whole record."""
-
+# starts of different methods that may make further ones unnecessary without a noise filter, see `descent.best_of`
 SUFFICIENT = 3
-"""Starts of different methods that may make further ones unnecessary without a noise filter, see `descent.best_of`."""
-
+# radii tried to bring the poles of a start into the region of the constraints
 PULLS = (1.0, 0.999, 0.99, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.3, 0.1, 0.0)
-"""Radii tried to bring the poles of a start into the region of the constraints."""
-
-ENTRIES = 3
-"""Different optima from which the constrained iteration may start."""
+ENTRIES = 3  # different optima from which the constrained iteration may start
 
 
 def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterable[tuple[str, Array]]]

@@ -25,29 +25,19 @@ from optid.statistics.state_sensitivities import StatePredictor
 from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
-WILD = 10.0
-"""Times the range of the record that the run of an iterate must not leave."""
-
-FLOOR = 1e-7
-"""Smallest standard deviation of an error that weights may rest on, as a share of that of its output."""
+WILD = 10.0  # times the range of the record that the run of an iterate must not leave
+FLOOR = 1e-7  # smallest standard deviation of an error that weights may rest on, as a share of that of its output
 
 
 @dataclass(frozen=True, eq=False)
 class StateErrors(Criterion):
-    """The weighted sum of squared errors of all outputs.
+    """The weighted sum of squared errors of all outputs."""
 
-    Attributes:
-        data: the record.
-        unknowns: their order, and whose errors are meant.
-        weight: (l, l) weight of the errors.
-        limit: modulus below which the poles that carry the state must stay.
-        checks: constraints on poles that every iterate obeys: model -> what is wrong, "" where nothing is.
-    """
-
-    data: Data
-    unknowns: StateUnknowns
-    weight: Array
-    limit: float = STABLE
+    data: Data  # the record
+    unknowns: StateUnknowns  # their order, and whose errors are meant
+    weight: Array  # (l, l) weight of the errors
+    limit: float = STABLE  # modulus below which the poles that carry the state must stay
+    # constraints on poles that every iterate obeys: model -> what is wrong, "" where nothing is
     checks: tuple[Callable[[Any], str], ...] = ()
     gauge: ClassVar[str] = "norm"
 

@@ -21,14 +21,11 @@ from optid.models.state_space import balancing
 from optid.program.solution import Status
 from optid.solving.solve import Evidence, Procedure
 
-ROUNDS = 10
-"""Times the errors are weighted anew at most."""
-
+ROUNDS = 10  # times the errors are weighted anew at most
 SAME_WEIGHT = 1e-4
 FINALISTS = 2
 
-RADII = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)
-"""Spectral radii tried to make a start stable."""
+RADII = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)  # spectral radii tried to make a start stable
 
 
 def search_states(errors: StateErrors, starts: Mapping[str, Array], weighting: str, iterations: int = STEPS

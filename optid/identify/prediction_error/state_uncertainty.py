@@ -23,26 +23,17 @@ from optid.program.units import energy_unit
 from optid.statistics.coloured import long_autoregression, response_of, scattered
 from optid.statistics.hankel import complete_runs
 
-LEAST = 8
-"""Order of the noise, at least, for which the autoregression has lags."""
-
-NO_EFFECT = 1e-9
-"""Size of an effect on the errors, relative to the largest, that is rounding."""
+LEAST = 8  # order of the noise, at least, for which the autoregression has lags
+NO_EFFECT = 1e-9  # size of an effect on the errors, relative to the largest, that is rounding
 
 
 @dataclass(frozen=True, eq=False)
 class CompressedStates(CompressedErrors):
-    """The compressed errors of a state-space model; see `CompressedErrors`.
+    """The compressed errors of a state-space model; see `CompressedErrors`."""
 
-    Attributes:
-        criterion: the errors.
-        outward: from the units of the programme's models to those of the record.
-        fixed: whether the programme fixes by rows what changes no output.
-    """
-
-    criterion: StateErrors
-    outward: Transform
-    fixed: bool = False
+    criterion: StateErrors  # the errors
+    outward: Transform  # from the units of the programme's models to those of the record
+    fixed: bool = False  # whether the programme fixes by rows what changes no output
 
     def settle(self, program: Program) -> None:
         """Linearise the errors anew, where the variables of the programme stand."""

@@ -22,15 +22,10 @@ from optid.statistics.unknowns import Unknowns
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Named variables, and where each stands in the vector of the unknowns.
+    """Named variables, and where each stands in the vector of the unknowns."""
 
-    Attributes:
-        unknowns: the order of the vector.
-        names: {variable: part of the vector}, in its order; "x0" is the initial states.
-    """
-
-    unknowns: Unknowns
-    names: Mapping[str, str]
+    unknowns: Unknowns  # the order of the vector
+    names: Mapping[str, str]  # {variable: part of the vector}, in its order; "x0" is the initial states
 
     @classmethod
     def of(cls, unknowns: Unknowns, name: Callable[[str, int], str]) -> "Places":
@@ -68,17 +63,11 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class TangentFit(ABC):
-    """A fit by programmes in the tangent of an iterate; a formulation states the programme and its model.
+    """A fit by programmes in the tangent of an iterate; a formulation states the programme and its model."""
 
-    Attributes:
-        name: of the formulation.
-        criterion: the errors, in the gauge of the programmes.
-        constraints: the user's.
-    """
-
-    name: str
-    criterion: Criterion
-    constraints: tuple[Any, ...]
+    name: str  # of the formulation
+    criterion: Criterion  # the errors, in the gauge of the programmes
+    constraints: tuple[Any, ...]  # the user's
 
     @abstractmethod
     def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
@@ -147,21 +136,13 @@ class ErrorRows:
 
 @dataclass(frozen=True, eq=False)
 class CompressedErrors:
-    """The compressed errors near an iterate, for uncertainty, prices and figures.
+    """The compressed errors near an iterate, for uncertainty, prices and figures."""
 
-    Attributes:
-        at: the errors near the iterate.
-        places: where the variables stand in the flattened variables z.
-        reference: (n,) z of the iterate.
-        energy: (1,) sum of squares of the output about its mean.
-        candidates: samples of the record.
-    """
-
-    at: Linearised
-    places: Places
-    reference: Array
-    energy: Array
-    candidates: int
+    at: Linearised  # the errors near the iterate
+    places: Places  # where the variables stand in the flattened variables z
+    reference: Array  # (n,) z of the iterate
+    energy: Array  # (1,) sum of squares of the output about its mean
+    candidates: int  # samples of the record
 
     @cached_property
     def problem(self) -> LeastSquares:

@@ -23,21 +23,15 @@ from optid.statistics.regression import ROWS_PER_COLUMN, accumulate, collect
 from optid.statistics.sensitivities import TransferPredictor
 from optid.statistics.unknowns import TransferUnknowns
 
-STABLE = 1 - 1e-9
-"""Radius inside which every pole of an iterate, or zero of C, lies."""
+STABLE = 1 - 1e-9  # radius inside which every pole of an iterate, or zero of C, lies
 
 
 @dataclass(frozen=True, eq=False)
 class TransferErrors(TransferPredictor, Criterion):
-    """Simulation errors, or one-step prediction errors with a noise filter.
+    """Simulation errors, or one-step prediction errors with a noise filter."""
 
-    Attributes:
-        gauge: how the scale between mu and b is fixed; "none" for a linear model.
-        units: from those of the record (`optid.program.units`) to those of the model.
-    """
-
-    gauge: str
-    units: Transform
+    gauge: str  # how the scale between mu and b is fixed; "none" for a linear model
+    units: Transform  # from those of the record (`optid.program.units`) to those of the model
     weight: ClassVar[Array] = np.eye(1)
 
     @property

@@ -17,14 +17,10 @@ from optid.data.stretches import interpolated
 from optid.errors import DataError, RankError
 from optid.models.hammerstein_ss import HammersteinSS
 
-ROUNDS = 12
-"""Models at most."""
-
+ROUNDS = 12  # models at most
+# change of the estimates (root mean square, in standard deviations of their outputs) below which no model follows
 SETTLED = 1e-3
-"""Change of the estimates (root mean square, in standard deviations of their outputs) below which no model follows."""
-
-BEYOND = 0.2
-"""Estimated outputs are clipped to the range of the record, wider by this share of it on either side."""
+BEYOND = 0.2  # estimated outputs are clipped to the range of the record, wider by this share of it on either side
 
 
 def clipping_range(outputs: Array) -> tuple[Array, Array]:

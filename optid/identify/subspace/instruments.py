@@ -9,8 +9,8 @@ from optid.arrays import Array, compact
 from optid.identify.subspace.imputation import clipping_range
 from optid.statistics.expansion import Expansion
 
+# points at which feedback functions are tabulated, which need not be exact, and samples expanded at a time
 GRID, CHUNK = 2001, 8192
-"""Points at which feedback functions are tabulated, which need not be exact, and samples expanded at a time."""
 
 
 def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,

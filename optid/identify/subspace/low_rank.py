@@ -27,21 +27,13 @@ SAMPLES = 4000  # outputs at most: the cube of their number is what a decomposit
 
 @dataclass(frozen=True, eq=False)
 class Structured:
-    """The structured problem of a record, in outputs of mean zero and unit variance.
+    """The structured problem of a record, in outputs of mean zero and unit variance."""
 
-    Attributes:
-        windows: the record.
-        problem: the numbers.
-        centre: (l,) subtracted from the outputs.
-        scale: (l,) by which they were divided.
-        size: largest singular value of the matrix of the measured outputs.
-    """
-
-    windows: Windows
-    problem: NuclearProblem
-    centre: Array
-    scale: Array
-    size: float
+    windows: Windows  # the record
+    problem: NuclearProblem  # the numbers
+    centre: Array  # (l,) subtracted from the outputs
+    scale: Array  # (l,) by which they were divided
+    size: float  # largest singular value of the matrix of the measured outputs
 
     def rank(self, sizes: Array) -> int:
         """Return how many singular values count; with a weight so small that nothing is left of the matrix, none."""

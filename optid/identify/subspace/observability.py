@@ -21,32 +21,21 @@ from optid.models.roots import spectral_radius
 from optid.statistics.expansion import Expansion, check_channels
 from optid.statistics.hankel import complete_runs
 
-WEAK = 0.1
-"""Share of the energy of the feedback functions that the simulated ones explain below which the user is told."""
-
+WEAK = 0.1  # share of the energy of the feedback functions that the simulated ones explain below which the user is told
+# missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
+# smaller share than this of all windows
 SCARCE, INTACT = 20, 0.8
-"""Missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
-smaller share than this of all windows."""
-
-INSIDE = 0.999
-"""Modulus to which the poles of an unstable estimate are brought."""
+INSIDE = 0.999  # modulus to which the poles of an unstable estimate are brought
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """The signals of a record in windows of 2 alpha samples.
+    """The signals of a record in windows of 2 alpha samples."""
 
-    Attributes:
-        plan: what was asked for.
-        records: raw channels, with simulated outputs where the expansion reads them.
-        expansion: the signals.
-        alpha: block rows of the past and of the future.
-    """
-
-    plan: Plan
-    records: list[Array]
-    expansion: Expansion
-    alpha: int
+    plan: Plan  # what was asked for
+    records: list[Array]  # raw channels, with simulated outputs where the expansion reads them
+    expansion: Expansion  # the signals
+    alpha: int  # block rows of the past and of the future
 
     @classmethod
     def of(cls, plan: Plan) -> "Windows":
@@ -164,19 +153,12 @@ class Windows:
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """An estimate of the observability matrix, and the record on which the other matrices follow from it.
+    """An estimate of the observability matrix, and the record on which the other matrices follow from it."""
 
-    Attributes:
-        windows: the record.
-        gamma: (rows l, n) observability matrix, in units of the outputs.
-        scale: (l,) sizes of the outputs, by which it and the residuals are divided.
-        figures: what was measured on the way.
-    """
-
-    windows: Windows
-    gamma: Array
-    scale: Array
-    figures: dict[str, Any] = field(default_factory=dict)
+    windows: Windows  # the record
+    gamma: Array  # (rows l, n) observability matrix, in units of the outputs
+    scale: Array  # (l,) sizes of the outputs, by which it and the residuals are divided
+    figures: dict[str, Any] = field(default_factory=dict)  # what was measured on the way
 
     @property
     def scaled(self) -> Array:

@@ -16,9 +16,7 @@ from optid.program.units import in_units, inner_bases, own_units
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.expansion import Expansion, expand
 
-BEST = "best"
-"""Word for the weighting that fits the record best."""
-
+BEST = "best"  # word for the weighting that fits the record best
 WORDS = {"observer": ("auto", "none", "kalman"), "split": ("exact", "lumped"), "stability": ("auto", "free"),
          "weighting": (*WEIGHTINGS, BEST)}
 
@@ -28,10 +26,6 @@ class Plan:
     """What a method is asked for, of a record in its own units; see `planned`.
 
     Attributes named as arguments of `formulations.hammerstein_ss.sid` mean the same.
-
-    Attributes:
-        imputes: whether missing outputs may be estimated although ``block_rows`` is given.
-        units: from those of the data above to those of the record; the identity where not given.
     """
 
     name: str
@@ -51,7 +45,8 @@ class Plan:
     split: str = "exact"
     stability: str = "auto"
     constraints: tuple[Any, ...] = ()
-    imputes: bool = False
+    imputes: bool = False  # whether missing outputs may be estimated although ``block_rows`` is given
+    # from those of the data above to those of the record; the identity where not given
     units: Transform = Transform((), (), (), ())
 
     def __post_init__(self) -> None:

@@ -26,19 +26,12 @@ from optid.structures.rank_one import RankOne
 
 @dataclass(frozen=True, eq=False)
 class Realisation:
-    """The compressed step, in named unknowns: one pair of factors per channel, or one matrix.
+    """The compressed step, in named unknowns: one pair of factors per channel, or one matrix."""
 
-    Attributes:
-        form: the layout.
-        problem: ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units.
-        rows: equations used.
-        factored: whether channels are rank one in the programme itself.
-    """
-
-    form: ObserverForm
-    problem: RankOne
-    rows: int
-    factored: bool = False
+    form: ObserverForm  # the layout
+    problem: RankOne  # ``||R z - s||^2 + remainder`` with one rank-one block per channel; weighted units
+    rows: int  # equations used
+    factored: bool = False  # whether channels are rank one in the programme itself
 
     def least_squares(self) -> Array:
         """Return the unrestricted minimiser z.

@@ -20,20 +20,11 @@ from optid.statistics.expansion import Expansion
 from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, root_of_gram
 from optid.structures.rank_one import matrices
 
-BLOCK = 32
-"""Samples whose responses are one product with a Toeplitz matrix."""
-
-TINY = 1e-150
-"""States below it are zero: denormal numbers would make every product with them slow."""
-
-CHUNK = 8192
-"""Samples whose regressors are formed at once."""
-
-MANY = 10
-"""Rows per column from which their Gram matrix is formed first."""
-
-HELD = 1 << 22
-"""Numbers held at once at most: models with many functions and states take shorter chunks."""
+BLOCK = 32  # samples whose responses are one product with a Toeplitz matrix
+TINY = 1e-150  # states below it are zero: denormal numbers would make every product with them slow
+CHUNK = 8192  # samples whose regressors are formed at once
+MANY = 10  # rows per column from which their Gram matrix is formed first
+HELD = 1 << 22  # numbers held at once at most: models with many functions and states take shorter chunks
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,28 +33,18 @@ class ObserverForm:
 
     The vector of unknowns is z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input
     and zeta x E_o for an output that is fed back, as `RankOne` wants them.
-
-    Attributes:
-        a: (n, n).
-        c: (l, n).
-        gain: (n, l) observer gain L.
-        expansion: the signals.
-        experiments: number of experiments.
-        feedthrough: whether every input acts on the outputs at once.
-        offset: whether there is a constant d.
-        weights: (l,) by which the residuals are multiplied.
-        instrumented: whether feedback functions of simulated outputs are instruments for those of the measured ones
-            (two-stage least squares), for noise that is fed back and not white; the expansion must contain both.
     """
 
-    a: Array
-    c: Array
-    gain: Array
-    expansion: Expansion
-    experiments: int
-    feedthrough: tuple[bool, ...]
-    offset: bool
-    weights: Array
+    a: Array  # (n, n)
+    c: Array  # (l, n)
+    gain: Array  # (n, l) observer gain L
+    expansion: Expansion  # the signals
+    experiments: int  # number of experiments
+    feedthrough: tuple[bool, ...]  # whether every input acts on the outputs at once
+    offset: bool  # whether there is a constant d
+    weights: Array  # (l,) by which the residuals are multiplied
+    # whether feedback functions of simulated outputs are instruments for those of the measured ones (two-stage least
+    # squares), for noise that is fed back and not white; the expansion must contain both
     instrumented: bool = False
 
     @property

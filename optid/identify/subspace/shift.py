@@ -32,24 +32,16 @@ AT_ONCE = 8  # poles that are constrained by one programme where there are more 
 
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """The answer of the step.
+    """The answer of the step."""
 
-    Attributes:
-        a: (n, n), or None where no programme had a point.
-        residual: ‖Gamma_up A - Gamma_dn‖ (Frobenius) at ``a``; nan without a point.
-        bound: the least-squares residual, below which no A can come.
-        applied: whether constraints were needed.
-        status: OPTIMAL where ``a`` is the least-squares solution, else that of the programmes: LOCAL where the
-            suboptimality is positive, INACCURATE where a back end was or where a pole lies outside its region.
-        reason: one sentence for people.
-    """
-
-    a: Array | None
-    residual: float
-    bound: float
-    applied: bool
+    a: Array | None  # (n, n), or None where no programme had a point
+    residual: float  # ‖Gamma_up A - Gamma_dn‖ (Frobenius) at ``a``; nan without a point
+    bound: float  # the least-squares residual, below which no A can come
+    applied: bool  # whether constraints were needed
+    # OPTIMAL where ``a`` is the least-squares solution, else that of the programmes: LOCAL where the suboptimality is
+    # positive, INACCURATE where a back end was or where a pole lies outside its region
     status: Status
-    reason: str
+    reason: str  # one sentence for people
 
     @property
     def suboptimality(self) -> float:
@@ -59,23 +51,14 @@ class Shift:
 
 @dataclass(frozen=True, eq=False)
 class ShiftStep:
-    """The step in coordinates z, x = T z, in which Gamma_up T has orthonormal columns, with its rows compressed.
+    """The step in coordinates z, x = T z, in which Gamma_up T has orthonormal columns, with its rows compressed."""
 
-    Attributes:
-        top: (2 n, n) compressed Gamma_up T.
-        low: (2 n, n) compressed Gamma_dn T.
-        free: (n, n) least-squares solution in z.
-        basis: (n, n) T.
-        change: (n, n) T^-1, the weight on the right that gives residuals in the original coordinates.
-        size: norm of Gamma_dn.
-    """
-
-    top: Array
-    low: Array
-    free: Array
-    basis: Array
-    change: Array
-    size: float
+    top: Array  # (2 n, n) compressed Gamma_up T
+    low: Array  # (2 n, n) compressed Gamma_dn T
+    free: Array  # (n, n) least-squares solution in z
+    basis: Array  # (n, n) T
+    change: Array  # (n, n) T^-1, the weight on the right that gives residuals in the original coordinates
+    size: float  # norm of Gamma_dn
 
     @classmethod
     def of(cls, up: Array, down: Array, free: Array) -> "ShiftStep":
@@ -100,10 +83,9 @@ class ShiftStep:
         return self.basis @ a @ self.change
 
 
+# the programmes of the step: (step, rules) -> fit in P and Q = A P, its residual weighted by P, or, given (P, A)
+# besides, in A alone from that A, its residual unweighted; (step, A, rules) -> the largest margin of P
 Programmes = tuple[Callable[..., Program], Callable[..., Program]]
-"""The programmes of the step: (step, rules) -> fit in P and Q = A P, its residual weighted by P, or, given (P, A)
-besides, in A alone from that A, its residual unweighted; (step, A, rules) -> the largest margin of P."""
-
 Shifting = Generator[Program, Solution, Shift]
 
 
