@@ -40,7 +40,7 @@ from optid.errors import StructureError
 from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.refinement import NO_BOUND
-from optid.identify.prediction_error.state_errors import WILD, StateErrors
+from optid.identify.prediction_error.state_errors import WILD, StateErrors, weight_root
 from optid.identify.prediction_error.state_uncertainty import CompressedStates
 from optid.identify.subspace.plan import Plan
 from optid.models import HammersteinSS
@@ -250,9 +250,8 @@ class StateShooting(StateSpaceFit):
         blocks = []
         for pattern in np.unique(here[here.any(axis=1)], axis=0):
             there = np.flatnonzero(pattern)
-            root = np.linalg.cholesky(np.linalg.inv(covariance[np.ix_(there, there)])).T
             picked = sp.eye_array(len(here)).tocsr()[np.flatnonzero((here == pattern).all(axis=1))]
-            blocks.append(sp.kron(root @ np.eye(len(pattern))[there], picked))
+            blocks.append(sp.kron(weight_root(covariance, ~pattern)[there], picked))
         return sp.csr_array(sp.vstack(blocks))
 
     def _measured(self, i: int) -> Array:

@@ -18,13 +18,13 @@ from formulations.state_space import ss as linear
 from optid.bases import BSpline, Linear, Polynomial, Triangular, UserFunctions
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
+from optid.identify.prediction_error import state_errors
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_search import entered
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.kalman import kalman_gain
-from optid.statistics import state_sensitivities
 from optid.statistics.expansion import expand
-from optid.statistics.state_sensitivities import StatePredictor
+from optid.statistics.linearised import linearised
 from optid.statistics.state_unknowns import Latent, StateUnknowns, beyond_affine
 
 
@@ -87,7 +87,7 @@ def test_sensitivities_equal_finite_differences(criterion, missing, basis, laten
 def test_chunks_agree(monkeypatch):
     criterion, x = problem("prediction", 0.1, True)
     found = [criterion.linearise(x)]
-    monkeypatch.setattr(state_sensitivities, "NUMBERS", 0)  # the shortest chunks
+    monkeypatch.setattr(state_errors, "NUMBERS", 0)  # the shortest chunks
     found.append(criterion.linearise(x))
     grams = [one.whole[0].T @ one.whole[0] for one in found]
     assert grams[0] == pytest.approx(grams[1], rel=1e-9, abs=1e-9 * np.abs(grams[0]).max())
@@ -100,7 +100,7 @@ def test_directions_of_the_gauge_change_nothing(word, latent):
     rows = criterion.gauge_rows(x)
     assert len(rows) == 9 + 2 + bool(latent)  # n^2 changes of states, scales of functions
     assert rows @ rows.T == pytest.approx(np.eye(len(rows)), abs=1e-10)
-    plain = StatePredictor(criterion.data, criterion.unknowns, criterion.at, criterion.weight).compress(x)
+    plain = linearised(criterion.blocks(x), 2, 3, criterion.unknowns.shared)
     assert np.abs(plain.root @ rows.T).max() < 1e-5 * np.abs(plain.root).max()
 
 

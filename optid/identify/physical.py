@@ -75,8 +75,7 @@ class PhysicalErrors(Criterion):
     def of(cls, data: Data, equations: Equations) -> "PhysicalErrors":
         """Prepare a record; states and parameters are measured by their starts.
 
-        Raises:
-            StructureError: names of the equations that are also those of channels, or equations that cannot be read.
+        Equations that cannot be read, or that have names of channels, raise a `StructureError`.
         """
         raw = data.raw()
         for name in {*equations.states, *equations.parameters} & {*raw.inputs, *raw.outputs}:
@@ -270,8 +269,7 @@ class PhysicalErrors(Criterion):
     def course(self, i: int) -> Array:
         """Return states (N, n) of an experiment to start from: measured, simulated, or as given, within their bounds.
 
-        Raises:
-            StructureError: an equation that has no value there, such as the root of a negative number.
+        An equation that has no value there, such as the root of a negative number, raises a `StructureError`.
         """
         e, states = self.data.experiments[i], self.equations.states
         given = np.array(list(states.values()), dtype=float)
@@ -328,11 +326,7 @@ class CompressedPhysical(CompressedStates):
             object.__setattr__(self, name, value)
 
     def settle(self, program: Program) -> None:
-        """Linearise the errors where the variables of the programme stand.
-
-        Raises:
-            RankError: parameters that the record, with the constraints that bind, does not determine.
-        """
+        """Linearise the errors where the variables of the programme stand; refuse what is left open (`RankError`)."""
         super().settle(program)
         equal, above, slack = constraint_rows(program, tuple(self.places.names))
         self._refuse_undetermined(np.vstack([equal, above[slack <= BINDING * (1 + np.abs(slack).max(initial=0.0))]]))

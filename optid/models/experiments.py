@@ -61,9 +61,7 @@ def check_inputs(model: Any, u: Array, label: str) -> None:
 def state_like(x0: Any, shape: tuple[int, ...]) -> Array:
     """Read an initial state given by the user; with a last dimension of one that may be left out.
 
-    Raises:
-        StructureError: another shape.
-        DataError: a value that is not finite.
+    Another shape (`StructureError`) or a value that is not finite (`DataError`) is refused.
     """
     state = np.atleast_1d(np.asarray(x0, dtype=float))
     if shape[1:] == (1,) and state.ndim == 1:

@@ -11,8 +11,7 @@ GAUGES = ("norm", "gain", "b0", "none")
 def gauge_factor(gauge: str, a: Array, b: Array, channel: str) -> float:
     """Return the factor by which B (nb,) or (nb, l) is divided, and f multiplied, for "norm", "gain" or "b0".
 
-    Raises:
-        StructureError: the quantity that the gauge sets to one is zero.
+    A gauge that sets a quantity to one which is zero is refused (`StructureError`).
     """
     size = float(np.linalg.norm(b))
     if size == 0:

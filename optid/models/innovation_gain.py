@@ -27,9 +27,9 @@ NO_FUNCTIONS = tabulated(())
 
 def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequence[Array] | None = None,
             arrived: float = ARRIVED) -> tuple[Array, Array]:
-    """Minimise the determinant of the covariance of the innovations by Levenberg-Marquardt steps.
+    """Return the gain (n, l) that minimises the determinant of the covariance (l, l) of its innovations, and this one.
 
-    A step that makes the predictor unstable is replaced by the stable gain of the same spectrum.
+    A step (Levenberg-Marquardt) that makes the predictor unstable is replaced by the stable gain of the same spectrum.
 
     Args:
         A: (n, n).
@@ -38,9 +38,6 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequen
         rest: (N, l) what the known signals leave of the outputs, one array per experiment; NaN = missing.
         part: of rest, whose mean information about the gain serves at every step, near an optimum.
         arrived: gain of the log-likelihood still to be expected at which the search ends.
-
-    Returns:
-        The gain and the covariance (l, l) of its innovations.
     """
     errors = whitened(A, C, gain, rest)
     best, damping, before = covariance_of(errors), 1e-4, 0.0

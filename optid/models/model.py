@@ -325,6 +325,24 @@ class Model(Ports):
         return files.write(self.to_dict(), path, files.FORMAT, files.VERSION)
 
 
+def impulse_response(A: Array, B: Array, C: Array, D: Array, n: int) -> Array:
+    """Return D, C B, C A B, ..., (n, l, r)."""
+    response, x = np.zeros((n, len(C), B.shape[1])), B
+    response[:1] = D
+    with np.errstate(all="ignore"):
+        for k in range(1, n):
+            response[k] = C @ x
+            x = A @ x
+    return response
+
+
+def frequency_response(A: Array, B: Array, C: Array, D: Array, w: ArrayLike, dt: float) -> Array:
+    """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
+    z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * dt)
+    resolvent = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, B.astype(complex))
+    return np.asarray(C @ resolvent + D)
+
+
 def static_solution(matrix: Array, right: Array) -> Array:
     """Solve the equations of a steady state; refuse those of an integrator, which are singular (`StructureError`)."""
     if matrix.size and np.linalg.svd(matrix, compute_uv=False)[-1] <= 1e-12 * (1 + np.abs(matrix).max()):

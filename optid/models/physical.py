@@ -1,7 +1,7 @@
 """Models from a user's own state equations: parameters with names, and the equations as one CasADi function."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Any, ClassVar, Self
 
@@ -13,8 +13,8 @@ from scipy.optimize import least_squares, root
 
 from optid.arrays import Array, finite
 from optid.errors import DataError, StructureError
-from optid.models.experiments import Record, check_inputs
-from optid.models.model import Model, static_solution
+from optid.models.experiments import Record, check_inputs, signal_units
+from optid.models.model import Model, frequency_response, impulse_response, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_simulation import allowed_range
 
@@ -68,10 +68,11 @@ class PhysicalModel(Model):
 
     def __post_init__(self) -> None:
         names = {name: tuple(getattr(self, name)) for name in ("text", "states")}
+        bounds = tuple((-np.inf if low is None else float(low), np.inf if high is None else float(high))
+                       for low, high in self.bounds)
         given = {"nonlinearities": (), "start": finite(self.start, "start"), "point": finite(self.point, "point"),
-                 "parameters": {name: float(value) for name, value in self.parameters.items()},
-                 "bounds": tuple((_number(low, -np.inf), _number(high, np.inf)) for low, high in self.bounds), **names}
-        self._fix(given, len(self.inputs), len(self.outputs))
+                 "parameters": {name: float(value) for name, value in self.parameters.items()}, "bounds": bounds}
+        self._fix({**given, **names}, len(self.inputs), len(self.outputs))
 
     @property
     def title(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -123,18 +124,11 @@ class PhysicalModel(Model):
 
     def impulse_response(self, n: int = 100) -> Array:
         """Return the impulse response (n, l, m) of the linear part about `point`."""
-        a, b, c, d = self.matrices
-        found = [d]
-        for _ in range(n - 1):
-            found.append(c @ b)
-            b = a @ b
-        return np.array(found)
+        return impulse_response(*self.matrices, n)
 
     def frequency_response(self, w: ArrayLike) -> Any:
         """Return that of the linear part about `point` at w (radians per unit of time), complex (len(w), l, m)."""
-        a, b, c, d = self.matrices
-        z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)
-        return c @ np.linalg.solve(z[:, None, None] * np.eye(self.nx) - a, b.astype(complex)) + d
+        return frequency_response(*self.matrices, w, self.dt)
 
     def _static_gain(self, u0: Array) -> Array:
         a, b, c, d = self._linear(self.rest(u0), u0)
@@ -192,7 +186,7 @@ class PhysicalModel(Model):
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
         check_inputs(self, u, label)
-        there, scale = np.isfinite(y), np.where(np.nanstd(y, axis=0) > 0, np.nanstd(y, axis=0), 1.0)
+        there, scale = np.isfinite(y), signal_units(y)
         low, high = np.array(self.bounds).T
 
         def errors(x: Array) -> Array:
@@ -222,19 +216,8 @@ class PhysicalModel(Model):
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""
-        return {**super().to_dict(), "parameters": dict(self.parameters), 
+        return {**super().to_dict(), "parameters": dict(self.parameters),
                 "bounds": [[end if np.isfinite(end) else None for end in pair] for pair in self.bounds]}
-
-    def with_parameters(self, **values: float) -> Self:
-        """Return the model with other values of some parameters; unknown names raise a `StructureError`."""
-        if unknown := values.keys() - self.parameters.keys():
-            raise StructureError(f"no parameter {min(unknown)!r}; there are {', '.join(self.parameters)}")
-        return replace(self, parameters={**self.parameters, **values})
-
-
-
-def _number(value: float | None, open_end: float) -> float:
-    return open_end if value is None else float(value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,9 +248,7 @@ class Runs:
     def slopes(self) -> Any:
         """The function (x, u, p) -> (dright/dx, dright/du, dy/dx, dy/du)."""
         x, u, p = (ca.SX.sym(name, self.right.size1_in(i)) for i, name in enumerate("xup"))
-        right, y = self.right(x, u, p)
-        return ca.Function("slopes", [x, u, p], [ca.jacobian(right, x), ca.jacobian(right, u), ca.jacobian(y, x),
-                                                 ca.jacobian(y, u)])
+        return ca.Function("slopes", [x, u, p], [ca.jacobian(one, by) for one in self.right(x, u, p) for by in (x, u)])
 
     def still(self, x: Array, u: Array, p: Array) -> Array:
         """Return what vanishes at rest."""
@@ -278,12 +259,13 @@ class Runs:
     def step(self) -> Any:
         """The function (x, [u now, u next], p) -> (state after a sampling time, y now)."""
         x, both, p = self._symbols()
-        y, state = self.right(x, both[: self._m], p)[1], x
-        if not self.steps:
-            return ca.Function("step", [x, both, p], [self.right(x, both[: self._m], p)[0], y])
-        one = self._trapezoid
-        for i in range(self.steps):
-            state = one(state, ca.vertcat(state, self._inputs(both, i), self._inputs(both, i + 1), p))
+        m = both.numel() // 2
+        now, after, (state, y) = both[:m], both[m:], self.right(x, both[:m], p)
+        if self.steps:
+            ends = [now + (self.hold == "first") * (i / self.steps) * (after - now) for i in range(self.steps + 1)]
+            state = x
+            for first, last in zip(ends, ends[1:]):
+                state = self._trapezoid(state, ca.vertcat(state, first, last, p))
         return ca.Function("step", [x, both, p], [state, y])
 
     @cached_property
@@ -299,19 +281,9 @@ class Runs:
         z = ca.MX.sym("z", n * (1 + n + q))
         return ca.Function("sensitive", [z, both, p], list(inner(z[:n], ca.reshape(z[n:], n, n + q), both, p)))
 
-    @property
-    def _m(self) -> int:
-        return self.right.size1_in(1)
-
-    def _symbols(self) -> tuple[Any, Any, Any]:
-        sizes = self.right.size1_in(0), 2 * self._m, self.right.size1_in(2)
-        x, both, p = (ca.MX.sym(name, size) for name, size in zip("xup", sizes))
-        return x, both, p
-
-    def _inputs(self, both: Any, i: int) -> Any:
-        """Inputs at the i-th part of a sampling time."""
-        now, after = both[: self._m], both[self._m :]
-        return now if self.hold == "zero" else now + (i / self.steps) * (after - now)
+    def _symbols(self) -> list[Any]:
+        """Return symbols of x, [u now, u next] and p."""
+        return [ca.MX.sym(name, (1 + (name == "u")) * self.right.size1_in(i)) for i, name in enumerate("xup")]
 
     @cached_property
     def _trapezoid(self) -> Any:

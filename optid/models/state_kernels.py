@@ -84,17 +84,9 @@ def slopes(tables, first, z, found):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def march(parts, stretch, x, outputs, states):
-    """Run over a stretch and leave the state behind.
+    """Run a model (`Parts`) over a `Stretch` and return how and at which sample the run ended.
 
-    Args:
-        parts: the model, a `Parts`.
-        stretch: what drives it over T samples, a `Stretch`.
-        x: (n,) state, changed in place.
-        outputs: (T, l) written.
-        states: (T, n) state before every sample, written; (0, n) for none.
-
-    Returns:
-        how the run ended and the sample at which it did.
+    Written are the state x (n,) after it, the outputs (T, l), and the states (T, n) before every sample; (0, n): none.
     """
     # fields of tuples are taken out of them once: reading one in a loop counts references every time
     A, C, E, L, K, output_of = parts.A, parts.C, parts.E, parts.L, parts.K, parts.output_of
@@ -174,19 +166,15 @@ def combine(weights, rows, into):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def sensitivities(parts, direct, signals, turn, jacobian):
-    """Carry the derivative S of the state along a run of T samples and leave it behind.
+    """Carry the derivative S of the state along a run (`Signals`) of a model (`Parts`), and leave it behind.
 
     With H(k) = dh(z)/dtheta = h' Cz S + (what theta changes in h(z) directly), and
     J(k) = dy/dtheta = C S + Fz H + (what theta changes in y directly),
 
         S(k+1) = A S + Ez H + (what theta changes in x(k+1) directly) + R J   where R is what comes back of the output.
 
-    Args:
-        parts: the model, a `Parts`.
-        direct: what theta changes directly, a `Direct`; the initial state has the first n columns.
-        signals: the run, a `Signals`.
-        turn: (n, q) derivative S of the state, changed in place.
-        jacobian: (T, l, q) written.
+    The direct changes are a `Direct`; the initial state has the first n columns. Written are ``turn`` S (n, q) and the
+    ``jacobian`` J (T, l, q).
     """
     n, l, q, latent = parts.A.shape[0], parts.C.shape[0], turn.shape[1], parts.Ez.shape[1]  # noqa: E741
     returned, bent, values = signals

@@ -22,7 +22,6 @@ FORGOTTEN = 1e-12
 STEPS = 50
 SETTLED = 1e-20  # a step that promises less than this share of the squared error is the last one
 DIGITS = 1e-15  # of the outputs; a step that promises less than their square is the last one, too
-
 ROUNDING = 1e-14
 SIMULATORS = ("predict", "measured_feedback", "free")
 
@@ -41,18 +40,10 @@ class Run(NamedTuple):
 
 
 def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limits: Any, label: str) -> Run:
-    """Return what a simulator runs over.
+    """Return what a simulator, "predict" (P1), "measured_feedback" (P2) or "free" (P3), runs over.
 
-    Args:
-        model: the model.
-        simulator: "predict" (P1), "measured_feedback" (P2) or "free" (P3).
-        u: (N, m) inputs.
-        y: (N, l) outputs; None for P3 only.
-        limits: (low, high), each (l,), from `allowed_range`, or None for the range of numbers.
-        label: words that name the experiment in a message.
-
-    Raises:
-        DataError: a missing input.
+    Outputs y (N, l) may be None for P3 only, the limits (low, high), each (l,), from `allowed_range`, None for the
+    range of numbers. A missing input is refused (`DataError`).
     """
     check_inputs(model, u, label)
     none = np.zeros_like(model.K)
@@ -64,13 +55,10 @@ def prepared(model: StateSpace, simulator: str, u: Array, y: Array | None, limit
 
 
 def run(job: Run, x0: Array, horizon: int = 1) -> Array:
-    """Compute the outputs (N, l) from the initial state (n,).
+    """Compute the outputs (N, l) from the initial state (n,); refuse one that leaves the range allowed (`DataError`).
 
     With a horizon the model runs freely for `horizon` - 1 samples from the state before every sample; the first
     `horizon` - 1 outputs are NaN.
-
-    Raises:
-        DataError: an output that leaves the range allowed, named by channel and sample.
     """
     model, outputs = job.model, np.full((len(job.u), job.model.l), np.nan)
     x = np.array(x0, dtype=float)
@@ -106,19 +94,12 @@ def visited(job: Run, x0: Array) -> Array:
 
 
 def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
-    """Estimate the initial state (n,) by least squares of the outputs of a simulator on the measured ones.
+    """Estimate the initial state (n,) by least squares of the outputs of a simulator on the measured ones y (N, l).
 
     The errors of each output count in units of its standard deviation. P1 and P2 are linear in the state (where an
-    output is missing, its feedback is not), a free run with feedback is not: Gauss-Newton steps, halved until the
-    error falls. Directions that the record does not determine are left as they are.
-
-    Args:
-        job: the run.
-        y: (N, l) measured outputs, NaN = missing.
-        x0: (n,) where to start; zero by default.
-
-    Raises:
-        DataError: the run leaves the range allowed from every start tried.
+    output is missing, its feedback is not), a free run with feedback is not: Gauss-Newton steps from x0 (zero by
+    default), halved until the error falls. Directions that the record does not determine are left as they are. A run
+    that leaves the range allowed from every start tried is refused (`DataError`).
     """
     n = job.model.nx
     x = np.zeros(n) if x0 is None else np.array(x0, dtype=float)
@@ -240,10 +221,9 @@ def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signal
 
 
 def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, states: Array) -> None:
-    """Run over a stretch that begins at sample `first`; see `optid.models.state_kernels.march`.
+    """Run over a stretch that begins at sample `first`, as `optid.models.state_kernels.march`.
 
-    Raises:
-        DataError: an output that leaves the range allowed, or the interval of a basis that refuses.
+    An output that leaves the range allowed, or the interval of a basis that refuses, is refused (`DataError`).
     """
     from optid.models.state_kernels import LEFT, REFUSED
     from optid.models.state_kernels import march as run_over

@@ -17,7 +17,7 @@ from optid.models import roots
 from optid.models.feedback_tables import tabulated
 from optid.models.gauges import leading_sign
 from optid.models.kalman import NoiseCovariances
-from optid.models.model import Model, static_solution
+from optid.models.model import Model, frequency_response, impulse_response, static_solution
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_signals import Parts
 
@@ -179,24 +179,11 @@ class StateSpace(Model):
 
     def impulse_response(self, n: int = 100) -> Array:
         """Return the response of (A, B, C, D) to a unit impulse of every f, (n, l, r), in the gauge of the model."""
-        response = self._markov(self.B, n)
-        response[:1] = self.D
-        return response
-
-    def _markov(self, columns: Array, n: int) -> Array:
-        """Return 0, C B, C A B, ... for columns (n_x, r) of B, (n, l, r)."""
-        response, x = np.zeros((n, self.l, columns.shape[1])), columns
-        with np.errstate(all="ignore"):
-            for k in range(1, n):
-                response[k] = self.C @ x
-                x = self.A @ x
-        return response
+        return impulse_response(self.A, self.B, self.C, self.D, n)
 
     def frequency_response(self, w: ArrayLike) -> Array:
         """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
-        z = np.exp(1j * np.atleast_1d(np.asarray(w, dtype=float)) * self.dt)
-        resolvent = np.linalg.solve(z[:, None, None] * np.eye(self.nx) - self.A, self.B.astype(complex))
-        return np.asarray(self.C @ resolvent + self.D)
+        return frequency_response(self.A, self.B, self.C, self.D, w, self.dt)
 
     def equilibrium(self, u0: ArrayLike) -> tuple[Array, Array]:
         """Return a state (n,) and outputs (l,) at which the model rests under constant inputs u0 (m,).
@@ -306,7 +293,8 @@ class StateSpace(Model):
         back = np.ones(self.E.shape[1])
         if gauge != "none":
             back = np.linalg.norm(self.E, axis=0)
-            back = back * _signs(self._markov(self.E, self.nx + 1)) if signs else back
+            response = impulse_response(self.A, self.E, self.C, np.zeros((self.l, back.size)), self.nx + 1)
+            back = back * _signs(response) if signs else back
         scales, back = np.where(scales == 0, 1.0, scales), np.where(back == 0, 1.0, back)
         return replace(
             self, B=self.B / scales, D=self.D / scales, E=self.E / back, gauge=gauge,

@@ -103,15 +103,9 @@ class Block:
 
 
 def stretches(chunks: Iterable[Sequence[Array]], reach: int, size: int) -> Iterator[list[Array]]:
-    """Cut chunks of parallel arrays into stretches of `size` samples, each with the `reach` samples before it.
+    """Cut chunks of parallel arrays, in time order, into stretches of `size` samples and the `reach` before them.
 
-    Args:
-        chunks: arrays with the same first axis, in time order, of any length.
-        reach: samples carried over from one stretch to the next.
-        size: new samples of each stretch; the last one has fewer.
-
-    Yields:
-        Arrays of at most reach + size samples; nothing when there are no more than `reach` in all.
+    The last one has fewer; there is none when there are no more than `reach` samples in all.
     """
     carried: list[Array] | None = None
     for chunk in chunks:
@@ -126,12 +120,9 @@ def stretches(chunks: Iterable[Sequence[Array]], reach: int, size: int) -> Itera
 
 
 def rows_present(missing: Sequence[NDArray[np.bool_]], lags: Sequence[range], reach: int) -> NDArray[np.bool_]:
-    """Mark the rows (R,) in which every sample is present.
+    """Mark the rows (R,), from sample `reach` on, in which every sample of all groups is present.
 
-    Args:
-        missing: (reach + R,) marks of missing samples, one array per group.
-        lags: lags of every group.
-        reach: largest lag; the first row is that of sample `reach`.
+    Every group has its marks of missing samples (reach + R,) and its lags; `reach` is the largest lag.
     """
     count = len(missing[0]) - reach
     present = np.ones(count, dtype=bool)
@@ -176,8 +167,7 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
 def cut(chunks: Iterable[Sequence[Array]], record: str, layout: Layout, chunk: int) -> Iterator[list[Array]]:
     """Cut chunks [u, y] or [u, y, weights] of one record into stretches that threads take one at a time.
 
-    Raises:
-        DataError: a sample outside a basis with outside="error".
+    A sample outside a basis with outside="error" is refused (`DataError`).
     """
     size = _block_size(layout, chunk)
     length = size * max(BLOCKS, layout.n_complete**2 // (4 * size))  # merging the sums must not cost much
@@ -222,11 +212,7 @@ def check_lengths(lengths: Sequence[int], layout: Layout) -> list[str]:
 
 
 def row_weights(weights: Any, count: int, name: str = "") -> Array:
-    """Return the weights of rows as (count,), from one number or one per sample.
-
-    Raises:
-        DataError: wrong shape, or a weight that is negative or not finite.
-    """
+    """Return the weights of rows as (count,), from one number or one per sample; refuse others (`DataError`)."""
     given = np.asarray(weights, dtype=float)
     if given.shape not in ((), (count,)):
         raise DataError(f"{name}weights have shape {given.shape}: one number, or one for each of the {count} samples.")

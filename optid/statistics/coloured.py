@@ -12,14 +12,9 @@ LONGEST = 4096  # samples of such a response at most
 
 
 def long_autoregression(errors: Sequence[Array], lags: int) -> tuple[Array, Array]:
-    """Fit e(k) = A_1 e(k-1) + ... + A_lags e(k-lags) + w(k) by least squares over complete runs.
+    """Fit e(k) = A_1 e(k-1) + ... + A_lags e(k-lags) + w(k), (N, l) per experiment, over complete runs.
 
-    Args:
-        errors: (N, l), one array per experiment; NaN = missing.
-        lags: their number.
-
-    Returns:
-        A (lags, l, l), and the triangular root (l, l) of the sum of squares of w divided by the rows.
+    Return A (lags, l, l) by least squares, and the triangular root (l, l) of the sum of squares of w over the rows.
     """
     outputs = errors[0].shape[1]
     statistics = hankel_statistics([e for e in errors if len(e) > lags], lags + 1)
@@ -41,14 +36,10 @@ def response_of(autoregression: Array, length: int = LONGEST, *, fade: bool = Tr
 
 
 def scattered(blocks: Iterable[tuple[Array, int]], response: Array, root: Array) -> Array:
-    """Return the covariance (q, q) of sum_k J(k)' e(k), e(k) = sum_i response_i w(k-i).
+    """Return the covariance (q, q) of sum_k J(k)' e(k), e(k) = sum_i H_i w(k-i), of w with the covariance root' root.
 
-    With H the response, the sum is that of G(k)' w(k), G(k) = sum_i H_i' J(k+i): rows are filtered against time.
-
-    Args:
-        blocks: rows [J | error] (T l, q + 1) of T samples in order, as for `optid.statistics.linearised.linearised`.
-        response: (M + 1, l, l) of e to w.
-        root: (l, l) triangular root of the covariance root' root of w.
+    With the response H (M + 1, l, l) the sum is that of G(k)' w(k), G(k) = sum_i H_i' J(k+i): the rows [J | error]
+    (T l, q + 1) of blocks in order, as for `optid.statistics.linearised.linearised`, are filtered against time.
     """
     ahead, outputs = len(response) - 1, len(root)
     held: Array | None = None

@@ -6,8 +6,7 @@ from an output injection (A - LC, B - LD), and a function nearly linear in y wou
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,51 +60,25 @@ class Expansion:
     output_names: tuple[str, ...]  # names of the l outputs
     simulated: bool = False  # whether simulated outputs follow the measured ones
 
-    @property
-    def m(self) -> int:
-        """Number of inputs."""
-        return len(self.input_names)
+    m: int = field(init=False)  # number of inputs
+    l: int = field(init=False)  # noqa: E741 - number of outputs, the field's letter
+    input_sizes: tuple[int, ...] = field(init=False)  # number of functions of every input
+    p: int = field(init=False)  # number of functions of all inputs
+    q: int = field(init=False)  # number of coordinates of all feedback functions
+    eta: range = field(init=False)  # positions of the input functions among the signals
+    zeta: range = field(init=False)  # those of the feedback functions of the measured outputs
+    y: range = field(init=False)  # those of the outputs
+    zeta_simulated: range = field(init=False)  # those of the feedback functions of the simulated outputs
 
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.output_names)
-
-    @cached_property
-    def input_sizes(self) -> tuple[int, ...]:
-        """Number of functions of every input."""
-        return tuple(basis.size for basis in self.inputs)
-
-    @property
-    def p(self) -> int:
-        """Number of functions of all inputs."""
-        return sum(self.input_sizes)
-
-    @property
-    def q(self) -> int:
-        """Number of coordinates of all feedback functions."""
-        return sum(family.size for family in self.feedback)
-
-    @property
-    def eta(self) -> range:
-        """Positions of the input functions among the signals."""
-        return range(self.p)
-
-    @property
-    def zeta(self) -> range:
-        """Positions of the feedback functions of the measured outputs."""
-        return range(self.p, self.p + self.q)
-
-    @property
-    def y(self) -> range:
-        """Positions of the outputs."""
-        return range(self.p + self.q, self.p + self.q + self.l)
-
-    @property
-    def zeta_simulated(self) -> range:
-        """Positions of the feedback functions of the simulated outputs."""
-        start = self.p + self.q + self.l
-        return range(start, start + self.q * self.simulated)
+    def __post_init__(self) -> None:
+        sizes = tuple(basis.size for basis in self.inputs)
+        p, q, l = sum(sizes), sum(family.size for family in self.feedback), len(self.output_names)  # noqa: E741
+        end = p + q + l
+        found = {"m": len(self.input_names), "l": l, "input_sizes": sizes, "p": p, "q": q, "eta": range(p),
+                 "zeta": range(p, p + q), "y": range(p + q, end),
+                 "zeta_simulated": range(end, end + q * self.simulated)}
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,15 +104,11 @@ class Expansion:
                   ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
         """Return the positions of instruments, regressors and outputs among the first 2 alpha samples of the windows.
 
-        The last block row of the feedback functions never reaches the future outputs and is left out.
-
-        Args:
-            at: `optid.statistics.hankel.HankelStatistics.at` of windows of 2 alpha samples or more.
-            instruments: "past" (inputs, feedback functions and outputs of the past), "inputs" (past and future inputs),
-                "inputs+past", "simulated" (past and future inputs and functions of simulated outputs),
-                "simulated+past".
-            alpha: block rows of the past and of the future.
-            offset: whether a constant is among instruments and regressors.
+        Past and future have alpha block rows each; the last one of the feedback functions never reaches the future
+        outputs and is left out. ``at`` is that of `optid.statistics.hankel.HankelStatistics`. Instruments are "past"
+        (inputs, feedback functions and outputs of the past), "inputs" (past and future inputs), "inputs+past",
+        "simulated" (past and future inputs and functions of simulated outputs) or "simulated+past", and with an offset
+        a constant.
         """
         past, future, both = range(alpha), range(alpha, 2 * alpha), range(2 * alpha)
         one = np.zeros(int(offset), dtype=np.intp)
@@ -153,14 +122,10 @@ class Expansion:
 
     def block_rows(self, records: Sequence[Array], nx: int | None, *, spans: int = 2, per_row: float = 2.0,
                    least: int | None = None) -> int:
-        """Return block rows that a record can carry: 10, or twice the order, or fewer on a short record.
+        """Return block rows that a record can carry: 10, or twice the order (None: not known), or fewer.
 
-        Args:
-            records: raw channels, one per experiment.
-            nx: the order, or None where it is to be found.
-            spans: block rows of a window, in multiples of those of the future.
-            per_row: windows that are wanted per row of the Hankel matrix.
-            least: block rows at least; None for one more than the order.
+        A window has ``spans`` times as many; ``per_row`` windows are wanted per row of the Hankel matrix. There are at
+        least ``least`` block rows, one more than the order by default.
         """
         width, count = self.p + 2 * self.q + self.l, sum(len(record) for record in records)
         affordable = int(count / (spans * (len(records) + per_row * width)))  # windows = count - experiments (rows - 1)
@@ -168,11 +133,7 @@ class Expansion:
         return max(1 + (nx or 1) if least is None else least, min(max(10, 2 * (nx or 0)), affordable, shortest))
 
     def injection(self, e: Array) -> tuple[Array, Array]:
-        """Return L (n, l) and the constant (n,) that ``E zeta_r`` adds to the state equation beside ``E V^T zeta(y)``.
-
-        Args:
-            e: (n, q) E, families side by side.
-        """
+        """Return L (n, l) and the constant (n,) that E (n, q) adds to the state equation beside ``E V^T zeta(y)``."""
         slopes = np.concatenate([np.zeros((0, self.l)), *(family.slope for family in self.feedback)])
         intercepts = np.concatenate([np.zeros(0), *(family.intercept for family in self.feedback)])
         return -e @ slopes, -e @ intercepts
@@ -187,12 +148,7 @@ class Expansion:
 
 
 def expand(data: Data, basis: Bases, feedback_basis: FeedbackBases = None) -> Expansion:
-    """Fit the bases to a record and return its expansion.
-
-    Args:
-        data: the record; NaN = missing.
-        basis: of the inputs.
-        feedback_basis: of the outputs.
+    """Fit the bases of inputs and outputs to a record and return its expansion.
 
     Raises:
         StructureError: a wrong number of bases, or an entry that is not a basis.
@@ -243,12 +199,7 @@ def _family(basis: Basis) -> str:
 
 
 def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Sequence[str]) -> None:
-    """Refuse constant outputs, and channels that are sums of multiples of others.
-
-    Args:
-        records: (N, m + l) arrays [u | y], one per experiment; NaN = missing.
-        inputs: m names.
-        outputs: l names.
+    """Refuse channels of records [u | y], (N, m + l), that are constant or sums of multiples of others.
 
     Raises:
         DataError: an output that never changes.

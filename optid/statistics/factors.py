@@ -16,25 +16,16 @@ def _nonnegative_diagonal(root: Array) -> Array:
 
 
 def add_to_root(root: Array, rows: Array) -> Array:
-    """Return the upper triangular R, diagonal >= 0, with R^T R = root^T root + rows^T rows.
-
-    Args:
-        root: (n, n) upper triangular.
-        rows: (K, n).
-    """
+    """Return the upper triangular R (n, n), diagonal >= 0, with R^T R = root^T root + rows^T rows, for rows (K, n)."""
     return _nonnegative_diagonal(np.asarray(np.linalg.qr(np.concatenate([root, rows]), mode="r")))
 
 
 def root_of_gram(gram: Array, n: int) -> Array:
-    """Return an upper triangular R, diagonal >= 0, with R^T R = gram.
+    """Return an upper triangular R, diagonal >= 0, with R^T R = gram (n + l, n + l), positive semidefinite.
 
     The first n columns are scaled to norm one before they are factorised (Cholesky). From the first column on that
     depends on those before it, rows of R are zero. What remains of the last columns may be singular, as for data
     without noise.
-
-    Args:
-        gram: (n + l, n + l) symmetric, positive semidefinite up to rounding.
-        n: number of regressor columns.
     """
     from scipy.linalg import solve_triangular
     from scipy.linalg.lapack import dpotrf  # pyright: ignore[reportAttributeAccessIssue]

@@ -102,11 +102,7 @@ class HankelStatistics:
         return np.sqrt(np.maximum(energy, 1e-300))
 
     def check(self, per_row: float = 1.0) -> None:
-        """Refuse fewer windows than `per_row` times the rows of the Hankel matrix.
-
-        Raises:
-            RankError: with both numbers.
-        """
+        """Refuse fewer windows than `per_row` times the rows of the Hankel matrix (`RankError`)."""
         needed = int(np.ceil(per_row * self.rows * self.d)) + 1
         if self.windows < needed:
             lost = self.candidates - self.windows

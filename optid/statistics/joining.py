@@ -32,17 +32,10 @@ class Run:
 
 
 def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chunk: int, threads: int) -> Any:
-    """Return the sums over all parts of a stream, each added up where it is read.
+    """Return the sums over all parts of a `Stream`, each added up where it is read; ``start`` returns empty ones.
 
-    Args:
-        stream: a `Stream` in parts.
-        layout: the columns.
-        start: returns empty sums.
-        chunk: samples evaluated at a time.
-        threads: threads that read parts on this machine.
-
-    Raises:
-        RankError: an experiment shorter than the lags.
+    ``chunk`` samples are evaluated at a time by so many threads. An experiment shorter than the lags is refused
+    (`RankError`).
     """
     check_lengths(stream.lengths, layout)
     whole = _joined(start, [stream.reduced(partial(_run_of, layout, start, chunk), partial(_joined, start), threads)])

@@ -16,20 +16,12 @@ ONE = unsigned(1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def local_by_local(
-    first: Indices, weights: Array, other: Indices, others: Array, start: int, stop: int, lag: int, out: Array
-) -> None:
+def local_by_local(first: Indices, weights: Array, other: Indices, others: Array, start: int, stop: int, lag: int,
+                   out: Array) -> None:
     """Add sum_t g(t) h(t - lag - d)^T to out[:, d, :] for samples start <= t < stop of two local families g and h.
 
-    Args:
-        first: (T,) position of the first function of g.
-        weights: (T, s) values of g from there on.
-        other: (T,) the same of h.
-        others: (T, r) the same of h.
-        start: first sample; every t - lag - d must lie in the arrays.
-        stop: one after the last sample.
-        lag: smallest lag difference.
-        out: (functions of g, differences, functions of h).
+    A family has the position (T,) of its first function and its values (T, s) from there on; every t - lag - d must lie
+    in the arrays. out is (functions of g, differences, functions of h).
     """
     if weights.shape[1] == 2 and others.shape[1] == 2:  # hats: unrolled, more than twice as fast
         for t in range(unsigned(start), unsigned(stop)):
@@ -56,14 +48,9 @@ def local_by_local(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: Array) -> None:
-    """Add w(t) * flat[t * step : t * step + width] to the rows of out where the local family does not vanish.
+    """Add w(t) * flat[t * step : t * step + width] to the rows of out (functions, width) of a local family.
 
-    Args:
-        first: (T,) position of the first function.
-        weights: (T, s) values from there on.
-        flat: samples of the dense signals, one after the other; sample t meets the window that begins at t * step.
-        step: number of dense signals.
-        out: (functions, width).
+    The family is given as in `local_by_local`, flat as the samples of ``step`` dense signals, one after the other.
     """
     if weights.shape[1] == 2:
         for t in range(unsigned(first.size)):
@@ -83,14 +70,7 @@ def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> None:
-    """Add scale[k] * x_k x_k^T to the upper triangle of gram for sparse rows x_k.
-
-    Args:
-        columns: (K, z) increasing column numbers of each row.
-        values: (K, z) entries there.
-        scale: (K,) weights of the rows, of any sign.
-        gram: (n, n).
-    """
+    """Add scale[k] * x_k x_k^T to the upper triangle of gram (n, n), x_k sparse: increasing columns (K, z), values."""
     for k in range(unsigned(columns.shape[0])):
         for i in range(unsigned(columns.shape[1])):
             weight, row = scale[k] * values[k, i], unsigned(columns[k, i])

@@ -76,16 +76,11 @@ class Linearised:
 
 def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments: int, n: int, p: int,
                gauge: Array | None = None, method: Method = "auto") -> Linearised:
-    """Compress the errors of all experiments with their sensitivities.
+    """Compress the errors of all experiments with their sensitivities by n initial states and p shared unknowns.
 
-    Args:
-        blocks: number of an experiment -> rows [x0 | shared | errors], and the number of errors in each block; asked
-            for again where a QR decomposition is needed.
-        experiments: their number.
-        n: size of an initial state.
-        p: number of shared unknowns.
-        gauge: (rows, p) directions without effect, which are given weight; None for none.
-        method: see `Method`.
+    ``blocks`` yields the rows [x0 | shared | errors] of an experiment by its number, and how many errors each block
+    has; it is asked again where a QR decomposition is needed. The gauge (rows, p) holds directions without effect,
+    which are given weight.
     """
     use: Literal["gram", "qr"] = "qr" if method == "qr" else "gram"
     factors, rows = zip(*(compressed(blocks(i), n + p + 1, use, gauge, n) for i in range(experiments)))
@@ -101,17 +96,10 @@ def linearised(blocks: Callable[[int], Iterable[tuple[Array, int]]], experiments
 
 def compressed(blocks: Iterable[tuple[Array, int]], columns: int, method: str, gauge: Array | None = None,
                first: int = 0) -> tuple[Array, int]:
-    """Add up the blocks of an experiment; columns of a state that is forgotten may be missing on the left.
+    """Return a factor of the rows [x0 | shared | (measured) | errors] of an experiment, and the number of errors.
 
-    Args:
-        blocks: (rows, columns) and the number of errors in each.
-        columns: number of columns.
-        method: "gram" or "qr".
-        gauge: as in `linearised`; it takes part before the factorisation, which so is regular.
-        first: column of the first shared unknown.
-
-    Returns:
-        A factor of [x0 | shared | (measured) | errors], and the number of errors.
+    Columns of a state that is forgotten may be missing on the left. The gauge, as in `linearised`, takes part before
+    the factorisation by "gram" or "qr", which so is regular; column ``first`` is that of the first shared unknown.
     """
     def add(block: Array) -> None:
         used = slice(columns - block.shape[1], None)

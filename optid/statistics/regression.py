@@ -70,11 +70,7 @@ class Statistics:
 
     @cached_property
     def root(self) -> Array:
-        """Upper triangular R (n + l, n + l), diagonal >= 0, with R^T R = gram.
-
-        Raises:
-            RankError: a column of Phi depends on the columns before it; named.
-        """
+        """Upper triangular R (n + l, n + l), diagonal >= 0, R^T R = gram; dependent columns raise a `RankError`."""
         column = dependent_column(self._triangle, self.layout.n_columns, self.method)
         if column is not None:
             raise RankError(_explain_dependence(self.layout, self._triangle, column))
@@ -179,16 +175,9 @@ def factorise(data: "Data | Stream", layout: Layout, weights: Sequence[Array] | 
 
 
 def residuals(data: "Data", layout: Layout, theta: Array, chunk: int = CHUNK) -> list[Array]:
-    """Compute the one-step residuals Y - Phi theta without forming Phi.
+    """Compute the one-step residuals Y - Phi theta of coefficients (n_columns, l) without forming Phi.
 
-    Args:
-        data: the experiments.
-        layout: the columns of Phi.
-        theta: (n_columns, l) coefficients.
-        chunk: samples evaluated at a time.
-
-    Returns:
-        One array (N, l) per experiment, in output units; NaN where a sample of the row is missing or before the record.
+    Return one array (N, l) per experiment, NaN where a sample of the row is missing or before the record.
     """
     check_channels(data, layout)
     reach, found = layout.first_row, []

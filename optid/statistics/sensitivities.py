@@ -50,10 +50,8 @@ class TransferPredictor:
     def compress(self, point: TransferPoint, gauge: Array | None = None, method: Method = "auto") -> Linearised:
         """Predict over all experiments and compress the errors (predicted less measured) with their sensitivities.
 
-        Args:
-            point: where; C must be invertible, and A stable where D is not A.
-            gauge: (rows, p) directions of the shared unknowns that change no prediction (the scale between mu and b).
-            method: see `optid.statistics.linearised.Method`.
+        C must be invertible, and A stable where D is not A; gauge and method are as in
+        `optid.statistics.linearised.linearised`.
         """
         return linearised(partial(self.blocks, point), self.unknowns.experiments, self.unknowns.memory,
                           self.unknowns.shared, gauge, method)
@@ -91,10 +89,7 @@ class TransferPredictor:
         return lfilter([1.0], np.concatenate([[1.0], point.a]), total)
 
     def predict(self, point: TransferPoint, index: int, x: Array) -> Filtered:
-        """Run the predictor over one experiment, of which `simulate` returned x (N,).
-
-        The samples that its noise filter explains are y - x, or y where D is A.
-        """
+        """Run over one experiment of simulated x (N,) the noise filter, which explains y - x, or y where D is A."""
         y = self.data.experiments[index].y[:, 0]
         if self.unknowns.apart:
             return noise_filter.innovations(y - x, None, point.c, point.d)

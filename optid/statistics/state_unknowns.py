@@ -38,18 +38,15 @@ class Latent:
         return self.vectors.shape[1]
 
 
-def beyond_affine(basis: Basis, points: int = 64) -> Array:
+def beyond_affine(basis: Basis) -> Array:
     """Return orthonormal coordinates (P, r) of the functions of a basis that do not correlate with z.
 
     What is linear in z is carried by the matrices, constants by the offsets. The distribution of z is taken as uniform
     on the interval. Functions that go on straight beyond it meet its ends without curvature (natural splines) where
-    enough of them can: an end of few samples then bends no tail.
-
-    Raises:
-        StructureError: nothing is left.
+    enough of them can: an end of few samples then bends no tail. Where nothing is left a `StructureError` is raised.
     """
     low, high = basis.interval if basis.interval is not None else (-1.0, 1.0)
-    nodes, weights = np.polynomial.legendre.leggauss(points)
+    nodes, weights = np.polynomial.legendre.leggauss(64)
     family = _straight_at_ends(basis)
     values = basis.values((low + high) / 2 + (high - low) / 2 * nodes) @ family
     sizes, vectors = np.linalg.svd(((weights * nodes) @ values)[None])[1:]

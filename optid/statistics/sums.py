@@ -64,12 +64,7 @@ def _dense_products(g: Array, h: Array, count: int) -> Array:
 
 
 class Total:
-    """Running sums over blocks of one frame.
-
-    Attributes:
-        rows: rows used so far.
-        candidates: rows that would have been used, had no sample been missing.
-    """
+    """Running sums over blocks of one frame: rows used, and those that would have been, had no sample been missing."""
 
     rows = candidates = 0
 
@@ -85,11 +80,7 @@ class Total:
 
 
 class Factor(Total):
-    """Running triangular factor of the rows, by tall and skinny QR decomposition.
-
-    Attributes:
-        root: (n, n) upper triangular.
-    """
+    """Running triangular factor ``root`` (n, n) of the rows, by tall and skinny QR decomposition."""
 
     def __init__(self, n: int, contrast: Callable[[Array], Array] | None = None) -> None:
         """Start from no rows of length n; `contrast` makes them from complete ones."""

@@ -196,14 +196,9 @@ def best_of(criterion: Criterion, starts: Iterable[tuple[str, Array]], iteration
             enough: int | None = None) -> list[Descent]:
     """Descend from every start; the best comes first, those that end at the border of stability last.
 
-    There they are no local optima: an unstable model would be better still.
-
-    Args:
-        criterion: the errors.
-        starts: (name, point) pairs; they may be estimated as they are asked for.
-        iterations: at most, for each.
-        enough: number of starts after which, when all of them ended at the same optimum and it leaves little of the
-            record unexplained, no more are asked for.
+    There they are no local optima: an unstable model would be better still. Starts are (name, point) pairs, which may
+    be estimated as they are asked for: no more than ``enough`` of them where all of these ended at the same optimum and
+    it leaves little of the record unexplained.
     """
     found: list[Descent] = []
     for name, x in starts:

@@ -21,6 +21,7 @@ from optid.identify.prediction_error.descent import COMPARED, Descent, descend
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
 
+CANDIDATES = 32  # directions of z that are ranked, at least
 RANKED = 3_000  # samples on which directions are ranked and tried
 # samples of the descents before the one on the whole record; the model without functions is fitted to the first
 STAGES = (8_000, 20_000)
@@ -40,15 +41,14 @@ SIZES = (1.0, 0.3, 0.05)  # shares of the Gauss-Newton step from which a descent
 SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)
 
 
-def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, candidates: int = 32,
-                 seed: int = 0, iterations: int = 60, tries: int = 2) -> tuple[StateErrors, Descent, dict[str, Any]]:
+def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, seed: int = 0,
+                 iterations: int = 60, tries: int = 2) -> tuple[StateErrors, Descent, dict[str, Any]]:
     """Give a model functions of latent signals and descend to an optimum with all of them.
 
     Args:
         errors: the criterion of the model without them.
         best: its optimum.
         channels: the functions, each on the interval [-1, 1] of its argument.
-        candidates: directions of z that are ranked, at least.
         seed: of the random directions.
         iterations: of a descent at most.
         tries: searches for every function; those after the first know the other functions.
@@ -64,13 +64,13 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
     x, steps = best.x, best.steps
     for number, latent in enumerate(channels, start=1):
         try:
-            part, end, promise = _added(part, x, _coarse(latent), candidates, rng, iterations)
+            part, end, promise = _added(part, x, _coarse(latent), rng, iterations)
         except RankError as error:
             raise RankError(f"latent signal {number}: {error}") from error
         figures[f"gain promised by latent signal {number}"] = promise
         x, steps = end.x, steps + end.steps
     for number in [*range(len(channels))] * (tries - 1):
-        part, end, more = _exchanged(part, end, number, candidates, rng, iterations)
+        part, end, more = _exchanged(part, end, number, rng, iterations)
         x, steps = end.x, steps + more
     total = errors.data.n_samples
     for size in sorted({min(size, total) for size in (*STAGES, total)}):
@@ -85,11 +85,11 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
     return part, replace(end, steps=steps), figures
 
 
-def _added(part: StateErrors, x: Array, latent: Latent, candidates: int, rng: np.random.Generator, iterations: int
+def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator, iterations: int
            ) -> tuple[StateErrors, Descent, float]:
     """Add the function of a latent signal; also return the share of the errors that its best direction promised."""
     part, x = whitened(part, x)
-    ranked = sorted(_ranked(part, x, latent, candidates, rng), key=lambda one: -one[0])
+    ranked = sorted(_ranked(part, x, latent, rng), key=lambda one: -one[0])
     ranked = [one for one, before in zip(ranked, [None, *ranked]) if before is None or one[0] < SAME * before[0]]
     ends = [one for _, *chosen in ranked[: HEATS[0][0]] if (one := _short(part, x, latent, *chosen)) is not None]
     if not ends:
@@ -108,12 +108,9 @@ def _added(part: StateErrors, x: Array, latent: Latent, candidates: int, rng: np
     return part, replace(ends[0], steps=steps), ranked[0][0]
 
 
-def _exchanged(part: StateErrors, end: Descent, number: int, candidates: int, rng: np.random.Generator,
-               iterations: int) -> tuple[StateErrors, Descent, int]:
-    """Search for one function anew beside the others, which it was found without; the better model stays.
-
-    Also return the number of steps.
-    """
+def _exchanged(part: StateErrors, end: Descent, number: int, rng: np.random.Generator, iterations: int
+               ) -> tuple[StateErrors, Descent, int]:
+    """Search anew for one function, found without the others, beside them; the better model stays. Also count steps."""
     point, latent = part.unknowns.unpack(end.x), part.unknowns.latent
     kept = np.delete(np.arange(len(latent)), number)
     rest = replace(part, unknowns=replace(part.unknowns, latent=tuple(latent[i] for i in kept)))
@@ -123,7 +120,7 @@ def _exchanged(part: StateErrors, end: Descent, number: int, candidates: int, rn
     if not np.isfinite(without.value):
         return part, end, without.steps
     try:
-        new, found, _ = _added(rest, without.x, latent[number], candidates, rng, iterations)
+        new, found, _ = _added(rest, without.x, latent[number], rng, iterations)
     except RankError:
         return part, end, without.steps
     steps = without.steps + found.steps
@@ -245,8 +242,7 @@ def _with(point: StatePoint, rows: Array, cs: tuple[Array, ...], Ez: Array, Fz: 
                    offset_z=np.concatenate([point.offset_z, rows[:, -1]]))
 
 
-def _directions(errors: StateErrors, point: StatePoint, latent: Latent, count: int, rng: np.random.Generator
-                ) -> Iterator[Array]:
+def _directions(errors: StateErrors, point: StatePoint, latent: Latent, rng: np.random.Generator) -> Iterator[Array]:
     """Yield rows [Cz, Dz, constant] whose z fills [-1, 1]: states, inputs, outputs, parts of them, random ones."""
     n, m = errors.unknowns.n, errors.unknowns.expansion.m
     states = np.vstack(errors.visited(point))
@@ -255,8 +251,8 @@ def _directions(errors: StateErrors, point: StatePoint, latent: Latent, count: i
     spread = signals.std(axis=0)
     weight = moving / np.where(spread > 0, spread, 1.0)
     known = [*np.eye(n + m)[moving > 0], *np.hstack([point.C, np.zeros((len(point.C), m))]),
-             *_factors(point, moving, 2 * count, rng)]
-    for number in range(max(count, len(known))):
+             *_factors(point, moving, 2 * CANDIDATES, rng)]
+    for number in range(max(CANDIDATES, len(known))):
         v = known[number] if number < len(known) else weight * rng.normal(size=n + m)
         z = signals @ v
         low, high = float(z.min()), float(z.max())
@@ -301,12 +297,12 @@ def _subsets(groups: Sequence[Any]) -> list[Any]:
             for chosen in combinations(groups, count)]
 
 
-def _ranked(errors: StateErrors, x: Array, latent: Latent, count: int, rng: np.random.Generator
+def _ranked(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator
             ) -> Iterator[tuple[float, Array, Array]]:
     """Yield (share of the errors that a Gauss-Newton step takes away, row of z, matrix [Ez; Fz] (n + l, r) of it)."""
     point, n = errors.unknowns.unpack(x), errors.unknowns.n
     r, outputs = latent.size, errors.unknowns.l
-    for row in _directions(errors, point, latent, count, rng):
+    for row in _directions(errors, point, latent, rng):
         single = [replace(latent, vectors=latent.vectors[:, [j]], row=row) for j in range(r)]
         trial = _widened(errors, tuple(single))
         start = _with(point, np.tile(row, (r, 1)), (np.ones(1),) * r, np.zeros((n, r)), np.zeros((outputs, r)))

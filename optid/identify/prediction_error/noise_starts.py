@@ -22,11 +22,7 @@ PLANTS = 4  # starts, at most, of the output-error fit whose plant is the start 
 
 
 def starts_of(criterion: TransferErrors, number: int, seed: int) -> Iterable[tuple[str, Array]]:
-    """Return named starts of any of the four noise models, up to a number.
-
-    Raises:
-        StructureError, RankError: the record does not determine the ARX model of an ARMAX fit.
-    """
+    """Return named starts of any of the four noise models, up to a number; errors as `extended_least_squares`."""
     unknowns = criterion.unknowns
     if not unknowns.innovations:
         return islice(plant_starts(criterion, seed), number)
@@ -69,10 +65,7 @@ def extended_least_squares(criterion: TransferErrors) -> dict[str, Array]:
 
     The innovations of a long ARX model (Hannan and Rissanen 1982), later those of the estimate, stand as regressors for
     the noise (Ding and Chen 2005); every pass is the rank-one least-squares problem itself. The best pass counts: they
-    do not descend by rule.
-
-    Raises:
-        StructureError, RankError: the orders are impossible, or the record does not determine the ARX model.
+    do not descend by rule. What the record does not determine is refused as in `equation_error`.
     """
     unknowns = criterion.unknowns
     with warnings.catch_warnings():
@@ -129,15 +122,9 @@ def _other_zeros(unknowns: TransferUnknowns, x: Array, seed: int) -> Iterator[tu
 
 
 def arma(signals: Sequence[Array], nc: int, nd: int) -> tuple[Array, Array]:
-    """Estimate C and D of ``v = (C/D) e`` by two regressions (Hannan and Rissanen 1982).
+    """Estimate C and D of ``v = (C/D) e``, (N,) per experiment, by two regressions (Hannan and Rissanen 1982).
 
-    Args:
-        signals: (N,) one for each experiment, NaN = missing.
-        nc: order of C.
-        nd: order of D.
-
-    Returns:
-        (c, d), zeros where the signals do not determine them; C is invertible and D stable.
+    Return (c, d), zeros where the signals do not determine them; C is invertible and D stable.
     """
     long, records = nc + nd + MORE, [v[:, None] for v in signals]
     try:
@@ -153,11 +140,7 @@ def arma(signals: Sequence[Array], nc: int, nd: int) -> tuple[Array, Array]:
 
 
 def _regression(records: Sequence[Array], terms: Sequence[tuple[int, int]]) -> Array:
-    """Regress the first channel of records (N, channels) on terms (channel, lag) where no sample is missing.
-
-    Raises:
-        RankError: no row is complete.
-    """
+    """Regress channel 0 of records (N, channels) on terms (channel, lag) over complete rows, or raise a `RankError`."""
     rows, n = 1 + max((lag for _, lag in terms), default=0), len(terms)
     statistics = hankel_statistics([record for record in records if len(record) >= rows], rows)
     order = [statistics.at([channel], [rows - 1 - lag])[0] for channel, lag in [*terms, (0, 0)]]

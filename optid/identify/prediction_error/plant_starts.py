@@ -61,13 +61,8 @@ def arx_start(criterion: TransferErrors) -> Descent:
 def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | None = None) -> TransferPoint:
     """Return the rank-one least squares of the equation error (ARX); initial states are zero.
 
-    Args:
-        criterion: record and unknowns.
-        innovations: (N,) of every experiment, whose coefficients are those of C; None for a C of one.
-
-    Raises:
-        StructureError, RankError: the record does not determine them.
-        DataError: innovations of zero.
+    The coefficients of given innovations (N,) are those of C, which is one without them. What the record does not
+    determine, and innovations of zero, are refused (`StructureError`, `RankError`, `DataError`).
     """
     data, unknowns, layout = criterion.data, criterion.unknowns, criterion.unknowns.layout
     if innovations is not None:

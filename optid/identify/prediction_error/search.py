@@ -29,14 +29,8 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
            ) -> tuple[Descent, list[Descent], dict[str, Any]]:
     """Descend from every start and return the best optimum, the other ones, and the figures of the comparison.
 
-    On long records the starts are compared on a part, and the winner descends on the whole.
-
-    Args:
-        criterion: the errors.
-        starts: criterion -> named starts.
-
-    Raises:
-        RankError: no start has a stable predictor.
+    On long records the starts (name, point) of a criterion are compared on a part, and the winner descends on the
+    whole. Where no start has a stable predictor a `RankError` is raised.
     """
     part, filtered = _part(criterion), criterion.unknowns.innovations
     found = best_of(part, starts(part), enough=None if filtered else SUFFICIENT)
@@ -84,11 +78,6 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
     """Return where to start under the constraints: the best of the optima whose poles are pulled into the region.
 
     What belongs to the pulled poles is estimated anew; without constraints on the poles alone they stay.
-
-    Args:
-        fit: the programmes.
-        criterion: the errors.
-        found: optima, the best first.
     """
     if not fit.constraints:
         return fit.signed(found[0].x)

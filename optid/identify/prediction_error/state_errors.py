@@ -1,10 +1,14 @@
-"""The error of a state-space model as a function of its unknowns: simulation (K = 0) or innovation form.
+"""The errors of a state-space model, simulation (K = 0) or innovation form, and their sensitivities, chunk by chunk.
 
 Unknowns live in the full matrices; the directions along which a change of states moves them, and the scale between mu
 and b, are projected out at every iterate (data-driven local coordinates, McKelvey, Helmersson and Ribarits 2004).
+
+A stretch is run by the simulator of the criterion; the derivatives of the state are carried along that run
+(`optid.models.state_kernels`), and what leaves a chunk is a factor of [sensitivities | errors]. Where an output is
+missing its error is left out, nothing is corrected by it, and the model's own output is fed back.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -14,17 +18,19 @@ import numpy as np
 from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.record import Data
-from optid.errors import StructureError
+from optid.errors import DataError, StructureError
 from optid.identify.prediction_error.descent import Criterion
 from optid.identify.subspace.realisation import state_model
 from optid.models import HammersteinSS, Nonlinearity
+from optid.models import state_simulation as simulation
 from optid.models.roots import spectral_radius
-from optid.models.state_simulation import allowed_range, prepared, visited
-from optid.statistics.linearised import Linearised, Method
-from optid.statistics.state_sensitivities import StatePredictor
+from optid.models.state_signals import Stretch
+from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.state_unknowns import SIMULATORS, StatePoint, StateUnknowns
 
 STABLE = 1 - 1e-9
+HUGE = 1e250  # sum of squared sensitivities beyond which a run counts as one that leaves its range
+NUMBERS = 500_000  # entries of the sensitivities formed at a time
 WILD = 10.0  # times the range of the record that the run of an iterate must not leave
 FLOOR = 1e-7  # smallest standard deviation of an error that weights may rest on, as a share of that of its output
 
@@ -63,19 +69,35 @@ class StateErrors(Criterion):
         unknowns = self.unknowns
         if unknowns.innovations or not (unknowns.expansion.feedback or unknowns.latent):
             return None
-        return tuple(allowed_range([e.y], WILD) for e in self.data.experiments)
-
-    @cached_property
-    def _predictor(self) -> StatePredictor:
-        return StatePredictor(self.data, self.unknowns, self.at, self.weight, self.limits)
+        return tuple(simulation.allowed_range([e.y], WILD) for e in self.data.experiments)
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
-        """Return the errors near x."""
-        return self._predictor.compress(x, self.gauge_rows(x), method)
+        """Return the errors near x; of infinite value where a run leaves the range allowed."""
+        n, p, experiments = self.unknowns.n, self.unknowns.shared, self.unknowns.experiments
+        try:
+            return linearised(self.blocks(x), experiments, n, p, self.gauge_rows(x), method)
+        except (FloatingPointError, DataError):
+            nothing = (np.eye(n), np.zeros((n, p)), np.zeros(n))
+            return Linearised(np.eye(p), np.zeros(p), (nothing,) * experiments, np.inf, 0, 1.0, "gram")
 
     def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
-        """Return what yields the weighted rows [sensitivities | errors] of an experiment."""
-        return self._predictor.blocks(x)
+        """Return what yields the weighted rows [x0 | shared | error] of an experiment, and their number, by its index.
+
+        A missing output has a row of zeros.
+        """
+        unknowns, point = self.unknowns, self.unknowns.unpack(x)
+        model, covariance = self.at(point), np.linalg.inv(self.weight)
+        chunk = max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
+
+        def rows(index: int) -> Iterator[tuple[Array, int]]:
+            for block in _runs(self._job(model, index), unknowns, point, index, chunk):
+                count = int(np.count_nonzero(~np.isnan(block[:, :, -1])))
+                block = _weighted(block, covariance)
+                if not np.vdot(block, block) < HUGE:
+                    raise FloatingPointError
+                yield block.reshape(-1, block.shape[2]), count
+
+        return rows
 
     def admissible(self, x: Array) -> bool:
         """Whether the matrix that carries the state is stable enough, and the constraints on poles hold."""
@@ -99,24 +121,33 @@ class StateErrors(Criterion):
         return vectors[values > 1e-12 * values[0]]
 
     def value(self, x: Array) -> float:
-        """Return the weighted sum of squared errors."""
-        return self._predictor.squares(x)
+        """Return the weighted sum of squared errors; infinite where a run leaves the range allowed."""
+        try:
+            found, covariance = self.residuals(x), np.linalg.inv(self.weight)
+        except DataError:
+            return np.inf
+        total = sum(float(np.sum(_weighted(e[:, :, None], covariance) ** 2)) for e in found)
+        return total if np.isfinite(total) else np.inf
 
     def residuals(self, x: Array) -> list[Array]:
-        """Return the errors (N, l) of every experiment."""
-        return self._predictor.residuals(x)
+        """Return the errors (N, l) of every experiment, NaN where y is missing; a run out of range: `DataError`."""
+        point = self.unknowns.unpack(x)
+        model = self.at(point)
+        return [simulation.run(self._job(model, i), point.x0[i]) - e.y for i, e in enumerate(self.data.experiments)]
 
     def visited(self, point: StatePoint) -> list[Array]:
-        """Return the states (N, n) of the run of every experiment."""
-        model, word = self.at(point), SIMULATORS[self.unknowns.criterion]
-        return [visited(prepared(model, word, e.u, e.y, None, ""), x0)
-                for e, x0 in zip(self.data.experiments, point.x0)]
+        """Return the states (N, n) of the run of every experiment, whatever its range."""
+        model = self.at(point)
+        return [simulation.visited(self._job(model, i, within=False), x0) for i, x0 in enumerate(point.x0)]
+
+    def _job(self, model: HammersteinSS, index: int, within: bool = True) -> simulation.Run:
+        e, limits = self.data.experiments[index], self.limits[index] if within and self.limits else None
+        return simulation.prepared(model, SIMULATORS[self.unknowns.criterion], e.u, e.y, limits, "")
 
     def reweighted(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.
 
-        A fixed point of this iteration is stationary for the determinant of the covariance (``full``), or the product
-        of the variances, of the errors.
+        A fixed point is stationary for the determinant of the covariance (``full``), or the product of the variances.
         """
         errors = np.vstack(self.residuals(x))
         floor = FLOOR * np.nanstd(np.vstack([e.y for e in self.data.experiments]), axis=0)
@@ -128,11 +159,7 @@ class StateErrors(Criterion):
         return replace(self, weight=np.linalg.inv(covariance))
 
     def level(self, x: Array, full: bool = False) -> float:
-        """Return the logarithm of the size of the errors, by which points of different weights are compared.
-
-        It is that of the product of the variances, or, ``full``, of the determinant of the covariance, which
-        `reweighted` lowers.
-        """
+        """Return the logarithm of what `reweighted` lowers, by which points of different weights are compared."""
         return -float(np.linalg.slogdet(self.reweighted(x, full).weight)[1])
 
     def at(self, point: StatePoint) -> HammersteinSS:
@@ -147,11 +174,7 @@ class StateErrors(Criterion):
                        offset_z=point.offset_z)
 
     def point_of(self, model: HammersteinSS) -> StatePoint:
-        """Return the point of a model of the same structure, its initial states zero.
-
-        Raises:
-            StructureError: another number of states, or functions other than the criterion's.
-        """
+        """Return the point of a model of the same structure, initial states zero; refuse others (`StructureError`)."""
         unknowns, x = self.unknowns, self.unknowns.expansion
         if model.nx != unknowns.n or model.m != x.m or model.l != x.l or len(model.nonlinearities) != x.m:
             raise StructureError(f"a start has {model.nx} states, {model.m} inputs and {model.l} outputs; "
@@ -183,3 +206,61 @@ class StateErrors(Criterion):
         cs = tuple(np.linalg.lstsq(one.vectors, h.mu)[0] for one, h in zip(unknowns.latent, model.latent))
         return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0, cs,
                           model.Ez + injection @ model.Fz, model.Fz, model.Cz, model.Dz, model.offset_z)
+
+
+def _weighted(block: Array, covariance: Array) -> Array:
+    """Weigh rows (T, l, q), the last column the errors, in place where that is possible; zero where one is missing."""
+    missing = np.isnan(block[:, :, -1])
+    if missing.any():
+        block[missing] = 0.0
+        for pattern in np.unique(missing, axis=0):
+            rows = (missing == pattern).all(axis=1)
+            block[rows] = weight_root(covariance, pattern) @ block[rows]
+        return block
+    root = weight_root(covariance, missing[0])
+    if np.any(root - np.diag(np.diag(root))):
+        return root @ block
+    block *= np.diag(root)[:, None]
+    return block
+
+
+def weight_root(covariance: Array, missing: Any) -> Array:
+    """Return the square root R of the weight of the outputs present, with e^T R^T R e the weighted square."""
+    here, root = np.flatnonzero(~missing), np.zeros((missing.size, missing.size))
+    if here.size:
+        root[np.ix_(here, here)] = np.linalg.cholesky(np.linalg.inv(covariance[np.ix_(here, here)])).T
+    return root
+
+
+def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, chunk: int) -> Iterator[Array]:
+    """Yield the sensitivities and the errors in the last column, (T, l, n + shared + 1), chunk by chunk."""
+    from optid.models.state_kernels import sensitivities
+
+    n, l, parts = unknowns.n, unknowns.l, job.model.parts  # noqa: E741
+    direct, state, turn = unknowns.direct(point), point.x0[index].copy(), np.eye(n, n + unknowns.shared)
+    for first in range(0, len(job.u), chunk):
+        samples = slice(first, min(first + chunk, len(job.u)))
+        eta = [basis.values(job.u[samples, c]) for c, basis in enumerate(unknowns.expansion.inputs)]
+        f = np.column_stack([part @ mu for part, mu in zip(eta, point.mus)])
+        stretch, count = simulation.stretch_of(job, samples, f), len(f)
+        states, outputs, block = np.empty((count, n)), np.empty((count, l)), np.empty((count, l, turn.shape[1] + 1))
+        simulation.march(job, first, stretch, state, outputs, states)
+        run = simulation.signals(job, stretch, states, outputs)
+        values = _values(unknowns, point, stretch, states, outputs, run.slopes, job.u[samples], f, eta)
+        sensitivities(parts, direct, run._replace(values=values), turn, block)
+        block[:, :, -1] = outputs - job.y[samples]
+        yield block
+
+
+def _values(unknowns: StateUnknowns, point: StatePoint, stretch: Stretch, states: Array, outputs: Array,
+            slopes: Array, u: Array, f: Array, eta: Sequence[Array]) -> Array:
+    """Return the signals of a run (T, s) that multiply unknowns, in the order of `StateUnknowns.signals`."""
+    missing, one = np.isnan(stretch.y), np.ones((len(u), 1))
+    fed, argument = np.where(missing, outputs, stretch.y), np.hstack([states, u, one])
+    zeta = [family.values(fed) for family in unknowns.expansion.feedback]
+    z = (stretch.z + states @ point.Cz.T).T
+    phi = [latent.basis.values(signal) @ latent.vectors for latent, signal in zip(unknowns.latent, z)]
+    g, w = ([part @ one for part, one in zip(parts, of)] for parts, of in ((zeta, point.nus), (phi, point.cs)))
+    innovations = np.where(missing, 0.0, stretch.y - outputs)
+    return np.column_stack([states, innovations, f, *g, *w, one, *eta, *zeta, *phi,
+                            *(slope[:, None] * argument for slope in slopes.T)])

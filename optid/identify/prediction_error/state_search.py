@@ -114,10 +114,7 @@ def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
 
 
 def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
-    """Balance the states for the signals and weights of the fit, so that all entries of A are of one size.
-
-    A model without balanced states stays as it is.
-    """
+    """Balance the states, if possible, for the signals and weights of the fit, so that all of A is of one size."""
     data = errors.data
     f = model.expanded(np.vstack([e.u for e in data.experiments]))
     y = np.vstack([e.y for e in data.experiments])
@@ -132,12 +129,8 @@ def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
 def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
     """Add the noise model, and the Hankel bound to errors linear in functions of signals that the record shows.
 
-    Those are errors with one weight per output of models whose functions see inputs and measured outputs alone.
-
-    Args:
-        evidence: of a fit.
-        errors: as they were weighted at last.
-        unit: what one squared unit of the outputs is in units of the record.
+    Those are errors, as weighted at last, with one weight per output of models whose functions see inputs and measured
+    outputs alone. One squared unit of the outputs is ``unit`` in units of the record.
     """
     weight, unknowns, reason = errors.weight, errors.unknowns, evidence.reason
     model, remarks = _with_noise(evidence.model, errors)
@@ -175,10 +168,7 @@ def _runs_away(model: HammersteinSS, data: Data) -> str:
 
 
 def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinSS, dict[str, Any]]:
-    """Add the covariances of the noise: with K as it was fitted, or with one estimated from the simulation errors.
-
-    The figure besides says why there is no noise model where there is none.
-    """
+    """Add the covariances of the noise, K as fitted or from simulation errors; or say why there are none."""
     data = errors.data
     try:
         if not errors.unknowns.innovations and not errors.unknowns.latent:

@@ -88,11 +88,8 @@ class TransferErrors(TransferPredictor, Criterion):
     def levels_before(self, a: Any, thetas: Sequence[Any]) -> Any:
         """Return what x0 lacks in the record's own units, in which the time before the record is at the levels.
 
-        In the units of the model it is at zero, as the definition of x0 has it.
-
-        Args:
-            a: (na,) values or expressions.
-            thetas: (P, nb) of every input.
+        In the units of the model it is at zero, as x0 has it. a (na,) and Theta (P, nb) of every input may be
+        expressions.
         """
         units, memory, layout = self.units, self.unknowns.memory, self.unknowns.layout
         rows, total = np.arange(memory)[:, None], np.zeros(memory)

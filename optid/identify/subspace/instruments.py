@@ -50,17 +50,8 @@ def clipped_run(
 ) -> None:
     """Simulate x+ = A x + drive + sum_o table_o(y_o) + injection y, y = C x + direct, with y clipped to [low, high].
 
-    Args:
-        a: (n, n).
-        c: (l, n).
-        drive: (T, n) what the inputs add to the state.
-        direct: (T, l) what they add to the outputs.
-        tables: (l, G, n) feedback of output o at G points spread evenly over [low, high]; read with straight lines.
-        injection: (n, l).
-        low: (l,).
-        high: (l,).
-        x: (n,) state at the first sample; left at the sample after the last.
-        out: (T, l) clipped outputs, written.
+    The tables (l, G, n) hold the feedback of every output at G points spread evenly over [low, high], read with
+    straight lines. Written are the state x (n,) after the last sample and the clipped outputs (T, l).
     """
     n, l, last = x.size, low.size, tables.shape[1] - 1  # noqa: E741
     following = np.empty(n)

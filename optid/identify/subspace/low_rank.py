@@ -125,9 +125,8 @@ def held_out_fit(model: Any, data: Data) -> float:
 def structure(plan: Plan) -> Structured:
     """Build the structured problem of the record of a plan, whose instruments word is the form.
 
-    Raises:
-        StructureError: feedback in a form other than "predictor", or a record too long.
-        RankError: too few usable windows.
+    Feedback in a form other than "predictor", a record too long (`StructureError`) and too few usable windows
+    (`RankError`) are refused.
     """
     windows = Windows.of(plan)
     expansion, alpha, form = windows.expansion, windows.alpha, plan.instruments

@@ -41,9 +41,7 @@ class Windows:
     def of(cls, plan: Plan) -> "Windows":
         """Return the signals of a plan and its number of block rows, after the checks of its channels.
 
-        Raises:
-            StructureError: an order that the block rows cannot carry.
-            DataError: a constant channel.
+        An order that the block rows cannot carry (`StructureError`) and a constant channel (`DataError`) are refused.
         """
         expansion, nx = plan.expansion(), plan.order
         check_channels(plan.records, plan.data.inputs, plan.data.outputs)
@@ -117,8 +115,7 @@ class Windows:
         """Return the projection in the weighting whose (A, C) leaves the smallest error on the record.
 
         None is best on all records: the canonical weighting has the smaller variance where the order suffices, the
-        others keep the outputs with most energy where it does not. A stable estimate comes before one that had to be
-        moved.
+        others keep the outputs with most energy where it does not. A stable estimate comes before one that was moved.
         """
         tried = []
         for word in WEIGHTINGS:
@@ -176,12 +173,10 @@ class Observability:
         return a if radius < 1 else a * (INSIDE / radius)
 
     def step(self, a: Array, *, instruments: bool = True) -> Realisation:
-        """Compress the least squares for B, D, E, offset and x0 with a given A.
+        """Compress the least squares for B, D, E, offset and x0 with a given A (n, n).
 
-        Args:
-            a: (n, n).
-            instruments: take simulated feedback functions as instruments where the noise may be coloured; where past
-                outputs may be instruments, it is white and least squares has the smaller variance.
+        Simulated feedback functions are instruments where the noise may be coloured; where past outputs may be
+        instruments, it is white and least squares has the smaller variance.
         """
         plan, records, expansion = self.windows.plan, self.windows.records, self.windows.expansion
         c = self.gamma[: len(self.scale)].copy()
@@ -194,11 +189,7 @@ class Observability:
         return observer_problem(records, form, [record[:, plan.data.m :] for record in plan.records])
 
     def model(self) -> HammersteinSS:
-        """Return the least-squares model, for comparisons: no constraints, A contracted.
-
-        Raises:
-            RankError: the record does not determine it.
-        """
+        """Return the least-squares model, for comparisons: no constraints, A contracted; errors as of `step`."""
         step = self.step(self.contracted())
         return step.model(self.windows.plan.data, step.start())
 
@@ -206,11 +197,8 @@ class Observability:
 def estimate_observability(plan: Plan) -> Observability:
     """Project, find the order and choose the weighting; where missing outputs leave few windows, estimate them first.
 
-    Raises:
-        RankError: the record does not determine the model.
-
-    Warns:
-        DataWarning: missing outputs are estimated; the simulated feedback explains little of the measured one.
+    What the record does not determine raises a `RankError`. Missing outputs that are estimated, and simulated feedback
+    that explains little of the measured one, are told by a `DataWarning`.
     """
     windows, imputed = Windows.of(plan), {}
     if windows.are_scarce():

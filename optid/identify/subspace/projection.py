@@ -66,12 +66,8 @@ def project(records: Sequence[Array], expansion: Expansion, block_rows: int, *, 
             form: str = "projection", tolerance: float | None = None) -> Projection:
     """Take the statistics of raw channels [u | y] or [u | y | simulated y] per experiment, and decompose.
 
-    Instruments are words as in `Expansion.positions`, ``form`` and ``tolerance`` as in `optid.statistics.rq.rq`; the
-    past has as many block rows as the future.
-
-    Raises:
-        StructureError: an unknown form.
-        RankError: records that are too short, or do not excite the regressors.
+    Instruments are words as in `Expansion.positions`, ``form`` and ``tolerance`` as in `optid.statistics.rq.rq`, as are
+    the errors; the past has as many block rows as the future.
     """
     statistics = hankel_statistics(records, 2 * block_rows, expansion, names=expansion.names,
                                    centre="mean" if offset else None)

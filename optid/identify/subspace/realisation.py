@@ -34,11 +34,7 @@ class Realisation:
     factored: bool = False  # whether channels are rank one in the programme itself
 
     def least_squares(self) -> Array:
-        """Return the unrestricted minimiser z.
-
-        Raises:
-            RankError: the record does not determine it; names the first unknown that is lost.
-        """
+        """Return the unrestricted minimiser z; name the first unknown that the record leaves open (`RankError`)."""
         root, norms = self.problem.root, np.linalg.norm(self.problem.root, axis=0)
         lost = np.abs(np.diag(root)) <= 1e-10 * np.where(norms > 0, norms, 1.0)
         if lost.any():
@@ -76,11 +72,7 @@ class Realisation:
         return [(f"mu{tail}", f"b{tail}", f"Theta{tail}") for tail in tails]
 
     def start(self) -> dict[str, Array]:
-        """Return the unrestricted minimiser; of factored channels the most promising factors.
-
-        Raises:
-            RankError: naming what the record does not determine.
-        """
+        """Return the unrestricted minimiser, of factored channels promising factors; errors as `least_squares`."""
         form, z, point = self.form, self.least_squares(), None
         if self.factored:
             point = self.problem.core.point(*starts(self.problem.core, count=1)[0])
@@ -113,16 +105,10 @@ class Realisation:
 
 def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequence[Array] | None = None
                      ) -> Realisation:
-    """Compress the step.
+    """Compress the step from raw channels (N, m + l), or (N, m + 2 l) with simulated outputs, one array per experiment.
 
-    Args:
-        records: raw channels (N, m + l), or (N, m + 2 l) with simulated outputs, one per experiment; NaN = missing.
-        form: what is known.
-        targets: measured outputs (N, l), one per experiment, NaN = missing, where those of the records are partly
-            estimated: feedback and observer read the estimates, which are no equations.
-
-    Raises:
-        RankError: fewer equations than unknowns.
+    Measured outputs (N, l) are given as ``targets`` where those of the records are partly estimated: feedback and
+    observer read the estimates, which are no equations. Fewer equations than unknowns raise a `RankError`.
     """
     x, extra, own = form.expansion, form.extra, slice(form.experiments * form.n, None)
     total = form.size + extra
@@ -166,15 +152,9 @@ def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus
                 e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
     """Build the model, its feedback functions in their own basis: what is linear in them becomes L and a constant.
 
-    Args:
-        expansion: the signals of the fit.
-        data: the record, for names, units and sampling time.
-        matrices: A (n, n), B (n, m), C (l, n) and D (l, m).
-        mus: coefficients of the nonlinearity of every input.
-        nus: coefficients of every feedback family in its orthonormal coordinates.
-        e: (n, s), one column per family.
-        K: (n, l), zero where None.
-        offset: (l,) of the output, zero where None.
+    The matrices are A (n, n), B (n, m), C (l, n) and D (l, m); mus are the coefficients of the nonlinearity of every
+    input, nus those of every feedback family in its orthonormal coordinates, with one column of e (n, s) each. K (n, l)
+    and the offset (l,) of the output are zero where None. The record gives names, units and sampling time.
     """
     families = expansion.feedback
     parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]

@@ -110,8 +110,8 @@ class ObserverForm:
     def compress(self, run: Array, target: Array) -> tuple[Array, int, float]:
         """Return the triangular factor of the equations of a run, how many there are, and the outputs' energy.
 
-        The columns are [x0 | d | Theta of the inputs | E simulated | E], then the target.
-        Many equations enter by their Gram matrix, unless its condition would cost digits.
+        The columns are [x0 | d | Theta of the inputs | E simulated | E], then the target. Many equations enter by their
+        Gram matrix, unless its condition would cost digits.
         """
         given = (self.weights * target)[~np.isnan(target)]
         count = self.size - (self.experiments - 1) * self.n + self.extra
@@ -174,18 +174,10 @@ class ObserverForm:
 
 def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterable[Array]
                       ) -> Iterator[tuple[Array, Array]]:
-    """Yield the regressors of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i), linear in the matrix M (n, d).
+    """Yield the signals (d, T) and the regressors (l, d, n, T) of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i) by stretches.
 
-    The regressor of output o is the matrix X_o(k) (d, n), like M transposed, with X_o(k + 1) = X_o(k) F + s(k) C_o.
-
-    Args:
-        inner: (n, n) F.
-        outputs: (l, n) C.
-        state: (l, d, n) X at the first sample, for every output.
-        parts: (d, T) signals s, one stretch after the other.
-
-    Yields:
-        (d, T) and (l, d, n, T), every stretch and its X.
+    The regressor of output o is the matrix X_o(k) (d, n), like M transposed, with X_o(k + 1) = X_o(k) F + s(k) C_o, and
+    ``state`` (l, d, n) at the first sample; ``inner`` is F (n, n), ``outputs`` C (l, n).
     """
     (l, n), d = outputs.shape, state.shape[1]  # noqa: E741
     powers = np.empty((BLOCK + 1, n, n))

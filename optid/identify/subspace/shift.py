@@ -93,17 +93,8 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
     """Solve ``min ‖up A - down‖`` with the poles where the rules want them; use as ``shift = yield from ...``.
 
     No programme is posed where the least-squares solution obeys every rule already: the weighted fit would contract
-    poles that need no help.
-
-    Args:
-        up: (r, n) observability matrix without its last block row.
-        down: (r, n) the same without its first.
-        rules: constraints about the poles; a builder of another kind is always imposed.
-        programmes: of the step.
-
-    Returns:
-        The solution; with ``a`` None where the regions are empty together or the back end failed. The last programme
-        posed is then the one to explain.
+    poles that need no help. A builder that is no rule about poles is always imposed. ``a`` is None where the regions
+    are empty together or the back end failed; the last programme posed is then the one to explain.
 
     Raises:
         StructureError: shapes that do not fit, or a rule that does not apply to a matrix A.
