@@ -53,7 +53,7 @@ def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, ba
             "auto" the first unless A is unstable.
         split: "exact" keeps every channel rank one in that step (certified), "lumped" splits afterwards (convex).
         stability: "auto" brings poles of an unstable estimate to modulus 0.999, "free" leaves them.
-        constraints: rules about poles and about coefficients; the variables are those of `formulations.realisation`.
+        constraints: rules about poles and about coefficients; variables as in `formulations.subspace_procedure`.
 
     Raises:
         StructureError: words or orders that do not fit.

@@ -36,9 +36,9 @@ from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.identify.arguments import enough_rows
 from optid.identify.gauges import FIXED, scale_fixed
-from optid.identify.prediction_error.noise_starts import starts_of
 from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.search import entry, search
+from optid.identify.prediction_error.starts import starts_of
 from optid.identify.prediction_error.tangent_fit import CompressedErrors, TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF, Nonlinearity
@@ -167,8 +167,7 @@ class _Fit(TangentFit):
         r = cp.Variable(z0.size, name="residual")
         z = self.places.stacked(variables)
 
-        compressed = CompressedErrors(at, self.places, z0, np.array([self.criterion.energy]),
-                                      self.criterion.data.n_samples)
+        compressed = CompressedErrors(self.criterion, at, z0)
         objective = cp.sum_squares(r) + at.remainder
         if damping:
             sizes = np.sqrt(damping) * np.linalg.norm(compressed.problem.root, axis=0)

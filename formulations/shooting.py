@@ -32,7 +32,7 @@ from optid.bases import Bases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.gauges import FIXED, scale_fixed
-from optid.identify.prediction_error.plant_starts import arx_start, iterated
+from optid.identify.prediction_error.starts import arx_start, iterated
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models.gauges import leading_sign
@@ -72,7 +72,7 @@ class _Shooting:
     def __init__(self, criterion: TransferErrors) -> None:
         self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
         self.labels = criterion.labels
-        self.key, self.places = criterion.key, Places.of(criterion.unknowns, criterion.key)
+        self.key, self.places = criterion.key, Places.of(criterion)
         self.variables = self.places.variables()
         self.variables.pop("x0", None)  # the first outputs are the initial state
 

@@ -175,8 +175,7 @@ class StateShooting(StateSpaceFit):
         """State the programme with the start z0."""
         errors, variables, units = self.criterion, self.places.variables(), self.units
         start = dict(self.places.values(z0))
-        compressed = CompressedStates(at, self.places, z0, np.array([errors.energy]), errors.data.n_samples, errors,
-                                      units, fixed=True)
+        compressed = CompressedStates(errors, at, z0, units, fixed=True)
         rows = np.pad(errors.gauge_rows(z0), ((0, 0), (0, z0.size - errors.unknowns.shared)))
         structural: dict[str, Any] = {}
         if len(rows := np.vstack([rows, compressed.free])):

@@ -131,8 +131,7 @@ class StateSpaceFit(TangentFit):
         variables, values = self.places.variables(), self.places.values(z0)
         r = cp.Variable(z0.size, name="residual")
         step = self.places.stacked(variables) - z0
-        compressed = CompressedStates(at, self.places, z0, np.array([self.criterion.energy]),
-                                      self.criterion.data.n_samples, self.criterion, self.units)
+        compressed = CompressedStates(self.criterion, at, z0, self.units)
 
         matrix, errors = at.whole
         objective = cp.sum_squares(r) + at.remainder

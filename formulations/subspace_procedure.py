@@ -1,27 +1,58 @@
-"""The steps that the subspace methods share.
+"""The steps that the subspace methods share, and the programme of the third of them.
 
 1. The observability matrix from projections: `optid.identify.subspace.observability`, no programme.
 2. (A, C) from its shift invariance, poles where the constraints want them: `formulations.shift`.
-3. (B, D, E, offset, x0) with the constraints on coefficients: `formulations.realisation`.
+3. B, D, E, offset and x0 with the constraints on coefficients, for these (A, C): `realisation_programme`,
+
+       min ‖R [x0; offset; vec Theta_1; ...] - s‖²,    Theta_i = mu_i [B_i; D_i]ᵀ
+
+   R and s are the record, compressed (`optid.identify.subspace.realisation`).
 4. The noise model from the prediction errors, when it is asked for: `optid.identify.noise`.
+
+The third programme has two forms:
+
+* factored: every channel is rank one; solved and certified by the machinery of rank-one blocks. Named variables:
+  ``x0``, ``offset``, ``mu``, ``b`` (= [B_i; D_i]) and, for an output that is fed back, ``mu feedback``,
+  ``b feedback``.
+* lumped: ``Theta_i`` as it comes, convex; the factors are split off afterwards in the metric of the least squares.
+  Named variables: ``x0``, ``offset``, ``Theta``, ``Theta feedback``. Linear channels alone always take this form.
+
+With several inputs the per-channel names carry the input, as in ``mu[valve]``. Expressions for constraints in either
+form: ``Theta`` (P, n + l), the lumped ``Bu`` (n, p), ``Du`` (l, p) and ``Ez`` (n, q); where every channel is linear
+``B`` (n, m) and ``D`` (l, m) too. ``reference`` of the view holds A and C.
 """
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
 
 from formulations.constraints.poles import stable
-from formulations.realisation import realisation_programme
 from formulations.shift import constrained_shift
+from optid.bases import Linear
 from optid.certificate.hankel import simulation_bound
+from optid.certificate.lifting import certify_rank_one
+from optid.data.channels import Transform
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.realisation import Realisation
 from optid.models.roots import spectral_radius
+from optid.program.expressions import flat
+from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
+from optid.program.units import energy_unit, outer_bases
+from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
+from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
+
+# multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme
+RELAXED = 150
 
 
 def identified(plan: Plan, found: Observability | None = None) -> Procedure:
@@ -67,3 +98,52 @@ def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block
     bound = simulation_bound(plan.records, form.expansion, form.n, form.weights, solution.objective / unit, block_rows,
                              said, not form.injected and not form.extra)
     return replace(bound, value=unit * bound.value)
+
+
+def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
+    """Pose the least squares of a plan under its constraints on coefficients; ``recover`` gives the model."""
+    problem, form, units = realisation.problem, realisation.form, plan.units
+    shape = form.n if form.experiments == 1 else (form.n, form.experiments)
+    linear = {"x0": cp.Variable(shape, name="x0")} | ({"offset": cp.Variable(form.l, name="offset")}
+                                                      if form.offset else {})
+    names = realisation.names
+    if realisation.factored:
+        mus = [cp.Variable(p, name=mu) for (mu, _, _), (p, _) in zip(names, form.blocks)]
+        bs = [cp.Variable(entries, name=b) for (_, b, _), (_, entries) in zip(names, form.blocks)]
+        thetas = [cp.outer(mu, b) for mu, b in zip(mus, bs)]
+        variables = linear | {one.name(): one for pair in zip(mus, bs) for one in pair}
+        gauge = {"gauge": tuple(cp.sum_squares(b) == 1 for b in bs)}
+        structure = RankOneStructure(problem, tuple(linear), tuple((mu, b) for mu, b, _ in names), "norm")
+        certify = partial(certify_rank_one, max_size=RELAXED)
+    else:
+        thetas = [cp.Variable(shape, name=theta) for (_, _, theta), shape in zip(names, form.blocks)]
+        variables = linear | {theta.name(): theta for theta in thetas}
+        gauge, structure, certify = {}, LeastSquaresStructure(problem, tuple(variables)), None
+    error = problem.root @ cp.hstack([flat(part) for part in (*linear.values(), *thetas)]) - problem.target
+    residual = cp.Variable(error.size, name="residual")
+    structural = {"residual": (residual == error,), **gauge}
+    relative = np.any(form.weights != 1)  # to the sizes of the outputs, which have the same unit as the residuals
+    return Program(
+        plan.name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
+        {**variables, "residual": residual}, realisation.start(), partial(realisation.model, plan.data),
+        _view(realisation, units, variables, thetas), structural=frozenset(structural), derived={"residual": error},
+        scale=problem.scale, unit=1.0 if relative else energy_unit(units),
+        structure=structure, certify=certify).subject_to(*plan.about("coefficients"))
+
+
+def _view(realisation: Realisation, units: Transform, variables: dict[str, Any], thetas: Sequence[cp.Expression]
+          ) -> View:
+    """Return what constraints may speak about; Theta_i is (P, n + l) or, without feedthrough, (P, n)."""
+    form, x, n = realisation.form, realisation.form.expansion, realisation.form.n
+    expressions = variables | {name: theta for (_, _, name), theta in zip(realisation.names, thetas)}
+    inner = [theta[:, :n].T for theta in thetas]
+    direct = [theta[:, n:].T if direct else np.zeros((form.l, theta.shape[0]))
+              for theta, direct in zip(thetas, form.feedthrough)]
+    expressions["Bu"], expressions["Du"] = cp.hstack(inner[: x.m]), cp.hstack(direct)
+    if x.q:
+        expressions["Ez"] = cp.hstack(inner[x.m :])
+    if all(isinstance(basis, Linear) for basis in x.inputs):
+        expressions["B"], expressions["D"] = expressions["Bu"], expressions["Du"]
+    return View(expressions, channels=x.input_names, outputs=x.output_names,
+                bases=dict(zip(x.input_names, outer_bases(x.inputs, units))),
+                gauge="norm" if realisation.factored else "", reference={"A": form.a, "C": form.c}, units=units)

@@ -17,7 +17,7 @@ from formulations.prediction_error import hammerstein_bj as bj
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import DataWarning, InfeasibleError, OptidError, RankError, StructureError
-from optid.identify.prediction_error.noise_starts import arma
+from optid.identify.prediction_error.starts import arma
 from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
 

@@ -96,7 +96,7 @@ class PhysicalErrors(Criterion):
     @cached_property
     def places(self) -> Places:
         """Where named variables stand among the unknowns."""
-        return Places.of(self.unknowns, self.key)
+        return Places.of(self)
 
     @cached_property
     def steps(self) -> int:
@@ -319,11 +319,7 @@ class CompressedPhysical(CompressedStates):
     criterion: PhysicalErrors  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(self, errors: PhysicalErrors) -> None:
-        there = {"criterion": errors, "places": errors.places, "energy": np.array([errors.energy]),
-                 "candidates": sum(e.y.size for e in errors.data.experiments),
-                 "outward": Transform.identity(errors.data.m, errors.data.l)}
-        for name, value in there.items():
-            object.__setattr__(self, name, value)
+        self.criterion, self.outward = errors, Transform.identity(errors.data.m, errors.data.l)
 
     def settle(self, program: Program) -> None:
         """Linearise the errors where the variables of the programme stand; refuse what is left open (`RankError`)."""

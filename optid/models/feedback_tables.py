@@ -65,18 +65,13 @@ def _row(f: Nonlinearity) -> tuple[int, float, float, int, int, float, Array]:
         rate = np.pi / (basis.half_range * (high - low) / 2)
         return TRIGONOMETRIC, low, high, outside, basis.p, rate, mu.reshape(-1, 2)
     if isinstance(basis, Triangular | PiecewiseConstant | BSpline):
-        return CELLS, low, high, outside, basis.p, 0.0, _pieces(basis, mu)
+        return CELLS, low, high, outside, basis.p, 0.0, _pieces(replace(basis, interval=span(basis))) @ mu
     return USER, low, high, outside, 0, 0.0, np.zeros((1, 1))
 
 
-def _pieces(basis: Triangular | PiecewiseConstant | BSpline, mu: Array) -> Array:
-    """Coefficients (cells, degree + 1) of the polynomial in every cell."""
-    return _pieces_of_functions(replace(basis, interval=span(basis))) @ mu
-
-
 @lru_cache(maxsize=64)
-def _pieces_of_functions(basis: Triangular | PiecewiseConstant | BSpline) -> Array:
-    """Those of every function (cells, degree + 1, P), from values inside the cells."""
+def _pieces(basis: Triangular | PiecewiseConstant | BSpline) -> Array:
+    """Coefficients (cells, degree + 1, P) of the polynomials of all functions, from values inside the cells."""
     low, high = span(basis)
     degree = {Triangular: 1, PiecewiseConstant: 0}.get(type(basis), getattr(basis, "degree", 0))
     inside = (np.arange(degree + 1) + 0.5) / (degree + 1)

@@ -85,11 +85,10 @@ class HammersteinTF(Model):
         if fields["d"] is not None and fields["d"].size and np.array_equal(fields["d"], a):
             fields["d"] = None
         self._fix(fields, len(self.b), offset.size)
-        self._check_plant()
-        self._check_noise()
+        self._check()
         _ = self.layout
 
-    def _check_plant(self) -> None:
+    def _check(self) -> None:
         l, m = self.offset.size, len(self.b)  # noqa: E741 - the field's letter
         if self.offset.ndim != 1:
             raise StructureError(f"offset has shape {self.offset.shape}; (l,) is needed.")
@@ -104,8 +103,6 @@ class HammersteinTF(Model):
             raise StructureError(
                 "A nonlinearity of a model has offset None: put the constant of the equation in offset=."
             )
-
-    def _check_noise(self) -> None:
         for name, values in (("c", self.c), ("d", self.d)):
             if values is not None and values.ndim != 1:
                 raise StructureError(f"{name} has shape {values.shape}; (n{name},) is needed.")
@@ -241,15 +238,13 @@ class HammersteinTF(Model):
 
     def impulse_response(self, n: int = 100) -> Array:
         """Return the response of A^-1 B_c to a unit impulse of f_c, (n, l, m), in the gauge of the model."""
-        impulses = np.zeros((n, self.l, self.m))
-        impulses[: len(self.numerators)] = self.numerators[:n]
-        return np.stack([autoregression(self.matrices, impulses[:, :, c]) for c in range(self.m)], axis=2)
+        return self._response(self.numerators, n)
 
-    def inverse_impulse(self, n: int) -> Array:
-        """Return the impulse response of A^-1, (n, l, l): [k, o, p] of output o to equation p."""
-        impulses = np.zeros((n, self.l, self.l))
-        impulses[:1] = np.eye(self.l)
-        return np.stack([autoregression(self.matrices, impulses[:, :, p]) for p in range(self.l)], axis=2)
+    def _response(self, drive: Array, n: int) -> Array:
+        """Return the response (n, l, r) of A^-1 to what enters its equations at first (k, l, r)."""
+        right = np.zeros((n, *drive.shape[1:]))
+        right[: len(drive)] = drive[:n]
+        return np.stack([autoregression(self.matrices, column) for column in np.moveaxis(right, 2, 0)], axis=2)
 
     def frequency_response(self, w: ArrayLike) -> Array:
         """Return A^-1 B_c at the frequencies w (radians per unit of time, up to pi / dt), complex (len(w), l, m)."""
@@ -358,7 +353,7 @@ class HammersteinTF(Model):
         present = np.isfinite(rest)
         if not present.any():
             return np.zeros((n, outputs))
-        free = self.inverse_impulse(count)
+        free = self._response(np.eye(outputs)[None], count)
         columns = np.zeros((count, outputs, n, outputs))
         for i in range(min(n, count)):
             columns[i:, :, i] = free[: count - i]

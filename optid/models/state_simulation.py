@@ -4,7 +4,6 @@ P1 predicts with the innovation form, P2 feeds the measured outputs to g without
 Inputs are expanded stretch by stretch, so nothing of the size samples x functions is formed for the whole record.
 """
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -60,13 +59,11 @@ def run(job: Run, x0: Array, horizon: int = 1) -> Array:
     With a horizon the model runs freely for `horizon` - 1 samples from the state before every sample; the first
     `horizon` - 1 outputs are NaN.
     """
-    model, outputs = job.model, np.full((len(job.u), job.model.l), np.nan)
-    x = np.array(x0, dtype=float)
-    for first, last, stretch in _stretches(job, overlap=horizon - 1):
-        starts = min(STRETCH, last - first)
-        states = np.empty((starts if horizon > 1 else 0, x.size))
-        y = np.empty((starts, model.l))
-        march(job, first, stretch.part(slice(starts)), x, y, states)
+    model, outputs, x = job.model, np.full((len(job.u), job.model.l), np.nan), np.array(x0, dtype=float)
+    for first in range(0, len(job.u), STRETCH):
+        last = min(first + STRETCH + horizon - 1, len(job.u))
+        stretch = stretch_of(job, slice(first, last))
+        states, y = march(job, first, stretch.part(slice(STRETCH)), x, keep=horizon > 1)
         for i in range(1, horizon):
             states, y = states[: last - first - i], y[: last - first - i]  # those after which i samples follow
             now, then = (slice(j, j + len(states)) for j in (i - 1, i))
@@ -86,11 +83,8 @@ def run(job: Run, x0: Array, horizon: int = 1) -> Array:
 
 def visited(job: Run, x0: Array) -> Array:
     """Compute the states (N, n) of a run; errors as `run`."""
-    x, found = np.array(x0, dtype=float), []
-    for first, last, stretch in _stretches(job):
-        found.append(np.empty((last - first, x.size)))
-        march(job, first, stretch, x, np.empty((last - first, job.model.l)), found[-1])
-    return np.vstack(found)
+    x, starts = np.array(x0, dtype=float), range(0, len(job.u), STRETCH)
+    return np.vstack([march(job, k, stretch_of(job, slice(k, k + STRETCH)), x)[0] for k in starts])
 
 
 def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
@@ -140,18 +134,18 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
 
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
-    x, turn = np.array(x0, dtype=float), np.eye(n)
+    x, turn, length = np.array(x0, dtype=float), np.eye(n), max(64, STRETCH // (n * outputs + 1))
     nothing = Direct.of()  # besides the initial state
-    for first, last, stretch in _stretches(job, length=max(64, STRETCH // (n * outputs + 1))):
+    for first in range(0, len(job.u), length):
         if not (informs or whole):
             break
-        simulated, states = np.empty((last - first, outputs)), np.empty((last - first, n))
-        march(job, first, stretch, x, simulated, states)
-        error = (y[first:last] - simulated) / unit
+        stretch = stretch_of(job, slice(first, first + length))
+        states, simulated = march(job, first, stretch, x)
+        error = (y[first : first + length] - simulated) / unit
         present = ~np.isnan(error)
         cost += float(np.sum(error[present] ** 2))
         if informs:
-            jacobian = np.empty((last - first, outputs, n))
+            jacobian = np.empty((len(states), outputs, n))
             sensitivities(job.model.parts, nothing, signals(job, stretch, states, simulated), turn, jacobian)
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
             if not np.all(np.isfinite(rows)):
@@ -180,13 +174,6 @@ def allowed_range(data: Any, times: float = FAR) -> Any:
     middle = np.where(np.isfinite(low), (low + high) / 2, 0.0)
     reach = np.where(np.isfinite(low), reach, np.finfo(float).max)
     return middle - reach, middle + reach
-
-
-def _stretches(job: Run, length: int = 0, overlap: int = 0) -> Iterator[tuple[int, int, Stretch]]:
-    length = length or STRETCH
-    for first in range(0, len(job.u), length):
-        last = min(first + length + overlap, len(job.u))
-        yield first, last, stretch_of(job, slice(first, last))
 
 
 def stretch_of(job: Run, samples: slice, f: Array | None = None) -> Stretch:
@@ -220,15 +207,17 @@ def signals(job: Run, stretch: Stretch, states: Array, outputs: Array) -> Signal
     return Signals(compact(returned), slopes, np.zeros((len(states), 0)))
 
 
-def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, states: Array) -> None:
-    """Run over a stretch that begins at sample `first`, as `optid.models.state_kernels.march`.
+def march(job: Run, first: int, stretch: Stretch, x: Array, keep: bool = True) -> tuple[Array, Array]:
+    """Run from a state x, which moves on, over a stretch that begins at sample `first`; return its states and outputs.
 
-    An output that leaves the range allowed, or the interval of a basis that refuses, is refused (`DataError`).
+    The states before every sample are (T, n), (0, n) where they are not kept. An output that leaves the range allowed,
+    or the interval of a basis that refuses, raises a `DataError`.
     """
     from optid.models.state_kernels import LEFT, REFUSED
     from optid.models.state_kernels import march as run_over
 
-    parts = job.model.parts._replace(K=compact(job.gain))
+    parts, count = job.model.parts._replace(K=compact(job.gain)), len(stretch.y)
+    states, outputs = np.empty((count if keep else 0, x.size)), np.empty((count, job.model.l))
     if not parts.tables.compiled and (job.model.latent or np.isnan(stretch.feedback).any()):
         ended, at = _march_by_steps(job.model, parts, stretch, x, outputs, states)
     else:
@@ -241,6 +230,7 @@ def march(job: Run, first: int, stretch: Stretch, x: Array, outputs: Array, stat
         )
     if ended == LEFT:
         raise _left(job, first + at)
+    return states, outputs
 
 
 def _left(job: Run, sample: int) -> DataError:

@@ -88,7 +88,29 @@ def _equation(model: Any, o: int, outputs: tuple[str, ...], digits: int) -> str:
 
 def state_equations(model: Any, digits: int = 4) -> str:
     """Write a state-space model as equations: one per state up to four states, in matrices beyond."""
-    return _equations(model, digits) if model.nx <= READABLE else _summary(model)
+    if model.nx > READABLE:
+        return _summary(model)
+    functions, (names, words), (inner, latent) = [], _names(model), latent_names(model)
+    for f, c, name in zip(model.nonlinearities, model.input_of, names):
+        sample = f"{model.inputs[c]}(k)"
+        linear = name == model.inputs[c]
+        functions.append((float(f.mu[0]), sample) if linear else (1.0, f"{name}({sample})"))
+    errors = [f"e_{name}(k)" if model.l > 1 else "e(k)" for name in model.outputs]
+    samples = {
+        "x": [f"x{i + 1}(k)" for i in range(model.nx)], "y": [f"{name}(k)" for name in model.outputs], "e": errors,
+        "g": [f"{name}({model.outputs[o]}(k))" for name, o in zip(words, model.output_of)], "": [""],
+        "h": [f"{h}({z}(k))" for h, z in zip(inner, latent)], "u": [f"{name}(k)" for name in model.inputs],
+    }
+    signals = {signal: [(1.0, name) for name in names] for signal, names in samples.items()} | {"f": functions}
+    lines = []
+    for kind, left in (("x", [f"x{i + 1}(k+1)" for i in range(model.nx)]), ("y", samples["y"]),
+                       ("z", [f"{name}(k)" for name in latent])):
+        for i, name in enumerate(left):
+            terms = [(float(value) * scale, word) for matrix, signal in TERMS[kind].items()
+                     for value, (scale, word) in zip(np.atleast_1d(getattr(model, matrix)[i]), signals[signal])]
+            tail = f" + {errors[i]}" if kind == "y" and np.any(model.K) else ""
+            lines.append(f"{name} = {signed_sum(terms, digits)}{tail}")
+    return "\n".join(lines)
 
 
 def matrix_entries(model: Any) -> list[tuple[str, float]]:
@@ -112,30 +134,6 @@ def _names(model: Any) -> tuple[list[str], list[str]]:
     alone = [f.is_linear and model.input_of.count(f.channel) == 1 for f in found]
     own = [f.name if linear else f.word for f, linear in zip(found, alone) if f.family == "nonlinearities"]
     return own, [f.word for f in found if f.family == "feedback"]
-
-
-def _equations(model: Any, digits: int) -> str:
-    functions, (names, words), (inner, latent) = [], _names(model), latent_names(model)
-    for f, c, name in zip(model.nonlinearities, model.input_of, names):
-        sample = f"{model.inputs[c]}(k)"
-        linear = name == model.inputs[c]
-        functions.append((float(f.mu[0]), sample) if linear else (1.0, f"{name}({sample})"))
-    errors = [f"e_{name}(k)" if model.l > 1 else "e(k)" for name in model.outputs]
-    samples = {
-        "x": [f"x{i + 1}(k)" for i in range(model.nx)], "y": [f"{name}(k)" for name in model.outputs], "e": errors,
-        "g": [f"{name}({model.outputs[o]}(k))" for name, o in zip(words, model.output_of)], "": [""],
-        "h": [f"{h}({z}(k))" for h, z in zip(inner, latent)], "u": [f"{name}(k)" for name in model.inputs],
-    }
-    signals = {signal: [(1.0, name) for name in names] for signal, names in samples.items()} | {"f": functions}
-    lines = []
-    for kind, left in (("x", [f"x{i + 1}(k+1)" for i in range(model.nx)]), ("y", samples["y"]),
-                       ("z", [f"{name}(k)" for name in latent])):
-        for i, name in enumerate(left):
-            terms = [(float(value) * scale, word) for matrix, signal in TERMS[kind].items()
-                     for value, (scale, word) in zip(np.atleast_1d(getattr(model, matrix)[i]), signals[signal])]
-            tail = f" + {errors[i]}" if kind == "y" and np.any(model.K) else ""
-            lines.append(f"{name} = {signed_sum(terms, digits)}{tail}")
-    return "\n".join(lines)
 
 
 def _summary(model: Any) -> str:

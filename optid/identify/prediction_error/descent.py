@@ -192,6 +192,15 @@ def _gain(root: Array, at: Linearised) -> float:
     return float(np.sum((basis.T @ at.pull) ** 2)) + at.reach - float(at.pull @ at.pull)
 
 
+def with_poles(criterion: Criterion, x: Array, a: Array) -> Descent:
+    """Return what belongs to a given stable A: the rest of the unknowns after a few steps with A held."""
+    unknowns, moved = criterion.unknowns, x.copy()
+    moved[unknowns.slices["a"]] = a
+    held = np.zeros(unknowns.shared, dtype=bool)
+    held[unknowns.slices["a"]] = True
+    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3)
+
+
 def best_of(criterion: Criterion, starts: Iterable[tuple[str, Array]], iterations: int = STEPS, *,
             enough: int | None = None) -> list[Descent]:
     """Descend from every start; the best comes first, those that end at the border of stability last.

@@ -9,8 +9,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
-from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend
-from optid.identify.prediction_error.plant_starts import with_poles
+from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend, with_poles
 from optid.identify.prediction_error.tangent_fit import TangentFit, violation
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models.roots import contained

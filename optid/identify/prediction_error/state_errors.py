@@ -242,9 +242,8 @@ def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index
         samples = slice(first, min(first + chunk, len(job.u)))
         eta = [basis.values(job.u[samples, c]) for c, basis in enumerate(unknowns.expansion.inputs)]
         f = np.column_stack([part @ mu for part, mu in zip(eta, point.mus)])
-        stretch, count = simulation.stretch_of(job, samples, f), len(f)
-        states, outputs, block = np.empty((count, n)), np.empty((count, l)), np.empty((count, l, turn.shape[1] + 1))
-        simulation.march(job, first, stretch, state, outputs, states)
+        stretch, block = simulation.stretch_of(job, samples, f), np.empty((len(f), l, turn.shape[1] + 1))
+        states, outputs = simulation.march(job, first, stretch, state)
         run = simulation.signals(job, stretch, states, outputs)
         values = _values(unknowns, point, stretch, states, outputs, run.slopes, job.u[samples], f, eta)
         sensitivities(parts, direct, run._replace(values=values), turn, block)

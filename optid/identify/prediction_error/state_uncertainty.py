@@ -7,7 +7,6 @@ Identification, 1999, chapter 9).
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -27,23 +26,20 @@ LEAST = 8  # order of the noise, at least, for which the autoregression has lags
 NO_EFFECT = 1e-9  # size of an effect on the errors, relative to the largest, that is rounding
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class CompressedStates(CompressedErrors):
     """The compressed errors of a state-space model; see `CompressedErrors`."""
 
-    criterion: StateErrors  # the errors
+    criterion: StateErrors
     outward: Transform  # from the units of the programme's models to those of the record
     fixed: bool = False  # whether the programme fixes by rows what changes no output
 
     def settle(self, program: Program) -> None:
         """Linearise the errors anew, where the variables of the programme stand."""
-        x = self.places.pack(program.values())
-        for name in ("problem", "statistics", "free", "_scaled"):
-            self.__dict__.pop(name, None)
-        for name, value in {"reference": x, "at": self.criterion.linearise(x)}.items():
-            object.__setattr__(self, name, value)
+        self.reference = self.places.pack(program.values())
+        self.at = self.criterion.linearise(self.reference)
 
-    @cached_property
+    @property
     def _scaled(self) -> tuple[Array, Array, Array]:
         """Column sizes, singular values and right vectors of the factor, its columns scaled to one."""
         matrix = self.at.whole[0]
@@ -51,7 +47,7 @@ class CompressedStates(CompressedErrors):
         sizes = np.where(sizes > 0, sizes, 1.0)
         return sizes, *np.linalg.svd(matrix / sizes)[1:]
 
-    @cached_property
+    @property
     def free(self) -> Array:
         """Directions (k, n) in which functions of latent signals change into each other, as rows of weight.
 
@@ -71,11 +67,11 @@ class CompressedStates(CompressedErrors):
         values = self._scaled[1][: len(self.reference) - len(self.free)]
         return float(values[0] / max(values[-1], 1e-300))
 
-    @cached_property
+    @property
     def problem(self) -> LeastSquares:
-        """The sum of squares in z."""
-        matrix, errors = self.at.whole
-        root, errors = np.vstack([matrix, self.free]), np.append(errors, np.zeros(len(self.free)))
+        """The sum of squares in z, with the directions that are free."""
+        (matrix, errors), free = self.at.whole, self.free
+        root, errors = np.vstack([matrix, free]), np.append(errors, np.zeros(len(free)))
         return LeastSquares(root, root @ self.reference - errors, self.at.remainder)
 
     def one_step_fit(self, values: object) -> None:

@@ -1,10 +1,10 @@
 """What a formulation hands to the iteration: named variables, the programme of a step, and the model of its values."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import cvxpy as cp
 import numpy as np
@@ -28,13 +28,13 @@ class Places:
     names: Mapping[str, str]  # {variable: part of the vector}, in its order; "x0" is the initial states
 
     @classmethod
-    def of(cls, unknowns: Unknowns, name: Callable[[str, int], str]) -> "Places":
-        """Name the parts; ``name`` gives the variable of a part such as "mu" with its number."""
-        found = {}
+    def of(cls, criterion: Criterion) -> "Places":
+        """Name the parts by the keys of a criterion."""
+        found, unknowns = {}, criterion.unknowns
         for part, shape in unknowns.shapes.items():
             kind = part.rstrip("0123456789")
             if np.prod(shape):
-                found[part if kind == part else name(kind, int(part[len(kind) :]))] = part
+                found[part if kind == part else criterion.key(kind, int(part[len(kind) :]))] = part
         return cls(unknowns, {**found, "x0": "x0"} if unknowns.memory else found)
 
     def values(self, x: Array) -> dict[str, Array]:
@@ -80,7 +80,7 @@ class TangentFit(ABC):
     @cached_property
     def places(self) -> Places:
         """The named variables in the order of the unknowns."""
-        return Places.of(self.criterion.unknowns, self.criterion.key)
+        return Places.of(self.criterion)
 
     def signed(self, x: Array) -> Array:
         """Turn the signs of mu and b to where the constraints are violated least.
@@ -114,8 +114,7 @@ def violation(program: Program) -> float:
     return measure_violation(program)[0]
 
 
-@dataclass(frozen=True, eq=False)
-class LeastSquares:
+class LeastSquares(NamedTuple):
     """``‖root z - target‖² + remainder``."""
 
     root: Array
@@ -123,8 +122,7 @@ class LeastSquares:
     remainder: float
 
 
-@dataclass(frozen=True, eq=False)
-class ErrorRows:
+class ErrorRows(NamedTuple):
     """The triangular factor ``root`` (n + 1, n + 1) of [sensitivities | errors], and the rows it came from."""
 
     root: Array
@@ -134,46 +132,55 @@ class ErrorRows:
     method: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class CompressedErrors:
     """The compressed errors near an iterate, for uncertainty, prices and figures."""
 
-    at: Linearised  # the errors near the iterate
-    places: Places  # where the variables stand in the flattened variables z
-    reference: Array  # (n,) z of the iterate
-    energy: Array  # (1,) sum of squares of the output about its mean
-    candidates: int  # samples of the record
+    criterion: Criterion  # the errors
+    at: Linearised  # these near the iterate
+    reference: Array  # (n,) variables of the iterate, flattened: z
 
     @cached_property
+    def places(self) -> Places:
+        """Where the variables stand in z."""
+        return Places.of(self.criterion)
+
+    @property
+    def energy(self) -> Array:
+        """Sum of squares of the output about its mean, (1,)."""
+        return np.array([self.criterion.energy])
+
+    @property
     def problem(self) -> LeastSquares:
         """The sum of squares in z."""
         root, errors = self.at.whole
         return LeastSquares(root, root @ self.reference - errors, self.at.remainder)
 
-    @cached_property
+    @property
     def statistics(self) -> ErrorRows:
         """The same as a factor of rows."""
         size, (matrix, errors) = len(self.reference), self.at.whole
         root = np.zeros((size + 1, size + 1))
         root[:size, :size], root[:size, size] = matrix, matrix @ self.reference - errors
         root[size, size] = np.sqrt(self.at.remainder)
-        return ErrorRows(root, self.at.rows, self.candidates, self.condition, self.at.method)
+        candidates = sum(e.y.size for e in self.criterion.data.experiments)
+        return ErrorRows(root, self.at.rows, candidates, self.condition, self.at.method)
 
     @property
     def condition(self) -> float:
         """Condition number of the scaled sensitivities."""
         return self.at.condition
 
-    def lifted(self, values: Mapping[str, Array]) -> Array:
-        """Return z."""
-        return self.places.pack(values)
-
     @property
     def columns(self) -> NDArray[np.intp]:
         """Positions (n, 1) in z of the coefficients of the columns."""
         return np.arange(len(self.reference))[:, None]
 
-    def one_step_fit(self, values: Mapping[str, Array]) -> Array:
+    def lifted(self, values: Mapping[str, Array]) -> Array:
+        """Return z."""
+        return self.places.pack(values)
+
+    def one_step_fit(self, values: Mapping[str, Array]) -> Array | None:
         """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
         value = self.at.after(self.lifted(values) - self.reference)
         return 100.0 * (1.0 - np.sqrt(value / np.maximum(self.energy, 1e-300)))
