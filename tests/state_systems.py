@@ -17,8 +17,7 @@ def linear(seed=0, n=3, m=2, outputs=2, radius=0.8, **changes):
     arguments = {
         "A": A, "B": rng.normal(size=(n, m)), "C": rng.normal(size=(outputs, n)), "D": rng.normal(size=(outputs, m)),
         "K": 0.1 * rng.normal(size=(n, outputs)), "offset_x": rng.normal(size=n), "offset_y": rng.normal(size=outputs),
-        "dt": 0.5,
-    }
+        "dt": 0.5}
     return HammersteinSS(**(arguments | changes))
 
 
@@ -36,8 +35,7 @@ def with_feedback(basis=None, seed=0, **changes):
         "input_of": (0, 1, 1), "E": 0.1 * rng.normal(size=(3, 2)), "feedback": fed, "output_of": (1, 0),
         "L": 0.05 * rng.normal(size=(3, 2)), "K": 0.2 * rng.normal(size=(3, 2)), "offset_x": [0.1, -0.2, 0.05],
         "offset_y": [0.2, -0.1], "noise": NoiseCovariances(noise[:3, :3], noise[3:, 3:], noise[:3, 3:], np.eye(2)),
-        "dt": 0.5, "input_units": ("A", ""), "outputs": ("p", "q"),
-    }
+        "dt": 0.5, "input_units": ("A", ""), "outputs": ("p", "q")}
     return HammersteinSS(**(arguments | changes))
 
 
@@ -45,8 +43,7 @@ FEEDBACK_BASES = [
     Polynomial(3), Polynomial(4, outside="extrapolate"), Triangular(5), Triangular(4, outside="extrapolate"),
     BSpline(5), BSpline(4, degree=2, outside="extrapolate"),
     BSpline(4, outside="linear"), Polynomial(3, outside="linear"), PiecewiseConstant(6), Trigonometric(2), Linear(),
-    USER,
-]
+    USER]
 
 
 def by_hand(model, u, x0, y=None, gain=None, noise=None):

@@ -5,17 +5,15 @@ import numpy as np
 from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangular, Trigonometric
 from optid.models import HammersteinTF, Nonlinearity
 
-BASES = [
-    Triangular(7),
-    Trigonometric(3),
-    Polynomial(4),
-    BSpline(5),
-    BSpline(4, degree=2),
-    PiecewiseConstant(6),
-    Linear(),
-    Triangular(5, outside="extrapolate"),
-    BSpline(5, outside="extrapolate"),
-]
+BASES = [Triangular(7),
+         Trigonometric(3),
+         Polynomial(4),
+         BSpline(5),
+         BSpline(4, degree=2),
+         PiecewiseConstant(6),
+         Linear(),
+         Triangular(5, outside="extrapolate"),
+         BSpline(5, outside="extrapolate")]
 
 
 def nonlinearity(basis, seed=0, interval=(-0.7, 1.3)):
@@ -25,14 +23,12 @@ def nonlinearity(basis, seed=0, interval=(-0.7, 1.3)):
 
 def siso(basis=None, nk=0, offset=0.3, **changes):
     """The second-order example with poles 0.75 +- 0.37i."""
-    arguments = {
-        "a": [-1.5, 0.7],
-        "b": ([16 / 15, 0.8],),
-        "nonlinearities": (nonlinearity(basis or Triangular(7)),),
-        "nk": (nk,),
-        "offset": offset,
-        "dt": 0.1,
-    }
+    arguments = {"a": [-1.5, 0.7],
+                 "b": ([16 / 15, 0.8],),
+                 "nonlinearities": (nonlinearity(basis or Triangular(7)),),
+                 "nk": (nk,),
+                 "offset": offset,
+                 "dt": 0.1}
     return HammersteinTF(**(arguments | changes))
 
 
@@ -41,8 +37,7 @@ def mimo():
     a = [[[-0.9, 0.1], [0.2, -0.5]], [[0.3, 0.0], [-0.1, 0.1]]]
     b = ([[1.0, 0.5], [0.4, -0.2]], [[0.0, 1.0]], [[0.3, 0.1], [0.2, 0.2], [-0.1, 0.4]])
     functions = tuple(
-        nonlinearity(basis, seed) for seed, basis in enumerate([Triangular(6), Polynomial(3), BSpline(4)])
-    )
+        nonlinearity(basis, seed) for seed, basis in enumerate([Triangular(6), Polynomial(3), BSpline(4)]))
     return HammersteinTF(a, b, functions, (0, 2, 1), [0.2, -0.4], dt=0.5, input_units=("A", "", "m"))
 
 

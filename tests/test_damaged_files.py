@@ -121,5 +121,4 @@ def models():
         "armax": optid.fit(one, "hammerstein_armax.exact", na=1, nb=1, nc=1, basis=optid.Polynomial(3), prove=False),
         "ss": optid.fit(both, "hammerstein_ss.sid", nx=2, basis=optid.Polynomial(3), prove=False),
         "feedback": optid.fit(both, "hammerstein_ss.asivid", nx=2, basis=optid.Linear(),
-                              feedback_basis=optid.Polynomial(2), prove=False),
-    }
+                              feedback_basis=optid.Polynomial(2), prove=False)}

@@ -8,6 +8,7 @@ import sys
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refuses
 from sample_fits import feedback_fit
 from scipy import signal, special
 from systems import BASES, inputs, mimo, nonlinearity, siso
@@ -28,10 +29,8 @@ def test_dlti_has_the_impulse_responses(model):
 
 
 def test_dlti_channels():
-    with pytest.raises(StructureError, match="Known: u|Did you mean 'u'"):
-        siso().to_dlti(input="x")
-    with pytest.raises(StructureError, match="counted from 0"):
-        siso().to_dlti(output=1)
+    refuses(StructureError, "Known: u|Did you mean 'u'", siso().to_dlti, input="x")
+    refuses(StructureError, "counted from 0", siso().to_dlti, output=1)
     assert isinstance(siso().to_dlti(), signal.dlti)
 
 
@@ -49,8 +48,7 @@ def test_control_has_the_frequency_response(model):
 
 def test_control_missing_names_the_remedy(monkeypatch):
     monkeypatch.setitem(sys.modules, "control", None)
-    with pytest.raises(OptidError, match=r"optid\[control\]"):
-        siso().to_control()
+    refuses(OptidError, r"optid\[control\]", siso().to_control)
 
 
 def iterate(function, u, state):
@@ -93,8 +91,7 @@ def test_casadi_in_a_predictive_controller():
     u = ca.MX.sym("u")
     y = model.to_casadi()(ca.DM([0.1, 0.0]), u)[1]
     solver = ca.nlpsol(
-        "s", "ipopt", {"x": u, "f": (y - 0.8) ** 2}, {"print_time": 0, "ipopt": {"print_level": 0, "sb": "yes"}}
-    )
+        "s", "ipopt", {"x": u, "f": (y - 0.8) ** 2}, {"print_time": 0, "ipopt": {"print_level": 0, "sb": "yes"}})
     best = float(solver(x0=0.0, lbx=-0.7, ubx=1.3)["x"])
     assert model.simulate(np.array([[best]]), x0=[0.1, 0.0])[0, 0] == pytest.approx(0.8, abs=1e-4)
 
@@ -109,14 +106,12 @@ def test_user_functions_are_called_with_symbols():
 
 def test_a_user_function_that_takes_arrays_only_is_refused():
     functions = UserFunctions((special.j1,), ("bessel",)).fitted(-1, 1)
-    with pytest.raises(StructureError, match="CasADi scalar"):
-        siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi()
+    refuses(StructureError, "CasADi scalar", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
 
 
 def test_a_user_function_that_means_something_else_of_symbols_is_refused():
     functions = UserFunctions((lambda v: v * (2.0 if isinstance(v, np.ndarray) else 3.0),), ("two",)).fitted(-1, 1)
-    with pytest.raises(StructureError, match="other values"):
-        siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi()
+    refuses(StructureError, "other values", siso(nonlinearities=(Nonlinearity(functions, [1.0]),)).to_casadi)
 
 
 def test_control_keeps_the_names_of_the_channels():
@@ -150,5 +145,4 @@ def test_compiled_c_equals_the_simulation(name, tmp_path):
 
 
 def test_c_refuses_a_name_that_is_none(tmp_path):
-    with pytest.raises(StructureError, match="C function"):
-        siso().to_c(tmp_path / "a.c", "my-plant")
+    refuses(StructureError, "C function", siso().to_c, tmp_path / "a.c", "my-plant")

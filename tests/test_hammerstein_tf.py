@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.signal import lfilter
 from systems import inputs, mimo, nonlinearity, siso
 
@@ -177,8 +178,7 @@ def test_several_experiments_each_with_its_own_state():
             for found, part in zip(model.predict(both, horizon), parts):
                 assert np.array_equal(found, model.predict(part, horizon), equal_nan=True)
         assert len(model.simulate(both)) == 2 and len(model.innovations(both)) == 2
-    with pytest.raises(StructureError, match="give one each"):
-        model.predict(both, x0=[np.zeros(2)])
+    refuses(StructureError, "give one each", model.predict, both, x0=[np.zeros(2)])
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -233,24 +233,16 @@ def test_words():
 
 def test_refusals():
     plant = siso()
-    with pytest.raises(StructureError, match="one output"):
-        replace(mimo(), d=())
-    with pytest.raises(StructureError, match="not invertible.*modulus 1.25.*Reflect"):
-        replace(plant, c=[-1.25])
-    with pytest.raises(StructureError, match="not invertible"):
-        replace(plant, c=[1.0])
-    with pytest.raises(StructureError, match="not finite"):
-        replace(plant, c=[np.nan])
-    with pytest.raises(StructureError, match=r"\(nd,\)"):
-        replace(plant, d=[[0.1]])
+    refuses(StructureError, "one output", replace, mimo(), d=())
+    refuses(StructureError, "not invertible.*modulus 1.25.*Reflect", replace, plant, c=[-1.25])
+    refuses(StructureError, "not invertible", replace, plant, c=[1.0])
+    refuses(StructureError, "not finite", replace, plant, c=[np.nan])
+    refuses(StructureError, r"\(nd,\)", replace, plant, d=[[0.1]])
     model = replace(plant, d=())
     data, _ = noisy(model, 30)
-    with pytest.raises(StructureError, match="horizon"):
-        model.predict(data, 0)
-    with pytest.raises(StructureError, match="'zero', 'fit'"):
-        model.predict(data, x0="steady")
-    with pytest.raises(DataError, match="sampled every"):
-        model.predict(Data(data.u, data.y, dt=7.0))
+    refuses(StructureError, "horizon", model.predict, data, 0)
+    refuses(StructureError, "'zero', 'fit'", model.predict, data, x0="steady")
+    refuses(DataError, "sampled every", model.predict, Data(data.u, data.y, dt=7.0))
 
 
 def test_reflection_keeps_the_spectrum():

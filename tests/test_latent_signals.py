@@ -73,8 +73,7 @@ def test_several_steps_ahead_without_correction_are_the_free_run(model):
     lambda model: model.transformed(np.array([[1.0, 0.3, 0.0], [0.0, 2.0, -0.1], [0.4, 0.0, 0.5]])),
     lambda model: model.injected(0.1 * np.ones((3, 2))),
     lambda model: HammersteinSS.from_dict(model.to_dict()),
-    lambda model: model.regauge("norm"),
-])
+    lambda model: model.regauge("norm")])
 def test_forms_that_simulate_the_same(change):
     model, u = latent(), inputs()
     other = change(model)

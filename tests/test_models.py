@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 from systems import BASES, by_hand, inputs, mimo, nonlinearity, siso
 
 from optid.bases import Linear, Triangular, UserFunctions
@@ -40,10 +41,8 @@ def test_nonlinearity_equals_its_expansion(basis):
 
 
 def test_nonlinearity_refuses_wrong_coefficients():
-    with pytest.raises(StructureError, match=r"needs \(7,\)"):
-        Nonlinearity(Triangular(7).fitted(0, 1), np.ones(8))
-    with pytest.raises(StructureError, match=r"mu\[1\]"):
-        Nonlinearity(Triangular(2).fitted(0, 1), np.array([1.0, np.nan]))
+    refuses(StructureError, r"needs \(7,\)", Nonlinearity, Triangular(7).fitted(0, 1), np.ones(8))
+    refuses(StructureError, r"mu\[1\]", Nonlinearity, Triangular(2).fitted(0, 1), np.array([1.0, np.nan]))
 
 
 # -- simulation and prediction ---------------------------------------------------------------------------------------
@@ -109,8 +108,7 @@ def test_several_experiments_and_shapes():
         assert [r.shape for r in result] == [(50, 1), (70, 1)]
     assert model.simulate(parts[0][:, 0]).shape == (50,)
     assert model.simulate(data, x0=[np.zeros(2), np.ones((2, 1))])[1] == pytest.approx(
-        model.simulate(parts[1], x0=np.ones(2))
-    )
+        model.simulate(parts[1], x0=np.ones(2)))
 
 
 def test_simulation_refusals():
@@ -118,26 +116,17 @@ def test_simulation_refusals():
     data = record(model)
     u = data.u.copy()
     u[7] = np.nan
-    with pytest.raises(DataError, match="Input 'u' is missing at sample 7.*Interpolate"):
-        model.simulate(u)
-    with pytest.raises(DataError, match="2 channels; the model has 1"):
-        model.simulate(np.zeros((9, 2)))
-    with pytest.raises(StructureError, match="needs the outputs"):
-        model.simulate(data.u, x0="fit")
-    with pytest.raises(StructureError, match="'zero', 'fit'"):
-        model.simulate(data.u, x0="steady")
-    with pytest.raises(StructureError, match=r"\(2, 1\)"):
-        model.simulate(data.u, x0=np.zeros(3))
-    with pytest.raises(StructureError, match="give one each"):
-        model.simulate([data.u, data.u], x0=[np.zeros(2)])
-    with pytest.raises(DataError, match="sampled every 0.2"):
-        model.simulate(Data(data.u, data.y, dt=0.2))
+    refuses(DataError, "Input 'u' is missing at sample 7.*Interpolate", model.simulate, u)
+    refuses(DataError, "2 channels; the model has 1", model.simulate, np.zeros((9, 2)))
+    refuses(StructureError, "needs the outputs", model.simulate, data.u, x0="fit")
+    refuses(StructureError, "'zero', 'fit'", model.simulate, data.u, x0="steady")
+    refuses(StructureError, r"\(2, 1\)", model.simulate, data.u, x0=np.zeros(3))
+    refuses(StructureError, "give one each", model.simulate, [data.u, data.u], x0=[np.zeros(2)])
+    refuses(DataError, "sampled every 0.2", model.simulate, Data(data.u, data.y, dt=0.2))
     with pytest.raises(DataError, match=r"data.select\(outputs="):
         mimo().predict(Data(np.zeros((20, 3)), np.zeros((20, 2)), dt=0.5, outputs=["y2", "y1"]))
-    with pytest.raises(DataError, match="follows from 2 samples"):
-        model.state([1.0], [1.0])
-    with pytest.raises(DataError, match="missing 2 samples before the end"):
-        model.state([1.0, 1.0, 1.0], [1.0, np.nan, 1.0])
+    refuses(DataError, "follows from 2 samples", model.state, [1.0], [1.0])
+    refuses(DataError, "missing 2 samples before the end", model.state, [1.0, 1.0, 1.0], [1.0, np.nan, 1.0])
 
 
 def test_unstable_model_warns_and_names_the_overflow():
@@ -146,10 +135,8 @@ def test_unstable_model_warns_and_names_the_overflow():
     with pytest.warns(DataWarning, match="radius 2"):
         model.simulate(inputs(model, 20))
     overflow = np.log(np.finfo(float).max) / np.log(radius)
-    with (
-        pytest.warns(DataWarning),
-        pytest.raises(DataError, match="'y' leaves the range of numbers at sample") as caught,
-    ):
+    with (pytest.warns(DataWarning),
+          pytest.raises(DataError, match="'y' leaves the range of numbers at sample") as caught):
         model.simulate(inputs(model, 2000))
     assert abs(int(str(caught.value).split("at sample ")[1].split(":")[0]) - overflow) < 20
     double = mimo()
@@ -206,10 +193,8 @@ def test_static_gain_is_the_slope_of_the_steady_state(model):
             ends.append(model.simulate(np.tile(point, (600, 1)))[-1])
         gain[:, c] = (ends[0] - ends[1]) / (2 * step)
     assert np.reshape(model.static_gain(u0), gain.shape) == pytest.approx(gain, abs=1e-6)
-    with pytest.raises(StructureError, match="integrator"):
-        replace(model, a=-np.eye(2)[None] if model.l > 1 else [-1.0]).static_gain(u0)
-    with pytest.raises(StructureError, match="one operating point per input"):
-        model.static_gain(np.zeros(7))
+    refuses(StructureError, "integrator", replace(model, a=-np.eye(2)[None] if model.l > 1 else [-1.0]).static_gain, u0)
+    refuses(StructureError, "one operating point per input", model.static_gain, np.zeros(7))
 
 
 # -- gauge, offset, units ----------------------------------------------------------
@@ -220,15 +205,12 @@ def test_static_gain_is_the_slope_of_the_steady_state(model):
 @given(scale=st.floats(-50, 50).filter(lambda x: abs(x) > 0.02), gauge=st.sampled_from(["norm", "gain", "b0", "none"]))
 def test_predictions_do_not_depend_on_the_gauge(model, scale, gauge):
     if model.l > 1 and gauge in ("gain", "b0"):
-        with pytest.raises(StructureError, match="cannot be reached|one output"):
-            model.regauge(gauge)
+        refuses(StructureError, "cannot be reached|one output", model.regauge, gauge)
         return
     data = record(model)
-    scaled = replace(
-        model,
-        b=tuple(b / scale for b in model.b),
-        nonlinearities=tuple(replace(f, mu=scale * f.mu) for f in model.nonlinearities),
-    )
+    scaled = replace(model,
+                     b=tuple(b / scale for b in model.b),
+                     nonlinearities=tuple(replace(f, mu=scale * f.mu) for f in model.nonlinearities))
     other = scaled.regauge(gauge)
     size = np.max(np.abs(data.y))
     assert other.simulate(data) == pytest.approx(data.y, abs=1e-12 * size)
@@ -247,14 +229,10 @@ def test_predictions_do_not_depend_on_the_gauge(model, scale, gauge):
 
 
 def test_gauge_refusals():
-    with pytest.raises(StructureError, match="gauge=.norn.: use one of norm, gain"):
-        siso().regauge("norn")
-    with pytest.raises(StructureError, match="static gain"):
-        siso(b=([1.0, -1.0],)).regauge("gain")
-    with pytest.raises(StructureError, match="is zero"):
-        siso(b=([0.0, 0.0],)).regauge("norm")
-    with pytest.raises(StructureError, match="infinite"):
-        siso(a=[-1.0]).regauge("gain")
+    refuses(StructureError, "gauge=.norn.: use one of norm, gain", siso().regauge, "norn")
+    refuses(StructureError, "static gain", siso(b=([1.0, -1.0],)).regauge, "gain")
+    refuses(StructureError, "is zero", siso(b=([0.0, 0.0],)).regauge, "norm")
+    refuses(StructureError, "infinite", siso(a=[-1.0]).regauge, "gain")
 
 
 def test_offset_of_f_is_restored_where_it_can_be():
@@ -271,18 +249,15 @@ def test_offset_of_f_is_restored_where_it_can_be():
     assert mimo().c0 is None and "several inputs" in mimo().offset_note and len(mimo().f) == 3
     assert siso(Linear()).c0 is None
     two = HammersteinTF(
-        np.zeros((0, 2, 2)), ([[1.0, 2.0], [0.0, 1.0]],), (nonlinearity(Triangular(4)),), (0,), [0.5, 1.5]
-    )
+        np.zeros((0, 2, 2)), ([[1.0, 2.0], [0.0, 1.0]],), (nonlinearity(Triangular(4)),), (0,), [0.5, 1.5])
     assert two.c0 == pytest.approx(0.5)
     assert replace(two, offset=np.array([0.5, 0.0])).c0 is None
 
 
 @pytest.mark.sampled(5)
 @pytest.mark.parametrize("basis", BASES)
-@given(
-    scales=st.tuples(st.floats(0.01, 100), st.floats(0.01, 100)),
-    offsets=st.tuples(st.floats(-20, 20), st.floats(-20, 20)),
-)
+@given(scales=st.tuples(st.floats(0.01, 100), st.floats(0.01, 100)),
+       offsets=st.tuples(st.floats(-20, 20), st.floats(-20, 20)))
 def test_raw_units_siso(basis, scales, offsets):
     transform = Transform((scales[0],), (offsets[0],), (scales[1],), (offsets[1],))
     model = siso(basis, gauge="b0").regauge("b0")
@@ -305,8 +280,7 @@ def test_raw_units_mimo_and_linear():
     check_raw(mimo().regauge("norm"), transform)
     linear = siso(Linear()).regauge("none").with_transform(Transform((4.0,), (1.0,), (2.0,), (0.0,)))
     assert linear.nonlinearities[0].mu[0] == pytest.approx(1)
-    with pytest.raises(StructureError, match="3 inputs"):
-        siso().with_transform(transform)
+    refuses(StructureError, "3 inputs", siso().with_transform, transform)
     assert siso().with_transform(Transform.identity(1, 1)).a.tolist() == [-1.5, 0.7]
 
 
@@ -345,25 +319,20 @@ def test_orders_and_layout():
     assert model.theta(2).shape == (6, 6)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"a": [[1.0]]}, r"\(na,\) is needed"),
-        ({"b": ([[1.0, 2.0]],)}, r"b\[0\]"),
-        ({"b": ([],)}, r"b\[0\]"),
-        ({"b": ()}, "nonlinearities has 1 entries for 0 inputs"),
-        ({"b": ([1.0], [1.0])}, "nonlinearities has 1"),
-        ({"nk": -1}, "nk of input .u. must be a nonnegative integer"),
-        ({"a": [np.inf]}, "not finite"),
-        ({"dt": 0.0}, "positive"),
-        ({"gauge": "unit"}, "gauge"),
-        ({"outputs": ("y", "z")}, "2 names"),
-        ({"nonlinearities": (replace(nonlinearity(Triangular(3)), offset=1.0),)}, "offset="),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"),
+                         [({"a": [[1.0]]}, r"\(na,\) is needed"),
+                          ({"b": ([[1.0, 2.0]],)}, r"b\[0\]"),
+                          ({"b": ([],)}, r"b\[0\]"),
+                          ({"b": ()}, "nonlinearities has 1 entries for 0 inputs"),
+                          ({"b": ([1.0], [1.0])}, "nonlinearities has 1"),
+                          ({"nk": -1}, "nk of input .u. must be a nonnegative integer"),
+                          ({"a": [np.inf]}, "not finite"),
+                          ({"dt": 0.0}, "positive"),
+                          ({"gauge": "unit"}, "gauge"),
+                          ({"outputs": ("y", "z")}, "2 names"),
+                          ({"nonlinearities": (replace(nonlinearity(Triangular(3)), offset=1.0),)}, "offset=")])
 def test_inconsistent_models(changes, words):
-    with pytest.raises(StructureError, match=words):
-        siso(**changes)
+    refuses(StructureError, words, siso, **changes)
 
 
 def test_stable_models_do_not_warn():
@@ -383,5 +352,4 @@ def test_prediction_several_steps_ahead_is_simulation_from_the_state_then(make, 
         known = k - horizon + 1  # samples before this one are known
         state = model.state(u[:known], y[:known])
         assert predicted[k] == pytest.approx(model.simulate(longer[known:], state)[k - known], abs=1e-10)
-    with pytest.raises(StructureError, match="horizon must be a positive integer"):
-        model.predict(Data(u, y, dt=model.dt), 0)
+    refuses(StructureError, "horizon must be a positive integer", model.predict, Data(u, y, dt=model.dt), 0)

@@ -2,32 +2,29 @@
 
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.optimize import approx_fprime
 from scipy.signal import csd
 
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.noise import (
-    _most_likely,
-    _part,
-    colour,
-    noise_spectrum,
-    residuals,
-    whitening_gain,
-    with_noise,
-)
+from optid.identify.noise import (_most_likely,
+                                  _part,
+                                  colour,
+                                  noise_spectrum,
+                                  residuals,
+                                  whitening_gain,
+                                  with_noise)
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import (
-    _equations,
-    _initial,
-    _parts,
-    _slope,
-    covariance_of,
-    innovations,
-    innovations_covariance,
-    log_determinant,
-    refined,
-)
+from optid.models.innovation_gain import (_equations,
+                                          _initial,
+                                          _parts,
+                                          _slope,
+                                          covariance_of,
+                                          innovations,
+                                          innovations_covariance,
+                                          log_determinant,
+                                          refined)
 from optid.models.kalman import NoiseCovariances, kalman_gain
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
@@ -71,11 +68,9 @@ def test_gain_innovations_and_spectrum_are_recovered(lengths, missing, most, see
     model = truth(seed)
     found = with_noise(bare(model), record(model, lengths, seed + 10, missing))
     w = np.linspace(0.02, 3.1, 50)
-    for got, true in (
-        (found.K, model.K),
-        (found.noise.innovation, model.noise.innovation),
-        (noise_spectrum(found, w), noise_spectrum(model, w)),
-    ):
+    for got, true in ((found.K, model.K),
+                      (found.noise.innovation, model.noise.innovation),
+                      (noise_spectrum(found, w), noise_spectrum(model, w))):
         assert np.linalg.norm(got - true) < most * np.linalg.norm(true)
 
 
@@ -195,8 +190,7 @@ def test_without_noise_there_is_nothing_to_estimate():
     model, u = bare(truth()), np.random.default_rng(0).normal(size=(300, 2))
     found = with_noise(model, Data(u, model.simulate(u)))
     assert not found.K.any() and np.abs(found.noise.innovation).max() < 1e-15
-    with pytest.raises(StructureError, match="no noise covariances"):
-        noise_spectrum(model, [0.1])
+    refuses(StructureError, "no noise covariances", noise_spectrum, model, [0.1])
 
 
 def test_covariances_with_missing_samples_by_hand():
@@ -286,7 +280,5 @@ def test_the_autoregression_of_the_errors_of_an_observer_shows_the_gain():
         x, predicted = A @ x + k @ e[t], A @ predicted + gain @ errors[t]
     errors[15000] = np.nan
     assert whitening_gain(A, C, gain, [errors]) == pytest.approx(k, abs=0.05)
-    with pytest.raises(StructureError, match="too few"):
-        whitening_gain(A, C, gain, [errors[:50]])
-    with pytest.raises(StructureError, match="predicted exactly"):
-        whitening_gain(A, C, gain, [errors[:15000] * [1.0, 0.0]])
+    refuses(StructureError, "too few", whitening_gain, A, C, gain, [errors[:50]])
+    refuses(StructureError, "predicted exactly", whitening_gain, A, C, gain, [errors[:15000] * [1.0, 0.0]])

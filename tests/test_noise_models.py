@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -321,34 +322,27 @@ def test_results_by_name():
     ({"nb": 0}, StructureError, "nb of input 'u'"),
     ({"starts": 0}, StructureError, "starts"),
     ({"gauge": "none"}, StructureError, "gauge='none': use one of norm, gain, b0"),
-    ({"na": 60, "nb": 60}, RankError, "rows|samples"),
-])
+    ({"na": 60, "nb": 60}, RankError, "rows|samples")])
 def test_structure_that_will_not_do(changes, error, words):
     data = record(system("armax"), (120,))
     for pose, orders in ORDERS.values():
-        with pytest.raises(error, match=words):
-            quiet(data, pose, **(orders | changes))
+        refuses(error, words, quiet, data, pose, **orders | changes)
 
 
 @pytest.mark.slow
 def test_orders_of_the_noise_beyond_the_record():
     data = record(system("armax"), (40,))
-    with pytest.raises(RankError, match="prediction errors for"):
-        quiet(data, armax, **(ORDERS["armax"][1] | {"nc": 30}))
-    with pytest.raises(RankError, match="prediction errors for"):
-        quiet(data, bj, **(ORDERS["bj"][1] | {"nd": 30}))
+    refuses(RankError, "prediction errors for", quiet, data, armax, **ORDERS["armax"][1] | {"nc": 30})
+    refuses(RankError, "prediction errors for", quiet, data, bj, **ORDERS["bj"][1] | {"nd": 30})
 
 
 @pytest.mark.parametrize("kind", ORDERS)
 def test_records_that_will_not_do(kind):
     pose, orders = ORDERS[kind]
     data = record(system(kind), (200,))
-    with pytest.raises(StructureError, match="one output"):
-        quiet(Data(data.u, np.hstack([data.y, data.y**2])), pose, **orders)
-    with pytest.raises(OptidError, match="'y'"):
-        quiet(Data(data.u, np.full((200, 1), np.nan)), pose, **orders)
-    with pytest.raises(OptidError, match="'u'"):
-        quiet(Data(np.full(200, 0.5), data.y), pose, **orders)
+    refuses(StructureError, "one output", quiet, Data(data.u, np.hstack([data.y, data.y**2])), pose, **orders)
+    refuses(OptidError, "'y'", quiet, Data(data.u, np.full((200, 1), np.nan)), pose, **orders)
+    refuses(OptidError, "'u'", quiet, Data(np.full(200, 0.5), data.y), pose, **orders)
     with pytest.raises(RankError, match=r"u2\(k-1\)\) of the regressor depends on triangular1\(u1\(k-1\)"):
         quiet(Data(np.hstack([data.u, data.u]), data.y), pose, **orders)
     with pytest.raises(InfeasibleError):

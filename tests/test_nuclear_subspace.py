@@ -228,8 +228,7 @@ def test_scales_and_offsets_of_the_channels_do_not_matter():
     ({"hold_out": 1.0}, StructureError, "hold_out"),
     ({"nx": 6, "block_rows": 5}, StructureError, "5 block rows for order 6"),
     ({"block_rows": 60, "weight": 1.0}, RankError, "usable windows"),
-    ({"nx": 4, "block_rows": 6, "weight": 1e-4, "form": "projection"}, SolverFailed, "has rank .* larger weight"),
-])
+    ({"nx": 4, "block_rows": 6, "weight": 1e-4, "form": "projection"}, SolverFailed, "has rank .* larger weight")])
 def test_bad_requests(arguments, error, words):
     with pytest.raises(error, match=words):
         optid.fit(data(noise=0.1), "subspace.nuclear", **{"form": "projection"} | arguments)

@@ -367,8 +367,7 @@ def test_long_records_are_searched_in_part():
     ({"basis": Triangular(6).fitted(-1, 9)}, RankError, "Function . of 6 of Triangular .*'u'.* is never excited"),
     ({"constraints": ["stable:1.5"]}, StructureError, "radius lies in"),
     ({"constraints": ["stable:0.5", lambda v: {"slow": v["a"][0] <= -1.5}]}, InfeasibleError, "stable:0.5.*slow"),
-    ({"constraints": [lambda v: {"odd": v["A"] >= 0}]}, StructureError, "asks for 'A'"),
-])
+    ({"constraints": [lambda v: {"odd": v["A"] >= 0}]}, StructureError, "asks for 'A'")])
 def test_bad_structure_names_the_argument_and_the_remedy(change, error, words):
     with pytest.raises(error, match=words):
         optid.fit(record(count=150), "hammerstein_oe.exact", **({"na": 2, "nb": 2, "basis": BASIS} | change))

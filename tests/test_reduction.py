@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 from test_regressors import assert_gram, cases, formed
 
 import optid
@@ -157,8 +158,7 @@ def test_folders_of_parquet_files_are_experiments(record, folders, monkeypatch):
     assert len(stream.parts) > 24 and stream.lengths == (4000, 2500)
     np.testing.assert_array_equal(stream.ranges(), record.ranges())
     assert_same_fit(optid.fit(stream, **STRUCTURE), optid.fit(record, **STRUCTURE))
-    with pytest.raises(DataError, match="2 experiments"):
-        iter(stream)
+    refuses(DataError, "2 experiments", iter, stream)
     one = optid.open_stream(folders[0])
     np.testing.assert_array_equal(np.vstack([u for u, _ in one]), record.experiments[0].u)
 
@@ -210,27 +210,19 @@ def test_threads_read_parts_to_the_same_digits(record, folders):
 def test_what_is_no_record_in_parts_is_refused(record, folders, tmp_path):
     frame = frame_of(record.experiments[0])
     (tmp_path / "above" / "below").mkdir(parents=True)
-    with pytest.raises(DataError, match="no .parquet file"):
-        optid.open_stream(tmp_path / "above")
+    refuses(DataError, "no .parquet file", optid.open_stream, tmp_path / "above")
     frame.to_parquet(tmp_path / "above" / "below" / "x.parquet")
-    with pytest.raises(DataError, match="below.*one per experiment"):
-        optid.open_stream(tmp_path / "above")
-    with pytest.raises(DataError, match="list of sources is empty"):
-        optid.open_stream([])
-    with pytest.raises(DataError, match="use read for what is in memory"):
-        optid.open_stream(frame)
-    with pytest.raises(DataError, match="more channels than samples"):
-        optid.open_stream(da.zeros((2, 9)))
-    with pytest.raises(DataError, match="3 dimensions"):
-        optid.open_stream(da.zeros((9, 2, 2)))
-    with pytest.raises(DataError, match="different lengths"):
-        optid.open_stream({"u": da.zeros(9), "y": da.zeros(8)})
+    refuses(DataError, "below.*one per experiment", optid.open_stream, tmp_path / "above")
+    refuses(DataError, "list of sources is empty", optid.open_stream, [])
+    refuses(DataError, "use read for what is in memory", optid.open_stream, frame)
+    refuses(DataError, "more channels than samples", optid.open_stream, da.zeros((2, 9)))
+    refuses(DataError, "3 dimensions", optid.open_stream, da.zeros((9, 2, 2)))
+    refuses(DataError, "different lengths", optid.open_stream, {"u": da.zeros(9), "y": da.zeros(8)})
     with pytest.raises(DataError, match="weights are for records in memory"):
         layout = optid.fit(record, **STRUCTURE).program.compressed.statistics.layout
         collect(optid.open_stream(folders), layout, weights=[np.ones(4000), np.ones(2500)])
     text = dd.from_pandas(frame.assign(u="x"), npartitions=2, sort=False)
-    with pytest.raises(DataError, match="partition .: column 'u' is of type"):
-        optid.open_stream(text).ranges()
+    refuses(DataError, "partition .: column 'u' is of type", optid.open_stream(text).ranges)
     frame.iloc[:3].to_parquet(tmp_path / "short.parquet")
     with pytest.raises(RankError, match="experiment 2: 3 samples, but the lags reach back 4"):
         optid.fit(optid.open_stream([folders[0], tmp_path / "short.parquet"]), na=4, nb=1, basis="triangular:4")
@@ -279,11 +271,9 @@ def test_the_sampling_time_comes_from_the_first_two_stamps_of_a_part(tmp_path, p
 @pytest.mark.parametrize("source, words", [
     ({"u": np.zeros(9), "y": np.zeros(9)}, "channel 'u' is of type ndarray"),
     ({"u": "u.npy", "y": da.zeros(9)}, "channel 'y' is of type Array: a stream takes paths .* or Dask arrays for all"),
-    ({}, "is empty; give every channel"),
-])
+    ({}, "is empty; give every channel")])
 def test_mappings_that_are_no_stream_are_refused(source, words):
-    with pytest.raises(DataError, match=words):
-        optid.open_stream(source)
+    refuses(DataError, words, optid.open_stream, source)
 
 
 def test_a_file_that_changes_after_opening_is_refused(record, folders):
@@ -291,11 +281,9 @@ def test_a_file_that_changes_after_opening_is_refused(record, folders):
     stream.ranges()
     frame = pd.read_parquet(folders[0] / "part.3.parquet")
     frame.assign(y=frame.y + 1).to_parquet(folders[0] / "part.3.parquet")
-    with pytest.raises(DataError, match="part.3.parquet.*changed meanwhile"):
-        optid.fit(stream, **STRUCTURE)
+    refuses(DataError, "part.3.parquet.*changed meanwhile", optid.fit, stream, **STRUCTURE)
     (folders[0] / "part.3.parquet").unlink()
-    with pytest.raises(DataError, match="cannot read .*part.3.parquet.*No such file"):
-        optid.fit(stream, **STRUCTURE)
+    refuses(DataError, "cannot read .*part.3.parquet.*No such file", optid.fit, stream, **STRUCTURE)
 
 
 def test_an_infinite_sample_is_named_by_part(record):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 
 from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangular, Trigonometric
 from optid.data.record import Data
@@ -175,8 +176,7 @@ def test_short_record_starts_no_thread(monkeypatch):
     data = random_data(np.random.default_rng(20), [3000], 1, 1)
     layout = layout_of(data, (Triangular(3),), 1, [1], [0])
     collect(data, layout, threads=2)
-    with pytest.raises(AssertionError, match="a pool"):
-        collect(data, layout, chunk=100, threads=2)
+    refuses(AssertionError, "a pool", collect, data, layout, chunk=100, threads=2)
 
 
 @pytest.mark.parametrize("bases", [(Triangular(4),), (Polynomial(3),), (Triangular(4), Trigonometric(2))])
@@ -212,8 +212,7 @@ def test_order_of_the_columns():
     layout = layout_of(data, (Polynomial(2), Linear()), 2, [2, 1], [0, 3])
     assert layout.names() == [
         "-p(k-1)", "-q(k-1)", "-p(k-2)", "-q(k-2)", "polynomial1(v(k))", "polynomial2(v(k))", "polynomial1(v(k-1))",
-        "polynomial2(v(k-1))", "linear1(w(k-3))", "1",
-    ]
+        "polynomial2(v(k-1))", "linear1(w(k-3))", "1"]
     assert (layout.block(0), layout.block(1)) == (slice(4, 8), slice(8, 9))
     assert (layout.n_columns, layout.offset, layout.first_row) == (10, 9, 3)
 
@@ -293,8 +292,7 @@ def test_silent_function_is_named():
 
 def test_silent_output_is_named():
     data = Data(u=np.random.default_rng(9).uniform(-1, 1, 400), y=np.zeros(400), outputs=["thrust"])
-    with pytest.raises(RankError, match="Output 'thrust' is zero"):
-        collect(data, layout_of(data, (Triangular(4),), 1, [2], [0]))
+    refuses(RankError, "Output 'thrust' is zero", collect, data, layout_of(data, (Triangular(4),), 1, [2], [0]))
 
 
 def test_function_reached_in_lost_rows_only_is_silent():
@@ -302,19 +300,16 @@ def test_function_reached_in_lost_rows_only_is_silent():
     u, y = rng.uniform(0, 1, 400), rng.standard_normal(400)
     u[200], y[200:204] = -1.0, np.nan
     data = Data(u=u, y=y)
-    with pytest.raises(RankError, match="Function 1 of 4"):
-        collect(data, layout_of(data, (Triangular(4),), 1, [2], [0]))
+    refuses(RankError, "Function 1 of 4", collect, data, layout_of(data, (Triangular(4),), 1, [2], [0]))
 
 
 def test_too_few_rows():
     rng = np.random.default_rng(11)
     data = random_data(rng, [30], 1, 1)
     layout = layout_of(data, (Triangular(10),), 2, [3], [0])
-    with pytest.raises(RankError, match=r"28 rows for 33 parameters: at least 37"):
-        collect(data, layout)
+    refuses(RankError, r"28 rows for 33 parameters: at least 37", collect, data, layout)
     data = random_data(rng, [200], 1, 1, share=0.3)
-    with pytest.raises(RankError, match=r"Missing samples cost \d+ % of 198 rows"):
-        collect(data, layout)
+    refuses(RankError, r"Missing samples cost \d+ % of 198 rows", collect, data, layout)
 
 
 def test_experiment_shorter_than_the_lags_is_named():
@@ -335,14 +330,11 @@ def test_warns_below_half_of_the_rows():
 def test_weights_that_do_not_fit():
     data = random_data(np.random.default_rng(14), [50, 60], 1, 1)
     layout = layout_of(data, (Triangular(3),), 1, [1], [0])
-    with pytest.raises(DataError, match="1 arrays of weights for 2 experiments"):
-        collect(data, layout, [np.ones(50)])
-    with pytest.raises(DataError, match=r"experiment 2: weights have shape \(50,\)"):
-        collect(data, layout, [np.ones(50), np.ones(50)])
+    refuses(DataError, "1 arrays of weights for 2 experiments", collect, data, layout, [np.ones(50)])
+    refuses(DataError, r"experiment 2: weights have shape \(50,\)", collect, data, layout, [np.ones(50), np.ones(50)])
     with pytest.raises(DataError, match="experiment 1: weight of sample 7 is -1"):
         collect(data, layout, [np.where(np.arange(50) == 7, -1.0, 1.0), np.ones(60)])
-    with pytest.raises(DataError, match="stream"):
-        collect(Chunks(Data(u=data.u[0], y=data.y[0]), []), layout, [np.ones(50)])
+    refuses(DataError, "stream", collect, Chunks(Data(u=data.u[0], y=data.y[0]), []), layout, [np.ones(50)])
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -351,8 +343,7 @@ def test_sample_outside_is_named(threads):
     u[217] = 1.5
     data = Data(u=u, y=u, inputs=["current"])
     layout = layout_of(data, (Triangular(3, outside="error"),), 1, [1], [0])
-    with pytest.raises(DataError, match="'current', sample 217: 1.5"):
-        collect(data, layout, chunk=10, threads=threads)
+    refuses(DataError, "'current', sample 217: 1.5", collect, data, layout, chunk=10, threads=threads)
 
 
 def test_arguments_are_refused():
@@ -362,14 +353,11 @@ def test_arguments_are_refused():
     for change, words in (({"nb": (1,)}, "nb has 1 entries for 2 inputs"), ({"na": -1}, "na must be"),
                           ({"nk": (0, -1)}, "nk of input 'u2'"), ({"nb": (0, 1)}, "nb of input 'u1'"),
                           ({"outputs": ()}, "at least one")):
-        with pytest.raises(StructureError, match=words):
-            Layout(**good | change)
+        refuses(StructureError, words, Layout, **good | change)
     layout = Layout(**good)
-    with pytest.raises(DataError, match="The data have 1 inputs"):
-        collect(Data(u=data.u[:, 0], y=data.y), layout)
+    refuses(DataError, "The data have 1 inputs", collect, Data(u=data.u[:, 0], y=data.y), layout)
     for threads in (0, True, 1.5):
-        with pytest.raises(StructureError, match="threads"):
-            collect(data, layout, threads=threads)
+        refuses(StructureError, "threads", collect, data, layout, threads=threads)
     with pytest.raises(StructureError, match="same layout"):
         _ = collect(data, layout) + collect(data, Layout(**good | {"na": 2}))
 
@@ -381,8 +369,7 @@ def test_basis_that_points_outside_its_family_is_refused():
             return first + 2, weights
 
     data = random_data(np.random.default_rng(17), [100], 1, 1)
-    with pytest.raises(StructureError, match="outside the family"):
-        collect(data, layout_of(data, (Broken(3),), 1, [1], [0]))
+    refuses(StructureError, "outside the family", collect, data, layout_of(data, (Broken(3),), 1, [1], [0]))
 
 
 def test_memory_does_not_grow_with_the_record():

@@ -236,11 +236,9 @@ def test_a_back_end_without_an_answer_is_reported():
     assert shift.a is None and shift.status is Status.FAILED and "numbers ran out" in shift.reason
 
 
-@pytest.mark.parametrize("up, down, words", [
-    (np.ones((2, 3)), np.ones((2, 3)), "as many rows as states"),
-    (np.ones((4, 2)), np.ones((3, 2)), "one shape"),
-    (np.ones((4, 2)), np.ones((4, 2)), "rank below 2"),
-])
+@pytest.mark.parametrize("up, down, words", [(np.ones((2, 3)), np.ones((2, 3)), "as many rows as states"),
+                                             (np.ones((4, 2)), np.ones((3, 2)), "one shape"),
+                                             (np.ones((4, 2)), np.ones((4, 2)), "rank below 2")])
 def test_bad_matrices(up, down, words):
     with pytest.raises(StructureError, match=words):
         solved(up, down, [strip(2.0, 3.0)])
@@ -258,8 +256,7 @@ def slow_record():
 @pytest.mark.parametrize("word, inside", [
     ("stable:0.8", lambda z: abs(z) <= 0.8 + 1e-5), ("disc:0.4,0.5", lambda z: abs(z - 0.4) <= 0.5 + 1e-5),
     ("strip:high=0.7", lambda z: z.real <= 0.7 + 1e-5), ("sector:0.2", lambda z: abs(np.angle(z)) <= 0.2 + 1e-4),
-    ("damped:0.6", lambda z: abs(z) <= np.exp(-0.75 * abs(np.angle(z))) + 1e-5),
-])
+    ("damped:0.6", lambda z: abs(z) <= np.exp(-0.75 * abs(np.angle(z))) + 1e-5)])
 def test_every_region_holds_in_a_fit(word, inside):
     fit = optid.fit(slow_record(), "hammerstein_ss.sid", nx=2, block_rows=8, constraints=[word])
     assert all(inside(z) for z in fit.model.poles)

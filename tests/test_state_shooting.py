@@ -24,14 +24,11 @@ PLANTS = {
     "feedback": HammersteinSS(**PLAIN, nonlinearities=(CUBE,), E=[[0.2], [0.1]], feedback=(BEND,), output_of=(0,)),
     "latent": HammersteinSS(**PLAIN, latent=(CURVE,), Ez=[[0.5], [0.2]], Cz=[[0.3, 0.2]], Dz=[[0.3]], Fz=[[0.0]],
                             offset_z=[0.1]),
-    "two by two": linear(n=2),
-}
-CASES = {
-    "hammerstein": ("hammerstein_ss", {"nx": 2}),
-    "feedback": ("hammerstein_ss", {"nx": 2, "feedback_basis": Polynomial(2, outside="extrapolate")}),
-    "latent": ("lfr", {"nx": 2}),
-    "two by two": ("ss", {"nx": 2}),
-}
+    "two by two": linear(n=2)}
+CASES = {"hammerstein": ("hammerstein_ss", {"nx": 2}),
+         "feedback": ("hammerstein_ss", {"nx": 2, "feedback_basis": Polynomial(2, outside="extrapolate")}),
+         "latent": ("lfr", {"nx": 2}),
+         "two by two": ("ss", {"nx": 2})}
 
 
 def record(name, counts=(300,), noise=0.05, gaps=0.0, seed=0):

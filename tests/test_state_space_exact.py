@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.optimize
+from refusals import refuses
 from state_systems import by_hand
 from state_systems import linear as linear_system
 
@@ -245,16 +246,11 @@ def test_shape_constraints_hold_for_every_input():
 
 def test_refusals():
     _, data = system()
-    with pytest.raises(StructureError, match="criterion='best'"):
-        optid.fit(data, linear, nx=2, criterion="best")
-    with pytest.raises(StructureError, match="weighting"):
-        optid.fit(data, linear, nx=2, weighting="best")
-    with pytest.raises(StructureError, match="iterations"):
-        optid.fit(data, linear, nx=2, iterations=0)
-    with pytest.raises(StructureError, match="nx"):
-        optid.fit(data, linear, nx=0)
-    with pytest.raises(StructureError, match="a start has 3 states"):
-        optid.fit(data, linear, nx=2, initial=linear_system(n=3))
+    refuses(StructureError, "criterion='best'", optid.fit, data, linear, nx=2, criterion="best")
+    refuses(StructureError, "weighting", optid.fit, data, linear, nx=2, weighting="best")
+    refuses(StructureError, "iterations", optid.fit, data, linear, nx=2, iterations=0)
+    refuses(StructureError, "nx", optid.fit, data, linear, nx=0)
+    refuses(StructureError, "a start has 3 states", optid.fit, data, linear, nx=2, initial=linear_system(n=3))
     short = Data(data.u[:30], data.y[:30])
     with pytest.raises((RankError, StructureError)):
         optid.fit(short, linear, nx=12)

@@ -292,8 +292,7 @@ def tiny_output(u, y):
     (example1(600), {"nx": 3, "iterations": -1}, StructureError, "iterations must be a nonnegative integer"),
     (example1(600), {"nx": 3, "observer": "luenberger"}, StructureError, "observer="),
     (example1(600), {"nx": 3, "weighting": "n4"}, StructureError, "weighting="),
-    (example1(600), {"nx": 3, "feedthrough": [True]}, StructureError, "feedthrough="),
-])
+    (example1(600), {"nx": 3, "feedthrough": [True]}, StructureError, "feedthrough=")])
 def test_refusals(data, arguments, error, text):
     arguments = {"basis": F} | arguments
     with pytest.raises(error, match=text):

@@ -17,10 +17,8 @@ def in_units_of(model: Any, data: Data) -> Data:
     """Return data in raw units; refuse channels or a sampling time other than the model's (`DataError`)."""
     for kind, given, wanted in (("inputs", data.inputs, model.inputs), ("outputs", data.outputs, model.outputs)):
         if len(given) != len(wanted) or (given != wanted and set(given) == set(wanted)):
-            raise DataError(
-                f"The data have the {kind} {', '.join(given)}; the model has {', '.join(wanted)}. "
-                f"Use data.select({kind}={list(wanted)})."
-            )
+            raise DataError(f"The data have the {kind} {', '.join(given)}; the model has {', '.join(wanted)}. "
+                            f"Use data.select({kind}={list(wanted)}).")
     if abs(data.dt - model.dt) > 1e-6 * model.dt:
         raise DataError(f"The data are sampled every {data.dt:g}, the model every {model.dt:g}: resample the data.")
     return data if data.transform.is_identity else data.raw()
@@ -54,8 +52,7 @@ def check_inputs(model: Any, u: Array, label: str) -> None:
         k, c = np.argwhere(bad)[0]
         raise DataError(
             f"{label}Input {model.inputs[c]!r} is missing at sample {k} ({int(bad[:, c].sum())} in all): a simulation "
-            "needs every input. Interpolate it, or split the record there."
-        )
+            "needs every input. Interpolate it, or split the record there.")
 
 
 def state_like(x0: Any, shape: tuple[int, ...]) -> Array:

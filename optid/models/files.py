@@ -70,10 +70,8 @@ def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, A
     if not isinstance(content, dict) or content.get("format") != form:
         raise ModelFileError(f"{path} is JSON but not a {what}. {remedy}")
     if content.get("version") != version:
-        raise ModelFileError(
-            f"{path} is of version {content.get('version')!r}; this release reads version {version}. "
-            "Load it with the release that wrote it and save it again, or install that release."
-        )
+        raise ModelFileError(f"{path} is of version {content.get('version')!r}; this release reads version {version}. "
+                             "Load it with the release that wrote it and save it again, or install that release.")
     try:
         return build(content)
     except KeyError as error:
@@ -115,8 +113,7 @@ def write_state(path: str | Path, kind: str, version: int, head: Mapping[str, An
 
 
 def read_state(
-    path: str | Path, kind: str, version: int, names: Sequence[str]
-) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    path: str | Path, kind: str, version: int, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read the head, and the arrays of these names, that `write_state` wrote; refuse others (`ModelFileError`)."""
     path = Path(path)
     try:

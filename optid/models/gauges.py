@@ -25,8 +25,7 @@ def gauge_factor(gauge: str, a: Array, b: Array, channel: str) -> float:
         scale, what = float(b.sum()) / denominator if denominator else np.inf, "static gain of the linear part"
     if not 1e-9 * size < abs(scale) < 1e9 * size:
         raise StructureError(
-            f"gauge {gauge!r} cannot be reached: the {what} of input {channel!r} is zero or infinite; use 'norm'."
-        )
+            f"gauge {gauge!r} cannot be reached: the {what} of input {channel!r} is zero or infinite; use 'norm'.")
     return scale
 
 

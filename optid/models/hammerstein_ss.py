@@ -40,10 +40,8 @@ class HammersteinSS(StateSpace):
         states, limits = self._states(simulator, records, x0), simulation.allowed_range([y for _, y, _ in records])
         if not self.feedback and not np.any(self.L):
             self._warn_unstable()
-        return [
-            simulation.run(simulation.prepared(self, simulator, u, y, limits, label), x)
-            for (u, y, label), x in zip(records, states)
-        ]
+        return [simulation.run(simulation.prepared(self, simulator, u, y, limits, label), x)
+                for (u, y, label), x in zip(records, states)]
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
         """Fit the initial state of one record; a free run with feedback starts from the value of P2, or from rest."""

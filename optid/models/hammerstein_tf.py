@@ -73,15 +73,13 @@ class HammersteinTF(Model):
 
     def __post_init__(self) -> None:
         a, offset = finite(self.a, "a"), np.atleast_1d(finite(self.offset, "offset"))
-        fields = {
-            "a": a.reshape(0, offset.size, offset.size) if offset.size > 1 and not a.size else a,
-            "b": tuple(finite(b, f"b[{c}]") for c, b in enumerate(self.b)),
-            "nonlinearities": self.nonlinearities,
-            "nk": tuple(int(delay) for delay in self.nk),
-            "offset": offset,
-            "c": finite(self.c, "c"),
-            "d": None if self.d is None else finite(self.d, "d"),
-        }
+        fields = {"a": a.reshape(0, offset.size, offset.size) if offset.size > 1 and not a.size else a,
+                  "b": tuple(finite(b, f"b[{c}]") for c, b in enumerate(self.b)),
+                  "nonlinearities": self.nonlinearities,
+                  "nk": tuple(int(delay) for delay in self.nk),
+                  "offset": offset,
+                  "c": finite(self.c, "c"),
+                  "d": None if self.d is None else finite(self.d, "d")}
         if fields["d"] is not None and fields["d"].size and np.array_equal(fields["d"], a):
             fields["d"] = None
         self._fix(fields, len(self.b), offset.size)
@@ -101,8 +99,7 @@ class HammersteinTF(Model):
                 raise StructureError(f"b[{c}] has shape {b.shape}; {'(nb,)' if l == 1 else f'(nb, {l})'} is needed.")
         if any(f.offset is not None for f in self.nonlinearities):
             raise StructureError(
-                "A nonlinearity of a model has offset None: put the constant of the equation in offset=."
-            )
+                "A nonlinearity of a model has offset None: put the constant of the equation in offset=.")
         for name, values in (("c", self.c), ("d", self.d)):
             if values is not None and values.ndim != 1:
                 raise StructureError(f"{name} has shape {values.shape}; (n{name},) is needed.")
@@ -112,8 +109,7 @@ class HammersteinTF(Model):
         if largest >= 1:
             raise StructureError(
                 f"C is not invertible: it has a zero of modulus {largest:.6g}. Reflect it into the unit circle "
-                "(optid.models.roots.contained): the spectrum of the noise stays what it is."
-            )
+                "(optid.models.roots.contained): the spectrum of the noise stays what it is.")
 
     # -- sizes ---------------------------------------------------------------------------------------------------
 
@@ -262,10 +258,8 @@ class HammersteinTF(Model):
             scales = [gauge_factor(gauge, self.a, b, name) for b, name in zip(self.b, self.inputs)]
         if gauge == "norm" and not signs:
             scales = [abs(scale) for scale in scales]
-        return replace(
-            self, b=tuple(b / s for b, s in zip(self.b, scales)), gauge=gauge,
-            nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)),
-        )
+        return replace(self, b=tuple(b / s for b, s in zip(self.b, scales)), gauge=gauge,
+                       nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)))
 
     def _in_raw_units(self, transform: Transform) -> Self:
         gain, shift = np.array(transform.y_scale), np.array(transform.y_offset)
@@ -331,8 +325,7 @@ class HammersteinTF(Model):
             name = self.outputs[int(np.argmin(np.isfinite(y[k])))]
             raise DataError(
                 f"{label}The simulated output {name!r} leaves the range of numbers at sample {k}: the largest pole has "
-                f"radius {self.radius:.6g}. Identify the model with a stability constraint, or simulate fewer samples."
-            )
+                f"radius {self.radius:.6g}. Identify the model with a stability constraint, or simulate fewer samples.")
         return y
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
@@ -380,8 +373,7 @@ class HammersteinTF(Model):
         if np.isnan(y).any():
             k, o = np.argwhere(np.isnan(y))[0]
             raise DataError(
-                f"Output {self.outputs[o]!r} is missing {n - k} samples before the end: the state needs it."
-            )
+                f"Output {self.outputs[o]!r} is missing {n - k} samples before the end: the state needs it.")
         return self.following(u, y)
 
     def following(self, u: Array, y: Array) -> Array:

@@ -53,10 +53,8 @@ class NoiseCovariances:
 
     def mapped(self, states: Array, outputs: Array) -> "NoiseCovariances":
         """Return the covariances of T x and G y for ``states`` T (n, n) and ``outputs`` G (l, l)."""
-        return NoiseCovariances(
-            _congruent(states, self.Q), _congruent(outputs, self.R), states @ self.S @ outputs.T,
-            _congruent(outputs, self.innovation),
-        )
+        return NoiseCovariances(_congruent(states, self.Q), _congruent(outputs, self.R), states @ self.S @ outputs.T,
+                                _congruent(outputs, self.innovation))
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the matrices in JSON types."""

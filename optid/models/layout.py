@@ -34,8 +34,7 @@ class Layout(Ports):
         for name, entries in (("nb", self.nb), ("nk", self.nk), ("basis", self.bases)):
             if len(entries) != self.m:
                 raise StructureError(
-                    f"{name} has {len(entries)} entries for {self.m} inputs ({', '.join(self.inputs)}): give one each."
-                )
+                    f"{name} has {len(entries)} entries for {self.m} inputs ({', '.join(self.inputs)}): give one each.")
         check_integer(self.na, "na", 0)
         for channel, b, delay in zip(self.inputs, self.nb, self.nk):
             check_integer(b, f"nb of input {channel!r}")

@@ -173,12 +173,10 @@ class Model(Ports):
         states = [None] * len(records) if fit else self._states("predict", records, x0)
         predicted = [self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)]
         if self.structure not in ("arx", "armax") and all(np.isnan(p).all() for p in predicted) and any(
-            np.isnan(u).any() for u, _, _ in records
-        ):
+            np.isnan(u).any() for u, _, _ in records):
             raise DataError(
                 f"no stretch of {2 * self._state_shape[0] + 1} samples has every input: interpolate them, or leave an "
-                "input out"
-            )
+                "input out")
         return one_or_all(predicted)
 
     def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:
@@ -264,8 +262,7 @@ class Model(Ports):
                 f"The model is unstable: its largest pole has radius {self.radius:.6g}. Its simulation grows and tells "
                 "little about the fit; use one-step prediction, or identify with a stability constraint.",
                 DataWarning,
-                stacklevel=4,
-            )
+                stacklevel=4)
 
     # -- gauge and units -----------------------------------------------------------------------------------------
 
@@ -299,8 +296,7 @@ class Model(Ports):
         if len(transform.u_scale) != self.m or len(transform.y_scale) != self.l:
             raise StructureError(
                 f"The transform has {len(transform.u_scale)} inputs and {len(transform.y_scale)} outputs, "
-                f"the model {self.m} and {self.l}."
-            )
+                f"the model {self.m} and {self.l}.")
         # units do not turn signs: what a constraint decided about them stays
         return self._in_raw_units(transform).regauge(self.gauge, signs=False)
 

@@ -35,8 +35,7 @@ class Nonlinearity:
         mu = finite(self.mu, "mu")
         if mu.shape != (self.basis.size,):
             raise StructureError(
-                f"mu has shape {mu.shape}; a {type(self.basis).__name__} of this size needs ({self.basis.size},)."
-            )
+                f"mu has shape {mu.shape}; a {type(self.basis).__name__} of this size needs ({self.basis.size},).")
         object.__setattr__(self, "mu", mu)
 
     def __call__(self, u: ArrayLike) -> Any:

@@ -151,8 +151,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
             if not np.all(np.isfinite(rows)):
                 raise DataError(
                     f"{job.label}The effect of the initial state leaves the range of numbers: the largest pole has "
-                    f"radius {job.model.radius:.6g}."
-                )
+                    f"radius {job.model.radius:.6g}.")
             root = np.asarray(np.linalg.qr(np.vstack([root, rows]), mode="r"))
             largest = max(largest, float(np.abs(turn).max()))
             informs = float(np.abs(turn).max()) > FORGOTTEN * largest
@@ -226,8 +225,7 @@ def march(job: Run, first: int, stretch: Stretch, x: Array, keep: bool = True) -
         what = "argument of a latent function" if job.model.latent else "simulated output"
         raise DataError(
             f"{job.label}At sample {first + at} the {what} leaves the interval of a basis with outside='error'. Use "
-            "outside='clamp' or 'extrapolate', or a longer interval."
-        )
+            "outside='clamp' or 'extrapolate', or a longer interval.")
     if ended == LEFT:
         raise _left(job, first + at)
     return states, outputs
@@ -240,8 +238,7 @@ def _left(job: Run, sample: int) -> DataError:
     return DataError(
         f"{job.label}The simulated output leaves {what} at sample {sample}: the largest pole has radius "
         f"{job.model.radius:.6g}. Identify the model with a stability constraint, predict one step ahead, or simulate "
-        "fewer samples."
-    )
+        "fewer samples.")
 
 
 def _march_by_steps(model: StateSpace, parts: Parts, stretch: Stretch, x: Array, outputs: Array, states: Array

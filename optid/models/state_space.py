@@ -24,8 +24,7 @@ from optid.models.state_signals import Parts
 # shapes of the matrices: n states, m inputs, l outputs, r functions of the inputs, s of the outputs, k latent ones
 MATRICES = {
     "A": "nn", "B": "nr", "C": "ln", "D": "lr", "E": "ns", "L": "nl", "K": "nl", "offset_x": "n", "offset_y": "l",
-    "Ez": "nk", "Fz": "lk", "Cz": "kn", "Dz": "km", "offset_z": "k",
-}
+    "Ez": "nk", "Fz": "lk", "Cz": "kn", "Dz": "km", "offset_z": "k"}
 COVARIANCES = {"Q": "nn", "R": "ll", "S": "nl", "innovation": "ll"}
 
 NEWTON_STEPS = 100
@@ -126,21 +125,18 @@ class StateSpace(Model):
         if self.E.shape == (n + outputs, s) and s and outputs:
             raise StructureError(
                 f"E has {n + outputs} rows for {n} states: its last {outputs} would carry g(y) to the output y of the "
-                "same sample, an algebraic loop. Delay the feedback by one sample: keep the first rows only."
-            )
+                "same sample, an algebraic loop. Delay the feedback by one sample: keep the first rows only.")
         for name in MATRICES:
             found, shape = getattr(self, name).shape, shapes[name]
             if found != shape:
                 raise StructureError(
                     f"{name} has shape {found}; {n} states, {r} functions of the inputs, {s} of the outputs"
-                    f"{f', {k} of latent signals' * bool(k)} and {outputs} outputs need {shape}."
-                )
+                    f"{f', {k} of latent signals' * bool(k)} and {outputs} outputs need {shape}.")
         for kind, where, count in (("nonlinearities", "input_of", self.m), ("feedback", "output_of", outputs)):
             functions, channels = getattr(self, kind), getattr(self, where)
             if len(functions) != len(channels) or any(not 0 <= c < count for c in channels):
                 raise StructureError(
-                    f"{where} = {channels}: one channel from 0 to {count - 1} for each of the {len(functions)} {kind}."
-                )
+                    f"{where} = {channels}: one channel from 0 to {count - 1} for each of the {len(functions)} {kind}.")
         for kind in ("nonlinearities", "feedback", "latent"):
             for j, f in enumerate(getattr(self, kind)):
                 if f.offset:
@@ -209,8 +205,7 @@ class StateSpace(Model):
         if not self.feedback and not self.latent:
             static_solution(self.A + self.L @ self.C - np.eye(self.nx), self.B)
         raise StructureError(
-            f"No equilibrium was found at u0 = {points.tolist()}: the feedback does not let the model rest there."
-        )
+            f"No equilibrium was found at u0 = {points.tolist()}: the feedback does not let the model rest there.")
 
     def _static_gain(self, points: Array) -> Array:
         A, B, C, D = self._tangent(*self.equilibrium(points), points)
@@ -279,8 +274,7 @@ class StateSpace(Model):
             raise StructureError(f"The gain has shape {moved.shape}; {self.L.shape} is needed.")
         return replace(
             self, A=self.A - moved @ self.C, B=self.B - moved @ self.D, L=self.L + moved, K=self.K - moved,
-            Ez=self.Ez - moved @ self.Fz, offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none",
-        )
+            Ez=self.Ez - moved @ self.Fz, offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none")
 
     def _regauged(self, gauge: str, signs: bool) -> Self:
         if gauge == "gain":
@@ -296,11 +290,9 @@ class StateSpace(Model):
             response = impulse_response(self.A, self.E, self.C, np.zeros((self.l, back.size)), self.nx + 1)
             back = back * _signs(response) if signs else back
         scales, back = np.where(scales == 0, 1.0, scales), np.where(back == 0, 1.0, back)
-        return replace(
-            self, B=self.B / scales, D=self.D / scales, E=self.E / back, gauge=gauge,
-            nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)),
-            feedback=tuple(g.scaled(s) for g, s in zip(self.feedback, back)),
-        )
+        return replace(self, B=self.B / scales, D=self.D / scales, E=self.E / back, gauge=gauge,
+                       nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)),
+                       feedback=tuple(g.scaled(s) for g, s in zip(self.feedback, back)))
 
     def _gains(self) -> Array:
         """Static gains (r,) of the linear part from every f to the output."""
@@ -312,18 +304,15 @@ class StateSpace(Model):
         for gain, size, c in zip(gains[0], sizes[0], self.input_of):
             if not abs(gain) > 1e-9 * size:
                 raise StructureError(
-                    f"gauge 'gain' cannot be reached: the static gain of input {self.inputs[c]!r} is zero; use 'norm'."
-                )
+                    f"gauge 'gain' cannot be reached: the static gain of input {self.inputs[c]!r} is zero; use 'norm'.")
         return gains[0]
 
     def _in_raw_units(self, transform: Transform) -> Self:
         gain, shift = np.array(transform.y_scale), np.array(transform.y_offset)
         functions = [
-            f.mapped(transform.u_scale[c], transform.u_offset[c]) for f, c in zip(self.nonlinearities, self.input_of)
-        ]
+            f.mapped(transform.u_scale[c], transform.u_offset[c]) for f, c in zip(self.nonlinearities, self.input_of)]
         feedback = [
-            g.mapped(transform.y_scale[o], transform.y_offset[o]) for g, o in zip(self.feedback, self.output_of)
-        ]
+            g.mapped(transform.y_scale[o], transform.y_offset[o]) for g, o in zip(self.feedback, self.output_of)]
         constants, fed = (np.array([constant for _, constant in moved]) for moved in (functions, feedback))
         # the states take the unit that all outputs share: C, and with it what a norm of B means, stays as it is then
         state = gain[0] if np.all(gain == gain[0]) else 1.0
@@ -337,8 +326,7 @@ class StateSpace(Model):
             nonlinearities=tuple(f for f, _ in functions), feedback=tuple(g for g, _ in feedback),
             noise=None if self.noise is None else self.noise.mapped(state * np.eye(self.nx), np.diag(gain)),
             Ez=state * self.Ez, Fz=gain[:, None] * self.Fz, Cz=self.Cz / state, Dz=inward,
-            offset_z=self.offset_z - inward @ np.array(transform.u_offset),
-        )
+            offset_z=self.offset_z - inward @ np.array(transform.u_offset))
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
@@ -382,8 +370,7 @@ def balancing(A: Array, B: Array, C: Array) -> Array:
     if values[-1] <= 1e-13 * values[0]:
         raise StructureError(
             f"The model is not minimal: its Hankel singular values fall from {values[0]:.3g} to {values[-1]:.3g}. "
-            "Identify it with fewer states."
-        )
+            "Identify it with fewer states.")
     return (left / np.sqrt(values)).T @ see.T
 
 

@@ -10,19 +10,15 @@ from optid.models.state_space import MATRICES
 
 READABLE = 4  # most states whose equations are written out
 # the matrices of every equation in the order in which they are written, and what they multiply
-TERMS = {
-    "x": {"A": "x", "B": "f", "E": "g", "L": "y", "Ez": "h", "offset_x": "", "K": "e"},
-    "y": {"C": "x", "D": "f", "Fz": "h", "offset_y": ""},
-    "z": {"Cz": "x", "Dz": "u", "offset_z": ""},
-}
+TERMS = {"x": {"A": "x", "B": "f", "E": "g", "L": "y", "Ez": "h", "offset_x": "", "K": "e"},
+         "y": {"C": "x", "D": "f", "Fz": "h", "offset_y": ""},
+         "z": {"Cz": "x", "Dz": "u", "offset_z": ""}}
 
 
 def signed_terms(terms: Iterable[tuple[float, str]], digits: int = 4) -> str:
     """Write " + 1.5 y(k-1) - 0.7" from values and their names, without the terms that are zero."""
-    return "".join(
-        f" {'-' if value < 0 else '+'} {abs(value):.{digits}g}" + (f" {name}" if name else "")
-        for value, name in terms if value
-    )
+    return "".join(f" {'-' if value < 0 else '+'} {abs(value):.{digits}g}" + (f" {name}" if name else "")
+                   for value, name in terms if value)
 
 
 def signed_sum(terms: Iterable[tuple[float, str]], digits: int = 4) -> str:
@@ -99,8 +95,7 @@ def state_equations(model: Any, digits: int = 4) -> str:
     samples = {
         "x": [f"x{i + 1}(k)" for i in range(model.nx)], "y": [f"{name}(k)" for name in model.outputs], "e": errors,
         "g": [f"{name}({model.outputs[o]}(k))" for name, o in zip(words, model.output_of)], "": [""],
-        "h": [f"{h}({z}(k))" for h, z in zip(inner, latent)], "u": [f"{name}(k)" for name in model.inputs],
-    }
+        "h": [f"{h}({z}(k))" for h, z in zip(inner, latent)], "u": [f"{name}(k)" for name in model.inputs]}
     signals = {signal: [(1.0, name) for name in names] for signal, names in samples.items()} | {"f": functions}
     lines = []
     for kind, left in (("x", [f"x{i + 1}(k+1)" for i in range(model.nx)]), ("y", samples["y"]),
@@ -143,8 +138,7 @@ def _summary(model: Any) -> str:
     always = {"A", "B", "C", "Cz", "Dz", "offset_z"} | ({"E"} if model.feedback else set())
     state, output, latent = (
         " + ".join(matrix + words[signal] for matrix, signal in terms.items()
-                   if matrix in always or np.any(getattr(model, matrix))) for terms in TERMS.values()
-    )
+                   if matrix in always or np.any(getattr(model, matrix))) for terms in TERMS.values())
     text = f"x(k+1) = {state}\ny(k) = {output}{' + e(k)' * bool(np.any(model.K))}\n"
     sizes = f"{model.nx} states, {len(model.nonlinearities)} functions of the inputs"
     sizes += f", {len(model.feedback)} of the outputs" if model.feedback else ""

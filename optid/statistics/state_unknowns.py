@@ -60,8 +60,7 @@ def beyond_affine(basis: Basis) -> Array:
 # shapes of the arrays of a point: n states, l outputs, m inputs, s feedback and k latent functions, E experiments
 SHAPES = {
     "A": "nn", "C": "ln", "K": "nl", "offset": "l", "b": "nm", "d": "lm", "e": "ns", "x0": "En", "Ez": "nk", "Fz": "lk",
-    "Cz": "kn", "Dz": "km", "offset_z": "k",
-}
+    "Cz": "kn", "Dz": "km", "offset_z": "k"}
 
 
 def _straight_at_ends(basis: Basis) -> Array:

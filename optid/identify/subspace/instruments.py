@@ -46,8 +46,7 @@ def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c
 @njit(cache=True, nogil=True, error_model="numpy")
 def clipped_run(
     a: Array, c: Array, drive: Array, direct: Array, tables: Array, injection: Array, low: Array, high: Array,
-    x: Array, out: Array
-) -> None:
+    x: Array, out: Array) -> None:
     """Simulate x+ = A x + drive + sum_o table_o(y_o) + injection y, y = C x + direct, with y clipped to [low, high].
 
     The tables (l, G, n) hold the feedback of every output at G points spread evenly over [low, high], read with
