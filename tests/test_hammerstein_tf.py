@@ -196,15 +196,6 @@ def test_raw_units_and_gauges_leave_predictions_alone(name):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_round_trip_through_a_file(name, tmp_path):
-    model = MODELS[name]
-    again = optid.load(model.save(tmp_path / "model.json"))
-    assert isinstance(again, HammersteinTF)
-    assert again.to_dict() == model.to_dict()
-    assert (again.structure, again.title) == (model.structure, model.title)
-
-
-@pytest.mark.parametrize("name", MODELS)
 def test_files_with_the_plant_apart_or_without_noise_load(name, tmp_path):
     model = MODELS[name]
     plant = {key: value for key, value in model.to_dict().items() if key not in ("c", "d")} | {"kind": "HammersteinARX"}

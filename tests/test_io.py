@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from refusals import refuses
+from state_systems import linear, with_feedback
 from systems import BASES, inputs, mimo, siso
 
 import optid
@@ -15,12 +16,15 @@ from optid.errors import ModelFileError, StructureError
 from optid.models import Nonlinearity
 from optid.models.files import from_content, load
 
+NOISY = [siso(c=[-0.6, 0.25], d=d) for d in (None, [], [-0.5, 0.1, 0.3])] + [siso(d=[]), siso(d=[-0.5])]
+STATES = [linear(), with_feedback(), with_feedback(gauge="norm").regauge("norm")]
 
-@pytest.mark.parametrize("model", [siso(basis, nk=1) for basis in BASES] + [mimo(), siso(a=[])])
+
+@pytest.mark.parametrize("model", [*(siso(basis, nk=1) for basis in BASES), mimo(), siso(a=[]), *NOISY, *STATES])
 def test_round_trip_is_exact(model, tmp_path):
     path = model.save(tmp_path / "model.json")
     again = load(path)
-    assert again.to_dict() == model.to_dict()
+    assert again.to_dict() == model.to_dict() and (again.structure, again.title) == (model.structure, model.title)
     u = inputs(model)
     assert np.array_equal(again.simulate(u), model.simulate(u))
     assert [p.name for p in tmp_path.iterdir()] == ["model.json"]

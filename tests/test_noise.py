@@ -8,23 +8,19 @@ from scipy.signal import csd
 
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.identify.noise import (_most_likely,
-                                  _part,
-                                  colour,
-                                  noise_spectrum,
-                                  residuals,
-                                  whitening_gain,
-                                  with_noise)
+from optid.identify.noise import _most_likely, _part, colour, noise_spectrum, residuals, whitening_gain, with_noise
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import (_equations,
-                                          _initial,
-                                          _parts,
-                                          _slope,
-                                          covariance_of,
-                                          innovations,
-                                          innovations_covariance,
-                                          log_determinant,
-                                          refined)
+from optid.models.innovation_gain import (
+    _equations,
+    _initial,
+    _parts,
+    _slope,
+    covariance_of,
+    innovations,
+    innovations_covariance,
+    log_determinant,
+    refined,
+)
 from optid.models.kalman import NoiseCovariances, kalman_gain
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])

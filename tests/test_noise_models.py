@@ -341,7 +341,7 @@ def test_records_that_will_not_do(kind):
     pose, orders = ORDERS[kind]
     data = record(system(kind), (200,))
     refuses(StructureError, "one output", quiet, Data(data.u, np.hstack([data.y, data.y**2])), pose, **orders)
-    refuses(OptidError, "'y'", quiet, Data(data.u, np.full((200, 1), np.nan)), pose, **orders)
+    refuses(OptidError, "'y'", lambda: quiet(Data(data.u, np.full((200, 1), np.nan)), pose, **orders))
     refuses(OptidError, "'u'", quiet, Data(np.full(200, 0.5), data.y), pose, **orders)
     with pytest.raises(RankError, match=r"u2\(k-1\)\) of the regressor depends on triangular1\(u1\(k-1\)"):
         quiet(Data(np.hstack([data.u, data.u]), data.y), pose, **orders)

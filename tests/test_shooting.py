@@ -151,7 +151,7 @@ def test_refusals():
     refuses(StructureError, "one output", quiet, Data(data.u, np.hstack([data.y, data.y**2])), shooting.exact, **ORDERS)
     refuses(StructureError, "na .the number of poles.", quiet, data, shooting.exact, **ORDERS | {"na": -1})
     refuses(RankError, "samples for", quiet, Data(data.u[:10], data.y[:10]), shooting.exact, **ORDERS)
-    refuses(DataError, "'y'", quiet, Data(data.u, np.full((200, 1), np.nan)), shooting.exact, **ORDERS)
+    refuses(DataError, "'y'", lambda: quiet(Data(data.u, np.full((200, 1), np.nan)), shooting.exact, **ORDERS))
     with pytest.raises(OptidError):
         quiet(data, shooting.exact, solver="ipopt",
               constraints=[lambda v: {"up": v["a"][0] >= 1, "down": v["a"][0] <= -1}], **ORDERS)

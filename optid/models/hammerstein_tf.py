@@ -240,7 +240,7 @@ class HammersteinTF(Model):
         """Return the response (n, l, r) of A^-1 to what enters its equations at first (k, l, r)."""
         right = np.zeros((n, *drive.shape[1:]))
         right[: len(drive)] = drive[:n]
-        return np.stack([autoregression(self.matrices, column) for column in np.moveaxis(right, 2, 0)], axis=2)
+        return np.stack([autoregression(self.matrices, right[:, :, c]) for c in range(drive.shape[2])], axis=2)
 
     def frequency_response(self, w: ArrayLike) -> Array:
         """Return A^-1 B_c at the frequencies w (radians per unit of time, up to pi / dt), complex (len(w), l, m)."""
