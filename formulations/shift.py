@@ -61,7 +61,8 @@ def centred(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Program:
     structural = _normalised(p)
     bare = Program("centre", cp.Minimize(-margin), structural, {"P": p, "margin": margin}, {}, dict, view,
                    structural=frozenset(structural)).subject_to(*rules)
-    eased = {name: group if name in structural else tuple(_eased(c, margin) for c in group)
+    eased = {name: tuple(c.args[0] - margin * np.eye(c.args[0].shape[0]) >> 0
+                         if isinstance(c, PSD) and name not in structural else c for c in group)
              for name, group in bare.constraints.items()}
     # the rules hold at A already: here they are not the user's, so that their prices stay those of the fit
     return replace(bare, constraints=eased, structural=frozenset(eased))
@@ -70,10 +71,3 @@ def centred(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Program:
 def _normalised(p: cp.Variable) -> dict[str, tuple[Any, ...]]:
     n = p.shape[0]
     return {"positive": (p - DEFINITE * np.eye(n) >> 0,), "trace": (cp.trace(p) == n,)}
-
-
-def _eased(member: Any, margin: cp.Variable) -> Any:
-    if not isinstance(member, PSD):
-        return member
-    inner = member.args[0]
-    return inner - margin * np.eye(inner.shape[0]) >> 0

@@ -88,10 +88,8 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
         constraints: builders of smooth constraints in the named variables.
 
     Raises:
-        StructureError: words, orders or starts that do not fit, too many samples, a rule about poles, a basis of the
-            feedback without a formula.
-        DataError: no stretch of some length in which every input is present.
-        RankError: too few samples for the unknowns, or a feedback basis that is linear in y.
+        StructureError: as there, and too many samples, a rule about poles, a basis of the feedback without a formula.
+        DataError, RankError: as there.
     """
     return _fit("hammerstein_ss", data, nx, basis=basis, feedback_basis=feedback_basis, block_rows=block_rows,
                 weighting=weighting, offset=offset, feedthrough=feedthrough, stability=stability, initial=initial,
@@ -187,15 +185,18 @@ class StateShooting(StateSpaceFit):
         derived = {}
         for i, label in enumerate(errors.labels):
             structural |= self._experiment(i, label, variables, runs[i])
-            residual: Any = self._weighted(i) @ cp.vec(variables[f"output{label}"], order="F") - self._measured(i)
+            weights, measured = self._weights(i), np.nan_to_num(errors.data.experiments[i].y).ravel(order="F")
+            residual: Any = weights @ cp.vec(variables[f"output{label}"], order="F") - weights @ measured
             r = variables[f"residual{label}"] = cp.Variable(residual.size, name=f"residual{label}")
             derived[r.name()] = residual
             structural[r.name()] = (r == residual,)
             r.value = residual.value
         start = {name: np.asarray(variable.value) for name, variable in variables.items()}
         courses = frozenset(variables) - set(self.places.names) - set(derived)
-        expansion = errors.unknowns.expansion
-        view = View({**variables, **self._exact_products(variables)}, gauge="norm", channels=expansion.input_names,
+        expansion, key = errors.unknowns.expansion, errors.key
+        products = {key("Theta", c): cp.outer(variables[key("mu", c)] if free else np.ones(1), variables[key("b", c)])
+                    for c, free in enumerate(errors.unknowns.free)}
+        view = View({**variables, **products}, gauge="norm", channels=expansion.input_names,
                     outputs=expansion.output_names, reference=start, units=units,
                     bases=dict(zip(expansion.input_names, outer_bases(expansion.inputs, units))))
         objective = cp.Minimize(sum(cp.sum_squares(variables[name]) for name in derived))
@@ -221,29 +222,29 @@ class StateShooting(StateSpaceFit):
         for c, basis in enumerate(expansion.inputs):
             b, eta = variables[key("b", c)], basis.values(e.u[:, c])
             f = eta @ variables[key("mu", c)] if unknowns.free[c] else cp.Constant(eta[:, 0])
-            following = following + _outer(f, b[:n])
-            shown = shown + _outer(f, b[n:]) if unknowns.feedthrough[c] else shown
+            following = following + cp.outer(f, b[:n])
+            shown = shown + cp.outer(f, b[n:]) if unknowns.feedthrough[c] else shown
         for j, one in enumerate(unknowns.latent):
             row, matrix = variables[key("z", j)], variables[key("g", j)]
             argument = x @ row[:n] + row[-1] + (e.u @ row[n:-1] if one.moved else 0.0)
             z = course(f"signal of {key('z', j)}", argument.value)
             found[f"{z.name()}"] = (z == argument,)
             h = _values(one.basis, z, one.vectors @ variables[key("c", j)])
-            following = following + _outer(h, matrix[:n])
-            shown = shown + _outer(h, matrix[n:]) if one.direct else shown
+            following = following + cp.outer(h, matrix[:n])
+            shown = shown + cp.outer(h, matrix[n:]) if one.direct else shown
         if unknowns.constant:
-            shown = shown + _outer(cp.Constant(np.ones(len(run))), variables["offset"])
+            shown = shown + cp.outer(cp.Constant(np.ones(len(run))), variables["offset"])
         output = course("output", shown.value)
         for j, family in enumerate(expansion.feedback):
             nu = variables[key("nu", j)] if family.size > 1 else np.ones(1)
             g = (_values(family.basis, output[:, family.output], family.vectors @ nu)
                  - family.intercept @ nu - output @ (family.slope.T @ nu))
-            following = following + _outer(g, variables[key("e", j)])
+            following = following + cp.outer(g, variables[key("e", j)])
         first = variables["x0"] if len(self.criterion.labels) == 1 else variables["x0"][:, i]
         return {**found, f"initial state{label}": (x[0] == first,), f"dynamics{label}": (x[1:] == following[:-1],),
                 f"outputs{label}": (output == shown,)}
 
-    def _weighted(self, i: int) -> sp.csr_array:
+    def _weights(self, i: int) -> sp.csr_array:
         """Return the matrix that weighs the outputs of an experiment, column by column, as far as they are present."""
         here, covariance = np.isfinite(self.criterion.data.experiments[i].y), np.linalg.inv(self.criterion.weight)
         blocks = []
@@ -252,19 +253,6 @@ class StateShooting(StateSpaceFit):
             picked = sp.eye_array(len(here)).tocsr()[np.flatnonzero((here == pattern).all(axis=1))]
             blocks.append(sp.kron(weight_root(covariance, ~pattern)[there], picked))
         return sp.csr_array(sp.vstack(blocks))
-
-    def _measured(self, i: int) -> Array:
-        return self._weighted(i) @ np.nan_to_num(self.criterion.data.experiments[i].y).ravel(order="F")
-
-    def _exact_products(self, variables: Mapping[str, cp.Variable]) -> dict[str, cp.Expression]:
-        """Every Theta = mu bᵀ (P, n + l)."""
-        key, free = self.criterion.key, self.criterion.unknowns.free
-        return {key("Theta", c): _outer(variables[key("mu", c)] if free[c] else cp.Constant(np.ones(1)),
-                                        variables[key("b", c)]) for c in range(len(free))}
-
-
-def _outer(left: Any, right: Any) -> cp.Expression:
-    return cp.reshape(left, (left.size, 1), order="F") @ cp.reshape(right, (1, right.size), order="F")
 
 
 def _values(basis: Basis, v: Any, coefficients: Any) -> Any:

@@ -12,6 +12,13 @@ from optid.examples import example
 from optid.identify.fitting import Fit
 
 
+def quiet(*arguments: Any, **options: Any) -> Fit:
+    """A fit whose remarks about the record are of no interest."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        return optid.fit(*arguments, **options)
+
+
 @cache
 def example_fit(name: str, formulation: str = "hammerstein_arx.exact", **more: Any) -> Fit:
     """A built-in record as suggested."""
@@ -39,9 +46,7 @@ def two_by_two(n: int = 500, seed: int = 3) -> optid.Data:
 @cache
 def mimo_fit() -> Fit:
     """The record of `two_by_two`, fitted."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        return optid.fit(two_by_two(), na=1, nb=1, basis="polynomial:3")
+    return quiet(two_by_two(), na=1, nb=1, basis="polynomial:3")
 
 
 @cache
@@ -61,14 +66,10 @@ def feedback_fit() -> Fit:
 
     u = np.random.default_rng(0).uniform(-2, 2, 1500)
     data = van_der_pol(u, 1, measurement=0.02, process=0.005)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        return optid.fit(data, "hammerstein_ss.asivid", nx=2, basis="polynomial:3", feedback_basis="polynomial:3")
+    return quiet(data, "hammerstein_ss.asivid", nx=2, basis="polynomial:3", feedback_basis="polynomial:3")
 
 
 @cache
 def output_error_fit() -> Fit:
     """The dead zone record, fitted by its simulation error."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        return optid.fit(example("dead_zone").data, "hammerstein_oe.exact", na=2, nb=2, basis="triangular:8")
+    return quiet(example("dead_zone").data, "hammerstein_oe.exact", na=2, nb=2, basis="triangular:8")

@@ -51,11 +51,12 @@ def by_hand(model, u, x0, y=None, gain=None, noise=None):
     x, outputs = np.array(x0, dtype=float), np.zeros((len(u), model.l))
     for k in range(len(u)):
         f = np.array([g(u[k, c]) for g, c in zip(model.nonlinearities, model.input_of)])
-        yk = model.C @ x + model.D @ f + model.offset_y + (0 if noise is None else noise[k])
+        h = np.array([g(z) for g, z in zip(model.latent, model.Cz @ x + model.Dz @ u[k] + model.offset_z)])
+        yk = model.C @ x + model.D @ f + model.Fz @ h + model.offset_y + (0 if noise is None else noise[k])
         outputs[k] = yk
         seen = yk if y is None else np.where(np.isnan(y[k]), yk, y[k])
         g = np.array([h(seen[o]) for h, o in zip(model.feedback, model.output_of)])
-        x = model.A @ x + model.B @ f + model.L @ seen + model.offset_x + (model.E @ g if g.size else 0)
+        x = model.A @ x + model.B @ f + model.L @ seen + model.Ez @ h + model.offset_x + (model.E @ g if g.size else 0)
         if gain is not None:
             x = x + gain @ (seen - yk)
         if noise is not None:

@@ -18,7 +18,7 @@ from optid.errors import OptidError, StructureError
 from optid.models import Nonlinearity
 
 
-@pytest.mark.parametrize("model", [siso(), siso(nk=3), siso(a=[]), mimo()])
+@pytest.mark.parametrize("model", [siso(), siso(nk=3, c=[-0.6, 0.25], d=[-0.5, 0.1, 0.3]), siso(a=[]), mimo()])
 def test_dlti_has_the_impulse_responses(model):
     expected = model.impulse_response(30)
     for o in range(model.l):
@@ -70,11 +70,11 @@ def test_casadi_equals_simulation_inside_and_outside(basis):
 
 
 def test_casadi_mimo_and_static():
-    for model in (mimo(), siso(a=[], b=([2.0],))):
+    for model in (mimo(), siso(a=[], b=([2.0],)), siso(c=[-0.6, 0.25], d=[-0.5, 0.1, 0.3])):
         u = inputs(model, 80)
-        state = np.random.default_rng(2).normal(size=(model.memory, model.l))
+        state = np.random.default_rng(2).normal(size=(model.largest_lag, model.l))
         function = model.to_casadi()
-        assert function.size1_in(0) == model.memory * model.l and function.size1_in(1) == model.m
+        assert function.size1_in(0) == model.largest_lag * model.l and function.size1_in(1) == model.m
         assert iterate(function, u, state) == pytest.approx(model.simulate(u, x0=state), abs=1e-10)
 
 

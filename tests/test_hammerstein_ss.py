@@ -379,13 +379,6 @@ def test_other_tools():
     assert control.frequency_response(model.to_control(), [0.3]).frdata[:, :, 0] == pytest.approx(
         model.frequency_response([0.3])[0], abs=1e-10)
     assert model.to_dlti().A == pytest.approx(model.A)
-    model = with_feedback()
-    step, x, u = model.to_casadi(), X0, inputs(model, 30)
-    outputs = []
-    for row in u:
-        x, y = step(x, row)
-        outputs.append(np.array(y).ravel())
-    assert np.array(outputs) == pytest.approx(model.simulate(u, x0=X0), abs=1e-10)
 
 
 # -- noise -------------------------------------------------------------------------------------------------------------

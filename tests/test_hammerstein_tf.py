@@ -256,16 +256,3 @@ def test_unstable_armax_predicts():
         y = model.simulate(u) + lfilter(np.r_[1, C], np.r_[1, plant.a], e)[:, None]
     found = model.innovations(Data(u, y, dt=model.dt))[:, 0]
     assert found[45:] == pytest.approx(e[45:], abs=1e-4)
-
-
-def test_the_plant_leaves_for_other_tools():
-    model = MODELS["bj"]
-    one = model.to_dlti()
-    assert one.den == pytest.approx(np.r_[1, model.a]) and one.dt == model.dt
-    x, y = np.zeros(model.largest_lag), []
-    step, u = model.to_casadi(), inputs(model, 20)
-    for sample in u:
-        x, out = step(x, sample)
-        y.append(float(out))
-    assert y == pytest.approx(model.simulate(u)[:, 0], abs=1e-12)
-    assert (model.na, model.nb) == (2, (2,))

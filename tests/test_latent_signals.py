@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from state_systems import by_hand
 
 import optid
 from optid.bases import BSpline, Polynomial, UserFunctions
@@ -34,17 +35,6 @@ def latent(first=SMOOTH, second=CELLS, seed=0, **changes):
         "feedback": (FED,), "output_of": (1,), "L": 0.05 * rng.normal(size=(3, 2)),
         "offset_x": np.array([0.1, 0.0, -0.1]), "offset_y": np.array([0.5, -1.0])}
     return HammersteinSS(**(arguments | changes))
-
-
-def by_hand(model, u, x0):
-    """The equations as they are written."""
-    x, y = np.array(x0, dtype=float), np.zeros((len(u), model.l))
-    for k in range(len(u)):
-        h = np.array([f(z) for f, z in zip(model.latent, model.Cz @ x + model.Dz @ u[k] + model.offset_z)])
-        y[k] = model.C @ x + model.D @ u[k] + model.Fz @ h + model.offset_y
-        g = np.array([f(y[k, o]) for f, o in zip(model.feedback, model.output_of)])
-        x = model.A @ x + model.B @ u[k] + model.E @ g + model.L @ y[k] + model.Ez @ h + model.offset_x
-    return y
 
 
 def inputs(samples=80, seed=1):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scripts
+from sample_fits import quiet
 
 import optid
 from optid.data.record import Data
@@ -19,12 +20,6 @@ gaps = scripts.benchmark("gaps")
 CELLS = {str(cell): cell for cell in gaps.CELLS}
 CLOSE = {"subspace.nuclear": 3.0}
 """Points of simulation fit that a fifth of the outputs may cost; 2 where nothing is said."""
-
-
-def quiet(data, name, **arguments):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        return optid.fit(data, name, **arguments)
 
 
 def score(cell, data):

@@ -1,11 +1,11 @@
 """ARMAX and Box-Jenkins fits: other optimisers, known systems, constraints, gaps, experiments, efficiency, refusals."""
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from refusals import refuses
+from sample_fits import quiet
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
@@ -17,7 +17,7 @@ from formulations.prediction_error import hammerstein_armax as armax
 from formulations.prediction_error import hammerstein_bj as bj
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
-from optid.errors import DataWarning, InfeasibleError, OptidError, RankError, StructureError
+from optid.errors import InfeasibleError, OptidError, RankError, StructureError
 from optid.identify.prediction_error.starts import arma
 from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
@@ -45,12 +45,6 @@ def record(model, counts=(400,), noise=0.3, seed=0, gaps=0.0):
         us.append(u)
         ys.append(y)
     return Data(us, ys)
-
-
-def quiet(*arguments, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        return optid.fit(*arguments, **options)
 
 
 ORDERS = {"armax": (armax, {"na": 2, "nb": 2, "nk": 1, "nc": 2, "basis": BASIS}),

@@ -85,7 +85,11 @@ def test_sensitivities_are_the_derivatives_of_the_errors(name, gaps, monkeypatch
         states[:, i * unknowns.memory : (i + 1) * unknowns.memory] = part[:, : unknowns.memory]
         rows.append(np.hstack([part[:, unknowns.memory : -1], states, part[:, -1:]]))
         assert np.count_nonzero(found.state == 0) < len(e.u) + apart
-    whole = np.vstack(rows)
+    assert_derivatives(np.vstack(rows), data, unknowns, x)
+
+
+def assert_derivatives(whole, data, unknowns, x):
+    """Columns of the rows [sensitivities | errors] against finite differences."""
     assert whole[:, -1] == pytest.approx(errors(data, unknowns, x), abs=1e-13)
     for j in range(unknowns.size):
         step = 1e-6 * np.eye(unknowns.size)[j]
@@ -108,11 +112,7 @@ def test_derivatives_where_outputs_never_follow_one_another(name, monkeypatch):
         found = predictor.predict(point, i, predictor.simulate(point)[i])
         assert np.count_nonzero(found.state == 0) == np.isfinite(e.y[10 * unknowns.layout.first_row :]).sum() > 5
         rows.append(np.vstack([b for b, _ in predictor.blocks(point, i)]))
-    whole = np.vstack(rows)
-    for j in range(unknowns.size):
-        step = 1e-6 * np.eye(unknowns.size)[j]
-        slope = (errors(data, unknowns, x + step) - errors(data, unknowns, x - step)) / 2e-6
-        assert whole[:, j] == pytest.approx(slope, abs=2e-7 * (1 + np.max(np.abs(slope)))), j
+    assert_derivatives(np.vstack(rows), data, unknowns, x)
 
 
 @pytest.mark.parametrize("method", ["gram", "qr", "auto"])
@@ -164,11 +164,8 @@ def test_without_a_noise_filter_it_is_the_output_error():
 
 
 def test_packing():
-    model, _ = CASES["bj"]
-    data = records(model)
-    unknowns, x = point_of(model, data, True)
-    assert np.array_equal(unknowns.pack(unknowns.unpack(x)), x)
-    model, _ = CASES["armax"]
-    unknowns, x = point_of(model, data, False)
-    assert np.array_equal(unknowns.pack(unknowns.unpack(x)), x)
+    for name in ("bj", "armax"):
+        model, apart = CASES[name]
+        unknowns, x = point_of(model, records(model), apart)
+        assert np.array_equal(unknowns.pack(unknowns.unpack(x)), x)
     assert np.array_equal(unknowns.unpack(x).d, unknowns.unpack(x).a)

@@ -1,9 +1,9 @@
 """Subspace methods on noise-free and noisy systems with known parameters, and their refusals."""
 
-import warnings
 
 import numpy as np
 import pytest
+from sample_fits import quiet
 
 import optid
 from formulations.constraints import shape
@@ -66,12 +66,6 @@ def markov(a, c, b, count=8):
 def without_injection(model):
     """The model with the linear part of the feedback back in g, as the plant has it."""
     return model.injected(-model.L)
-
-
-def quiet(data, name, **arguments):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        return optid.fit(data, name, **arguments)
 
 
 # -- exact recovery ---------------------------------------------------------------------------------------------------

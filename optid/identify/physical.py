@@ -46,11 +46,6 @@ class PhysicalUnknowns(Unknowns):
     innovations = False
     latent = ()
 
-    @property
-    def memory(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Number of states."""
-        return self.n
-
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Every parameter is a number."""

@@ -101,13 +101,11 @@ class Equations:
             raise StructureError(f"the equations return a {type(found).__name__}; return a dictionary of "
                                  f"{', '.join([*self.states, *outputs])}")
         wanted = (*self.states, *outputs)
-        for name in wanted:
-            if name not in found:
-                raise StructureError(f"the equations return nothing for {name!r}; they return {', '.join(found)}")
-        for name in found:
-            if name not in wanted:
-                raise StructureError(f"the equations return {name!r}, which is neither a state nor an output of the "
-                                     f"record. {nearest(name, wanted)}")
+        for name in (name for name in wanted if name not in found):
+            raise StructureError(f"the equations return nothing for {name!r}; they return {', '.join(found)}")
+        for name in (name for name in found if name not in wanted):
+            raise StructureError(f"the equations return {name!r}, which is neither a state nor an output of the "
+                                 f"record. {nearest(name, wanted)}")
         return {name: found[name] for name in wanted}
 
 

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from html import escape
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -22,7 +22,19 @@ from optid.models.nonlinearity import Nonlinearity
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
 
 
-class Model(Ports):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class ModelFields(Ports):
+    """The fields that every model has; see `Model`."""
+
+    dt: float = 1.0
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    gauge: str = "none"
+
+
+class Model(ModelFields):
     """A linear part between static functions, with named channels; the fields are those of its dataclasses.
 
     Attributes:
@@ -42,15 +54,10 @@ class Model(Ports):
     """
 
     nonlinearities: tuple[Nonlinearity, ...]
-    dt: float
-    input_units: tuple[str, ...]
-    output_units: tuple[str, ...]
-    gauge: str
     orders: Any
     poles: Any
     memory: int
     structure: Any
-    __dataclass_fields__: ClassVar[dict[str, Any]]
     GAUGES: ClassVar[tuple[str, ...]]
     SIMULATORS: ClassVar[tuple[str, ...]]
     c0: Any

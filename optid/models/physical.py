@@ -52,12 +52,6 @@ class PhysicalModel(Model):
     bounds: tuple[tuple[float, float], ...]
     steps: int = 1
     hold: str = "zero"
-    dt: float = 1.0
-    inputs: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
-    input_units: tuple[str, ...] = ()
-    output_units: tuple[str, ...] = ()
-    gauge: str = "none"
     GAUGES = ("none",)
     SIMULATORS = ("free", "predict")
     nonlinearities: ClassVar[tuple[Nonlinearity, ...]] = ()

@@ -118,11 +118,6 @@ class StateUnknowns(Unknowns):
         """Number of outputs."""
         return self.expansion.l
 
-    @property
-    def memory(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Size of an initial state."""
-        return self.n
-
     @cached_property
     def free(self) -> tuple[bool, ...]:
         """Whether mu of every input is unknown: it is one where the basis has a single function."""

@@ -12,10 +12,15 @@ from optid.models.layout import Layout
 class Unknowns:
     """Where every part stands in the vector x; a subclass names the parts."""
 
+    n: int  # number of states
     experiments: int  # number of experiments
-    memory: int  # size of an initial state
     innovations: bool  # whether the errors are those of predictions rather than of simulations
     shapes: dict[str, tuple[int, ...]]  # shape of every shared part in the order of x
+
+    @property
+    def memory(self) -> int:
+        """Size of an initial state among the unknowns."""
+        return self.n
 
     @cached_property
     def slices(self) -> dict[str, slice]:
@@ -89,7 +94,7 @@ class TransferUnknowns(Unknowns):
         return (self.nc, self.nd) != (0, 0)
 
     @property
-    def memory(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def memory(self) -> int:
         """Size n of an initial state among the unknowns."""
         return self.layout.first_row if self.apart else 0
 

@@ -88,7 +88,7 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
 def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator, iterations: int
            ) -> tuple[StateErrors, Descent, float]:
     """Add the function of a latent signal; also return the share of the errors that its best direction promised."""
-    part, x = whitened(part, x)
+    x = whitened(part, x)
     ranked = sorted(_ranked(part, x, latent, rng), key=lambda one: -one[0])
     ranked = [one for one, before in zip(ranked, [None, *ranked]) if before is None or one[0] < SAME * before[0]]
     ends = [one for _, *chosen in ranked[: HEATS[0][0]] if (one := _short(part, x, latent, *chosen)) is not None]
@@ -197,7 +197,7 @@ def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[La
     return errors, replace(found, steps=best.steps + found.steps), {}
 
 
-def whitened(errors: StateErrors, x: Array) -> tuple[StateErrors, Array]:
+def whitened(errors: StateErrors, x: Array) -> Array:
     """Return the same model in states of unit covariance over the record."""
     point = errors.unknowns.unpack(x)
     runs = errors.visited(point)
@@ -207,7 +207,7 @@ def whitened(errors: StateErrors, x: Array) -> tuple[StateErrors, Array]:
     back = np.linalg.inv(turn)
     moved = replace(point, A=turn @ point.A @ back, C=point.C @ back, K=turn @ point.K, b=turn @ point.b,
                     e=turn @ point.e, Ez=turn @ point.Ez, Cz=point.Cz @ back, x0=point.x0 @ turn.T)
-    return errors, errors.normalised(errors.unknowns.pack(moved))
+    return errors.normalised(errors.unknowns.pack(moved))
 
 
 def first_samples(data: Data, size: int) -> Data:

@@ -130,7 +130,8 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:
             continue
         step = here.step(solution)
         gain, new = here.gain(step), here.moved(here.x + step)
-        weight = max(weight, 2.0 * _largest_dual(here.program, solution))
+        duals = [solution.duals[name] for name in here.program.user_constraints if name in solution.duals]
+        weight = max(weight, *(2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals), 0.0)
         idle += not damping and abs(gain) <= STALLED * here.at.value
         share = CONFIRMED if abs(gain) < 0.5 * last and idle <= PATIENCE else STALLED
         last = abs(gain) if not damping else last
@@ -192,8 +193,3 @@ def _near(solution: Solution) -> bool:
     found = solution.residuals
     return found is not None and solution.status is Status.INACCURATE and (
         max(found.violation, found.stationarity) <= INSIDE and found.complementarity <= STALLED)
-
-
-def _largest_dual(program: Program, solution: Solution) -> float:
-    return max((float(np.max(np.abs(solution.duals[name]), initial=0.0)) for name in program.user_constraints
-                if name in solution.duals), default=0.0)

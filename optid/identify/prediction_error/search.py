@@ -13,7 +13,6 @@ from optid.identify.prediction_error.descent import Descent, agreement, best_of,
 from optid.identify.prediction_error.tangent_fit import TangentFit, violation
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models.roots import contained
-from optid.statistics.linearised import Linearised
 
 # samples, from the middle of the record, on which starts are compared; the winner descends on the whole record
 SEARCH = 5_000
@@ -85,17 +84,12 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
         x = fit.signed(one.x)
         for radius in PULLS:
             pulled = x[at] if radius == 1.0 else contained(x[at], radius)
-            if _poles_obey(fit, np.concatenate([pulled, x[at.stop :]]), one.at):
+            program = fit.pose(np.concatenate([pulled, x[at.stop :]]), one.at, 0.0)
+            a = program.variables.get("a")
+            others = [name for name, group in program.user_constraints.items()
+                      if a is not None and any({v.id for v in c.variables()} != {a.id} for c in group)]
+            if violation(program.without(*others, "residual", "gauge")) <= 1e-9:  # those on the poles alone hold
                 again = one if radius == 1.0 else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break
     return fit.signed(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
-
-
-def _poles_obey(fit: TangentFit, x: Array, at: Linearised) -> bool:
-    """Whether the constraints on a alone hold at the A of x."""
-    program = fit.pose(x, at, 0.0)
-    a = program.variables.get("a")
-    others = [name for name, group in program.user_constraints.items()
-              if a is not None and any({v.id for v in c.variables()} != {a.id} for c in group)]
-    return violation(program.without(*others, "residual", "gauge")) <= 1e-9

@@ -75,11 +75,8 @@ def search_states(errors: StateErrors, starts: Mapping[str, Array], weighting: s
 def _weighted(errors: StateErrors, start: str, x: Array, weighting: str, iterations: int, steps: int = 0
               ) -> tuple[StateErrors, Descent]:
     """Descend, the errors weighted by their own (co)variance until it stays; steps taken before are counted."""
-    if weighting == "scale":
-        one = descend(errors, x, iterations=iterations, start=start)
-        return errors, replace(one, steps=steps + one.steps)
     for _ in range(ROUNDS):
-        new = errors.reweighted(x, full=weighting == "determinant")
+        new = errors if weighting == "scale" else errors.reweighted(x, full=weighting == "determinant")
         change = np.linalg.norm(new.weight - errors.weight) / np.linalg.norm(new.weight)
         errors = new
         one = descend(errors, x, iterations=iterations, start=start)
