@@ -103,21 +103,20 @@ class _Collocation:
         """Return the programme under the user's constraints."""
         errors = self.errors
         objective = cp.Minimize(sum(cp.sum_squares(one) for one in self.residuals))
-        bounds = {f"bounds of {name}": limits for name in self.equations.parameters if (limits := self._bounds(name))}
+        bounds = {f"bounds of {name}": limits for name in self.equations.parameters
+                  if (limits := _within(self.view[name], *self.equations.interval(name)))}
         for name, value in start.items():
             self.variables[name].value = value
         start = {**start, **{name: np.asarray(expression.value) for name, expression in self.derived.items()}}
         bound = Bound.none(NO_BOUND)
         program = Program(
-            "physical", objective, self.structural, self.variables, start, self._model, View(self.view),
+            "physical", objective, self.structural, self.variables, start,
+            lambda values: errors.model(errors.places.pack(values)), View(self.view),
             frozenset(self.structural), derived=self.derived, scale=errors.energy,
             certify=lambda program, values, duals: (bound, None), note=NO_BOUND,
             compressed=CompressedPhysical(errors), unit=errors.unit,
             courses=frozenset(name for name in self.variables if name.startswith("states of ")))
         return program.subject_to(*([bounds] if bounds else []), *constraints, convex=False)
-
-    def _model(self, values: Values) -> Any:
-        return self.errors.model(self.errors.places.pack(values))
 
     def _experiment(self, i: int, label: str) -> list[Any]:
         """Enter the dynamics of one experiment; return its residuals, one variable per output."""
@@ -131,15 +130,15 @@ class _Collocation:
             first = x0[j] if x0.ndim == 1 else x0[j, i]
             courses[name] = errors.usual[j] * cp.hstack([first, rest])
             self.view[f"{name}{label}"] = courses[name][::apart]
-            ends = [first >= low] * bool(np.isfinite(low)) + [first <= high] * bool(np.isfinite(high))
-            if ends:
+            if ends := _within(first, low, high):
                 self.structural[f"first value of {name}{label}"] = tuple(ends)
         grid = errors.grid(i)
         now, after = (grid[:-1], grid[:-1] if equations.hold == "zero" else grid[1:])
         moves = self._right({name: course[:-1] for name, course in courses.items()}, now)
         if errors.steps:
+            half = self.data.dt / apart / 2  # of a step
             ends = self._right({name: course[1:] for name, course in courses.items()}, after)
-            moves = {name: courses[name][:-1] + errors.half * (moves[name] + ends[name]) for name in names}
+            moves = {name: courses[name][:-1] + half * (moves[name] + ends[name]) for name in names}
         self.structural[f"dynamics{label}"] = tuple(
             (courses[name][1:] - moves[name]) / errors.usual[j] == 0 for j, name in enumerate(names))
         at = {name: course[::apart] for name, course in courses.items()}
@@ -160,12 +159,6 @@ class _Collocation:
         parameters = {name: self.view[name] for name in self.equations.parameters}
         found = self.equations.evaluated({**inputs, **parameters, **states}, self.data.outputs)
         return {name: cp.Constant(np.zeros(len(u))) + value for name, value in found.items()}
-
-    def _bounds(self, name: str) -> list[Any]:
-        """Return the bounds of a parameter as constraints, which have prices."""
-        low, high = self.equations.interval(name)
-        parameter = self.view[name]
-        return [parameter >= low] * bool(np.isfinite(low)) + [parameter <= high] * bool(np.isfinite(high))
 
     def along(self, x: Array) -> dict[str, Array]:
         """Return the start at unknowns x, with the states of its run."""
@@ -191,3 +184,8 @@ class _Collocation:
                 start[f"states of {name}{label}"] = np.clip(
                     course[:, j], *(end / errors.usual[j] for end in self.equations.interval(name)))
         return start
+
+
+def _within(expression: Any, low: float, high: float) -> list[Any]:
+    """Return bounds as constraints, which have prices; none where open."""
+    return [expression >= low] * bool(np.isfinite(low)) + [expression <= high] * bool(np.isfinite(high))

@@ -37,8 +37,7 @@ from optid.data.record import Data
 from optid.identify.arguments import enough_rows
 from optid.identify.gauges import FIXED, scale_fixed
 from optid.identify.prediction_error.refinement import refine
-from optid.identify.prediction_error.search import entry, search
-from optid.identify.prediction_error.starts import starts_of
+from optid.identify.prediction_error.search import entry, search, starts_of
 from optid.identify.prediction_error.tangent_fit import CompressedErrors, TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF, Nonlinearity

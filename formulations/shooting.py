@@ -32,7 +32,7 @@ from optid.bases import Bases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.gauges import FIXED, scale_fixed
-from optid.identify.prediction_error.starts import arx_start, iterated
+from optid.identify.prediction_error.search import arx_start, iterated
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models.gauges import leading_sign

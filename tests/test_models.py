@@ -283,13 +283,6 @@ def test_raw_units_mimo_and_linear():
     assert siso().with_transform(Transform.identity(1, 1)).a.tolist() == [-1.5, 0.7]
 
 
-def test_raw_units_through_data():
-    model = siso()
-    data = record(model, 300, noise=0.1)
-    changed = data.detrend().scale()
-    assert model.predict(changed)[2:] == pytest.approx(model.predict(data)[2:], abs=1e-9)
-
-
 def test_user_functions_keep_their_units():
     functions = UserFunctions((np.tanh,), ("tanh",)).fitted(-1, 1)
     with pytest.raises(StructureError, match="keeps the units"):

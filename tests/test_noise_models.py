@@ -18,7 +18,7 @@ from formulations.prediction_error import hammerstein_bj as bj
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.record import Data
 from optid.errors import InfeasibleError, OptidError, RankError, StructureError
-from optid.identify.prediction_error.starts import arma
+from optid.identify.prediction_error.search import arma
 from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
 

@@ -16,7 +16,7 @@ from optid.data.channels import Transform
 from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
 from optid.identify.prediction_error import search
 from optid.identify.prediction_error.descent import descend
-from optid.identify.prediction_error.starts import plant_starts
+from optid.identify.prediction_error.search import plant_starts
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.models.layout import Layout

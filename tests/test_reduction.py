@@ -18,8 +18,7 @@ from optid.data.reduction import FAN_IN, _streamed
 from optid.errors import DataError, RankError
 from optid.statistics import accumulate, collect, factorise
 from optid.statistics.blocks import Frame
-from optid.statistics.joining import total_of_parts
-from optid.statistics.sums import Sums
+from optid.statistics.sums import Sums, total_of_parts
 
 da = pytest.importorskip("dask.array")
 dd = pytest.importorskip("dask.dataframe")

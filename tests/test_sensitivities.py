@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import optid
-from optid.bases import BSpline, Linear, Polynomial, Triangular
+from optid.bases import Linear, Triangular
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.layout import Layout
 from optid.statistics import sensitivities
@@ -145,21 +145,6 @@ def test_instruments_hold_the_measured_output_in_the_columns_of_a():
     size = np.linalg.norm(formed, axis=0)
     found = TransferPredictor(data, unknowns).instruments(point)
     assert np.max(np.abs(found - formed.T @ formed) / np.outer(size, size)) < 1e-6
-
-
-@pytest.mark.parametrize("basis", [Polynomial(3), BSpline(5), Triangular(6)], ids=str)
-def test_every_basis(basis, monkeypatch):
-    monkeypatch.setattr(sensitivities, "CHUNK", 13)
-    rng = np.random.default_rng(2)
-    data = optid.Data(rng.uniform(-1, 1, 80), rng.normal(size=80))
-    basis = basis.fitted(-1, 1)
-    unknowns = TransferUnknowns(Layout(1, (2,), (1,), (basis,), ("y",), ("u",)), 1, (True,))
-    point = TransferPoint(np.array([-0.6]), (rng.normal(size=basis.size),), (np.array([0.8, 0.6]),), 0.1,
-                       rng.normal(size=(1, unknowns.memory)))
-    x = unknowns.pack(point)
-    slopes = jacobian(data, unknowns, x)
-    matrix, _ = TransferPredictor(data, unknowns).compress(point).whole
-    assert np.allclose(matrix.T @ matrix, slopes.T @ slopes, atol=1e-6 * np.max(slopes.T @ slopes))
 
 
 def test_kept_basis_functions_change_nothing(monkeypatch):

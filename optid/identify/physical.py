@@ -51,10 +51,6 @@ class PhysicalUnknowns(Unknowns):
         """Every parameter is a number."""
         return dict.fromkeys(self.names, ())
 
-    def words(self, states: tuple[str, ...]) -> list[str]:
-        """Say what stands at every position."""
-        return [*self.names, *(f"initial {name}" for _ in range(self.experiments) for name in states)]
-
 
 @dataclass(frozen=True, eq=False)
 class PhysicalErrors(Criterion):
@@ -226,11 +222,6 @@ class PhysicalErrors(Criterion):
         variances = np.nanmean(np.vstack(self.residuals(x)) ** 2, axis=0)
         return replace(self, weight=np.diag(1 / np.maximum(variances, FLOOR / np.diag(self.weight))))
 
-    @property
-    def half(self) -> float:
-        """Half a step of integration."""
-        return self.data.dt / self.steps / 2
-
     def grid(self, i: int) -> Array:
         """Return the inputs (G, m) of an experiment at the steps of integration."""
         u, apart = self.data.experiments[i].u, max(self.steps, 1)
@@ -329,7 +320,9 @@ class CompressedPhysical(CompressedStates):
 
     def _refuse_undetermined(self, rows: Array) -> None:
         """Refuse what has no effect beside the gradients (k, p) of binding constraints (`RankError`)."""
-        matrix, names = self.at.whole[0], self.criterion.unknowns.words(tuple(self.criterion.equations.states))
+        matrix, errors = self.at.whole[0], self.criterion
+        initial = [f"initial {name}" for name in errors.equations.states] * errors.unknowns.experiments
+        names = [*errors.unknowns.names, *initial]
         sizes = np.linalg.norm(matrix, axis=0)
         scale = np.where(sizes > NO_EFFECT * sizes.max(), sizes, sizes.max())
         lengths = np.linalg.norm(rows / scale, axis=1, keepdims=True)

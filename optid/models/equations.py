@@ -77,11 +77,7 @@ class Equations:
         return -np.inf if low is None else float(low), np.inf if high is None else float(high)
 
     def substeps(self, dt: float) -> int:
-        """Return how many steps of integration there are in a sampling time.
-
-        Raises:
-            StructureError: the step does not divide it, or the time is discrete.
-        """
+        """Return the steps of integration in a sampling time; refuse one that does not divide it (`StructureError`)."""
         if self.step is None:
             return 1
         count = dt / self.step if self.step > 0 else 0.0
@@ -91,11 +87,7 @@ class Equations:
         return round(count)
 
     def evaluated(self, v: Mapping[str, Any], outputs: tuple[str, ...]) -> dict[str, Any]:
-        """Return what the function says of every state and output.
-
-        Raises:
-            StructureError: it asks for an unknown name, or does not return one value for each.
-        """
+        """Return what the function says of states and outputs; refuse unknown or missing names (`StructureError`)."""
         found = self.right(_Named(v))
         if not isinstance(found, Mapping):
             raise StructureError(f"the equations return a {type(found).__name__}; return a dictionary of "

@@ -39,10 +39,7 @@ class StaticFunction:
     def samples(self, data: Data) -> Array:
         """Samples (N,) of its argument in a record, all experiments; NaN = missing.
 
-        Those of a latent signal are of the free run from the initial states that fit best.
-
-        Raises:
-            DataError: a free run that leaves 100 times the range of the record.
+        Those of a latent signal are of the free run from the initial states that fit best; see `latent_run`.
         """
         if self.family == "latent":
             return np.concatenate([z[:, self.channel] for z in self.model.latent_run(data)])

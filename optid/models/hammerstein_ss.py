@@ -58,8 +58,7 @@ class HammersteinSS(StateSpace):
     def latent_run(self, data: Data) -> list[Array]:
         """Return the latent signals (N, k) of every experiment in the free run from the initial state that fits best.
 
-        Raises:
-            DataError: a run that leaves 100 times the range of the record.
+        A run that leaves 100 times the range of the record raises a `DataError`.
         """
         records = records_of(self, data)[0]
         limits = simulation.allowed_range([y for _, y, _ in records])

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array, finite
 from optid.data.channels import Transform
 from optid.errors import DataError, StructureError
-from optid.models import noise_filter, roots, text
+from optid.models import recursions, roots, text
 from optid.models.experiments import Record, check_inputs, samples_of, scaled_least_squares, signal_units
 from optid.models.files import KINDS
 from optid.models.gauges import GAUGES, gauge_factor
@@ -288,8 +288,8 @@ class HammersteinTF(Model):
     def _noise_predicted(self, s: Array, drive: Array | None, horizon: int, start: int) -> Array:
         """Predict s = drive + (C/D) e, (N, 1)."""
         c, d = self.c, self.noise_denominator
-        found = noise_filter.innovations(s[:, 0], None if drive is None else drive[:, 0], c, d, start)
-        return noise_filter.predict(found, c, d, horizon)[:, None]
+        found = recursions.innovations(s[:, 0], None if drive is None else drive[:, 0], c, d, start)
+        return recursions.predict(found, c, d, horizon)[:, None]
 
     def driven(self, u: Array) -> Array:
         """Return the right-hand side sum_c B_c(q) f_c(u_c) + offset, (N, l), with nothing before the record."""
@@ -347,7 +347,7 @@ class HammersteinTF(Model):
         rest, columns = rest / units, columns.reshape(count, outputs, n * outputs) / units[:, None]
         if whitened:
             signals = np.where(present, np.column_stack([rest, columns[:, 0]]), np.nan).T
-            errors = [noise_filter.innovations(s, None, self.c, self.noise_denominator).innovations for s in signals]
+            errors = [recursions.innovations(s, None, self.c, self.noise_denominator).innovations for s in signals]
             rest, columns = errors[0][:, None], np.column_stack(errors[1:])[:, None]
         return scaled_least_squares(columns[present], rest[present]).reshape(n, outputs)
 

@@ -198,10 +198,7 @@ def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
 
 
 def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array) -> tuple[Array, Array]:
-    """Normal equations of a step in the gain (row by row), the innovations in units of their covariance.
-
-    The initial states are eliminated.
-    """
+    """Normal equations of a step in the gain (row by row), errors in units of their covariance, states eliminated."""
     parts, root, n = _parts(A, C, gain), _whitening(covariance), len(A)
     total = np.zeros((gain.size + 1, gain.size + 1))
     for r, x0 in zip(rest, _initial(parts, rest)):

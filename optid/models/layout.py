@@ -1,6 +1,6 @@
 """Which sample stands in which column of the regression y = Phi theta + e."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -27,6 +27,11 @@ class Layout(Ports):
     bases: tuple[Basis, ...]  # one basis per input, with its interval
     outputs: tuple[str, ...]  # names of the l outputs
     inputs: tuple[str, ...]  # names of the m inputs
+    n_columns: int = field(init=False, repr=False)  # number of columns of Phi
+    offset: int = field(init=False, repr=False)  # column of the constant
+    lags: tuple[range, ...] = field(init=False, repr=False)  # lags of every input
+    group_lags: tuple[range, ...] = field(init=False, repr=False)  # of the outputs (0 is the target), of every input
+    first_row: int = field(init=False, repr=False)  # first sample with a complete row: the largest lag
 
     def __post_init__(self) -> None:
         if not self.inputs or not self.outputs:
@@ -39,26 +44,12 @@ class Layout(Ports):
         for channel, b, delay in zip(self.inputs, self.nb, self.nk):
             check_integer(b, f"nb of input {channel!r}")
             check_integer(delay, f"nk of input {channel!r}", 0)
-
-    @cached_property
-    def n_columns(self) -> int:
-        """Number of columns of Phi."""
-        return self.na * self.l + sum(b * basis.size for b, basis in zip(self.nb, self.bases)) + 1
-
-    @property
-    def offset(self) -> int:
-        """Column of the constant."""
-        return self.n_columns - 1
-
-    @cached_property
-    def first_row(self) -> int:
-        """First sample with a complete row: the largest lag."""
-        return max(self.na, *(delay + b - 1 for b, delay in zip(self.nb, self.nk)))
-
-    @property
-    def lags(self) -> tuple[range, ...]:
-        """Lags of every input."""
-        return tuple(range(delay, delay + b) for b, delay in zip(self.nb, self.nk))
+        columns = self.na * self.l + sum(b * basis.size for b, basis in zip(self.nb, self.bases)) + 1
+        lags = tuple(range(delay, delay + b) for b, delay in zip(self.nb, self.nk))
+        found = {"n_columns": columns, "offset": columns - 1, "lags": lags, "group_lags": (range(self.na + 1), *lags),
+                 "first_row": max(self.na, *(own[-1] for own in lags))}
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
     def block(self, c: int) -> slice:
         """Return the columns of input c, whose coefficients are vec(Theta_c)."""
@@ -75,11 +66,6 @@ class Layout(Ports):
                 sample = f"{channel}(k-{lag})" if lag else f"{channel}(k)"
                 names += [f"{family}{j}({sample})" for j in range(1, basis.size + 1)]
         return [*names, "1"]
-
-    @cached_property
-    def group_lags(self) -> tuple[range, ...]:
-        """Lags of the outputs (0 is the target), then of every input."""
-        return (range(self.na + 1), *self.lags)
 
     @cached_property
     def complete_columns(self) -> tuple[np.ndarray, ...]:

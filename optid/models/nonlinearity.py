@@ -39,11 +39,7 @@ class Nonlinearity:
         object.__setattr__(self, "mu", mu)
 
     def __call__(self, u: ArrayLike) -> Any:
-        """Evaluate f at u, any shape; NaN where u is NaN.
-
-        Raises:
-            DataError: a sample outside the interval of a basis with outside="error".
-        """
+        """Evaluate f at u, any shape; NaN where u is NaN. A sample that the basis refuses raises a `DataError`."""
         u = np.asarray(u, dtype=float)
         flat, table = u.ravel(), self.basis.contrast @ self.mu
         f = np.empty(flat.size)
@@ -74,8 +70,7 @@ class Nonlinearity:
     def mapped(self, scale: float, offset: float) -> tuple["Nonlinearity", float]:
         """Express f in the units v = scale u + offset: f(u) = g(v) + c; return g and c.
 
-        Raises:
-            StructureError: a basis of UserFunctions, which keeps its units.
+        A basis of UserFunctions keeps its units and is refused (`StructureError`).
         """
         basis, matrix, constant = self.basis.mapped(scale, offset)
         return Nonlinearity(basis, matrix @ self.mu), float(constant @ self.mu)

@@ -29,29 +29,22 @@ class PhysicalModel(Model):
     Continuous equations are integrated by the trapezoidal rule, as they were in the fit.
 
     Attributes:
-        code: the equations as a serialised `casadi.Function` (x, u, p) -> (right, y) of the states x, inputs u and
-            parameters p.
-        text: the equations in words, one line per state and output.
-        states: names of the n states.
-        parameters: {name: value}.
-        start: (n,) state from which a simulation starts where none is given.
-        point: (m,) inputs at whose state of rest poles and responses of the linear part are given; `start` where
-            there is no such state.
-        bounds: (low, high) of every state, infinite where open; equations are evaluated no further than there.
-        steps: steps of integration in a sampling time; 0 for equations in discrete time.
-        hold: what an input does between its samples, "zero" (stays) or "first" (straight lines).
         dt, inputs, outputs, input_units, output_units, gauge: see `Model`.
     """
 
+    # the equations as a serialised `casadi.Function` (x, u, p) -> (right, y) of the states x, inputs u and parameters p
     code: str = field(repr=False)
-    text: tuple[str, ...]
-    states: tuple[str, ...]
-    parameters: Mapping[str, float]
-    start: Array
+    text: tuple[str, ...]  # the equations in words, one line per state and output
+    states: tuple[str, ...]  # names of the n states
+    parameters: Mapping[str, float]  # {name: value}
+    start: Array  # (n,) state from which a simulation starts where none is given
+    # (m,) inputs at whose state of rest poles and responses of the linear part are given; `start` where there is no
+    # such state
     point: Array
+    # (low, high) of every state, infinite where open; equations are evaluated no further than there
     bounds: tuple[tuple[float, float], ...]
-    steps: int = 1
-    hold: str = "zero"
+    steps: int = 1  # steps of integration in a sampling time; 0 for equations in discrete time
+    hold: str = "zero"  # what an input does between its samples, "zero" (stays) or "first" (straight lines)
     GAUGES = ("none",)
     SIMULATORS = ("free", "predict")
     nonlinearities: ClassVar[tuple[Nonlinearity, ...]] = ()

@@ -1,8 +1,18 @@
-"""Linear recursions, from rest."""
+"""Linear recursions, from rest, and the predictor of a noise model, without a Python loop over samples.
+
+Innovations and predictions of s = g + H e with H = C/D:
+``s(k) = g(k) - sum_i d_i s(k-i) + sum_i c_i e(k-i) + e(k)``. An innovation that cannot be computed, because the sample
+or its prediction is missing, counts as zero; a missing sample is then replaced by its prediction. This is the
+stationary predictor: it forgets the larger uncertainty after a gap at the rate of the zeros of C.
+
+Before the recursion has its first prediction, and after a missing drive, a missing sample has no replacement: nothing
+is predicted until as many samples follow one another as D reaches back. A record in which they never do is begun with
+the last sample held in the gaps, and its first innovations count as zero while that is forgotten.
+"""
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +21,9 @@ from scipy.linalg import get_lapack_funcs
 from optid.arrays import Array, compact
 
 SHORT = 5000  # samples up to which a triangular solution takes less time than the import of scipy.signal
+PRESENT, MISSING, DEAD = 0, 1, 2
+
+WARMING = 10  # times the lags of a record that is begun with held samples, during which its innovations count as zero
 
 
 @cache
@@ -80,3 +93,69 @@ def _march(a: Array, right: Array) -> Array:
                 for p in range(y.shape[1]):
                     y[k, o] -= a[i, o, p] * y[k - 1 - i, p]
     return y
+
+
+class Filtered(NamedTuple):
+    """What one pass of the noise filter over a record finds, each (N,)."""
+
+    innovations: Array  # zero where they cannot be computed
+    filled: Array  # the samples, the missing ones replaced by their predictions
+    predicted: Array  # one step ahead; NaN where that is impossible
+    # PRESENT where there is an innovation, MISSING where the prediction stands for the sample, DEAD elsewhere
+    state: Any
+
+
+def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 0) -> Filtered:
+    """Run the noise filter over one record s (N,) from rest; c and d are the coefficients after the leading ones.
+
+    drive (N,) is what is known besides, None for zero; NaN is a missing sample of either. The innovations of the first
+    `start` samples count as zero, and these samples are not predicted.
+    """
+    known = np.zeros(len(s)) if drive is None else compact(drive)
+    samples, c, d = compact(s), np.array(c, dtype=float), np.array(d, dtype=float)
+    if not start and np.isfinite(samples).all() and np.isfinite(known).all():  # C e = D s - drive, nothing to compile
+        whole = np.concatenate([[1.0], c])
+        e = lfilter(np.concatenate([[1.0], d]), whole, samples) - lfilter(np.ones(1), whole, known)
+        return Filtered(e, samples.copy(), samples - e, np.full(len(s), PRESENT, dtype=np.int8))
+    with np.errstate(all="ignore"):
+        found = Filtered(*late_njit(_march_noise)(samples, known, c, d, start, -1))
+        if np.all(found.state != PRESENT) and np.isnan(samples).any():
+            found = Filtered(*late_njit(_march_noise)(samples, known, c, d, WARMING * start, start))
+    return found
+
+
+def predict(found: Filtered, c: Array, d: Array, horizon: int) -> Array:
+    """Predict ``horizon`` samples ahead, (N,): the sample less what the last innovations added; NaN without them."""
+    told = np.where(np.isnan(found.predicted), np.nan, found.innovations)
+    response = lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), np.eye(1, horizon)[0])
+    prediction = found.filled.copy()
+    for i, weight in enumerate(response):
+        prediction[i:] -= weight * told[: len(told) - i]
+    return prediction
+
+
+def _march_noise(s: Array, drive: Array, c: Array, d: Array, start: int, held: int) -> tuple[Array, Array, Array, Any]:
+    count = s.shape[0]
+    e, filled, predicted = np.zeros(count), np.empty(count), np.empty(count)
+    state = np.full(count, 2, dtype=np.int8)
+    last = 0.0
+    for k in range(count):
+        value = drive[k]
+        for i in range(min(d.shape[0], k)):
+            value -= d[i] * filled[k - 1 - i]
+        for i in range(min(c.shape[0], k)):
+            value += c[i] * e[k - 1 - i]
+        predicted[k] = value if k >= start else np.nan
+        if np.isnan(s[k]):
+            filled[k] = predicted[k] if held < 0 else value
+            if held >= 0 and (k < held or np.isnan(value)):
+                filled[k] = last
+            elif not np.isnan(filled[k]):
+                state[k] = 1
+        else:
+            filled[k] = s[k]
+            if k >= start and not np.isnan(value):
+                e[k] = s[k] - value
+                state[k] = 0
+        last = filled[k]
+    return e, filled, predicted, state

@@ -251,8 +251,7 @@ class StateSpace(Model):
     def balanced(self) -> Self:
         """Return the model in balanced states: both Gramians of (A, [B E Ez], [C; Cz]) are diagonal and equal.
 
-        Raises:
-            StructureError: an unstable model, or one that is not minimal.
+        An unstable model, or one that is not minimal, is refused (`StructureError`).
         """
         return self if self.nx == 0 else self.transformed(
             balancing(self.A, np.hstack([self.B, self.E, self.Ez]), np.vstack([self.C, self.Cz])))

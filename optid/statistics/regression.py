@@ -19,7 +19,7 @@ from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
 from optid.statistics.blocks import CHUNK, Frame, blocks_of, check_channels, cut, records, stretches, used_rows
 from optid.statistics.factors import add_to_root, conditioning, dependent_column, root_of_gram
-from optid.statistics.sums import Factor, Sums, Total
+from optid.statistics.sums import Factor, Sums, Total, total_of_parts
 
 if TYPE_CHECKING:
     from optid.data.record import Data
@@ -213,19 +213,11 @@ def _total(
     if weights is not None and not hasattr(data, "experiments"):
         raise DataError("weights are for records in memory; a stream has none.")
     if getattr(data, "parts", ()):
-        from optid.statistics.joining import total_of_parts
-
         return total_of_parts(data, layout, start, chunk, threads)
 
-    def sum_stretch(stretch: Sequence[Array]) -> Total:
-        sums = start()
-        for block in blocks_of(stretch, layout, chunk):
-            sums.add(block)
-        return sums
-
-    total = start()
     parts = (part for name, chunks in records(data, layout, weights) for part in cut(chunks, name, layout, chunk))
-    for sums in mapped(sum_stretch, parts, threads):
+    total = start()
+    for sums in mapped(lambda stretch: start().add_all(blocks_of(stretch, layout, chunk)), parts, threads):
         total.merge(sums)
     return total
 

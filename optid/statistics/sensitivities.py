@@ -25,9 +25,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.models import noise_filter
-from optid.models.noise_filter import DEAD, PRESENT, Filtered
-from optid.models.recursions import late_njit, lfilter
+from optid.models import recursions
+from optid.models.recursions import DEAD, PRESENT, Filtered, late_njit, lfilter
 from optid.statistics.linearised import Linearised, Method, compressed, eliminated, linearised
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
@@ -92,8 +91,8 @@ class TransferPredictor:
         """Run over one experiment of simulated x (N,) the noise filter, which explains y - x, or y where D is A."""
         y = self.data.experiments[index].y[:, 0]
         if self.unknowns.apart:
-            return noise_filter.innovations(y - x, None, point.c, point.d)
-        return noise_filter.innovations(y, x, point.c, point.a, start=self.unknowns.layout.first_row)
+            return recursions.innovations(y - x, None, point.c, point.d)
+        return recursions.innovations(y, x, point.c, point.a, start=self.unknowns.layout.first_row)
 
     def blocks(self, point: TransferPoint, index: int, measured: bool = False) -> Iterator[tuple[Array, int]]:
         """Yield [x0 | shared | (measured) | errors] of every chunk of an experiment, and its number of errors.

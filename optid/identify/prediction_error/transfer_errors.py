@@ -13,7 +13,7 @@ from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.identify.arguments import enough_rows, one_output, outputs_present, per_channel
 from optid.identify.prediction_error.descent import Criterion
-from optid.models import noise_filter, roots
+from optid.models import recursions, roots
 from optid.models.gauges import gauge_factor
 from optid.models.layout import Layout
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
@@ -55,7 +55,7 @@ class TransferErrors(TransferPredictor, Criterion):
         """Return the innovations (N,) of every experiment, NaN where there is none."""
         point = self.unknowns.unpack(x)
         found = [self.predict(point, i, y) for i, y in enumerate(self.simulate(point))]
-        return [np.where(one.state == noise_filter.PRESENT, one.innovations, np.nan) for one in found]
+        return [np.where(one.state == recursions.PRESENT, one.innovations, np.nan) for one in found]
 
     def admissible(self, x: Array) -> bool:
         """Whether the predictor is stable: C invertible and, unless D is A, the plant stable."""

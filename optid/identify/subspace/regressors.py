@@ -10,8 +10,8 @@ matrices take the place of a loop over samples; time is the last axis, so that e
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from functools import cached_property, reduce
+from dataclasses import dataclass, field
+from functools import reduce
 
 import numpy as np
 
@@ -47,35 +47,28 @@ class ObserverForm:
     # squares), for noise that is fed back and not white; the expansion must contain both
     instrumented: bool = False
 
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        return len(self.a)
+    n: int = field(init=False)  # number of states
+    l: int = field(init=False)  # noqa: E741 - number of outputs, the field's letter
+    linear: int = field(init=False)  # number of unknowns outside the blocks: initial states and offset
+    # (functions, entries of [B_i; D_i] or E_o) of every channel, inputs first
+    blocks: tuple[tuple[int, int], ...] = field(init=False)
+    size: int = field(init=False)  # number of unknowns
+    extra: int = field(init=False)  # number of instruments, as many as entries of all E_o; zero where there are none
+    injected: bool = field(init=False)  # whether the gain feeds measured outputs back
 
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return len(self.c)
-
-    @property
-    def linear(self) -> int:
-        """Number of unknowns outside the blocks: initial states and offset."""
-        return self.experiments * self.n + self.l * self.offset
-
-    @property
-    def blocks(self) -> tuple[tuple[int, int], ...]:
-        """(functions, entries of [B_i; D_i] or E_o) of every channel, inputs first."""
-        inputs = [(p, self.n + self.l * direct) for p, direct in zip(self.expansion.input_sizes, self.feedthrough)]
-        return (*inputs, *((family.size, self.n) for family in self.expansion.feedback))
+    def __post_init__(self) -> None:
+        n, l, x = len(self.a), len(self.c), self.expansion  # noqa: E741
+        linear = self.experiments * n + l * self.offset
+        blocks = (*((p, n + l * direct) for p, direct in zip(x.input_sizes, self.feedthrough)),
+                  *((family.size, n) for family in x.feedback))
+        found = {"n": n, "l": l, "linear": linear, "blocks": blocks, "size": linear + sum(p * b for p, b in blocks),
+                 "extra": n * x.q * self.instrumented, "injected": bool(np.any(self.gain))}
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
     def thetas(self, z: Array) -> list[Array]:
         """Return the matrices Theta_i of the unknowns z."""
         return matrices(z[self.linear :], self.blocks)
-
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return self.linear + sum(functions * entries for functions, entries in self.blocks)
 
     @property
     def channels(self) -> list[str]:
@@ -90,16 +83,6 @@ class ObserverForm:
         for channel, (p, b) in zip(self.channels, self.blocks):
             named += [f"function {j + 1} of {channel}" for _ in range(b) for j in range(p)]
         return named
-
-    @property
-    def extra(self) -> int:
-        """Number of instruments, as many as entries of all E_o; zero where there are none."""
-        return self.n * self.expansion.q * self.instrumented
-
-    @cached_property
-    def injected(self) -> bool:
-        """Whether the gain feeds measured outputs back."""
-        return bool(np.any(self.gain))
 
     @property
     def needed(self) -> np.ndarray:
