@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
-from optid.identify.recursive.intake import as_block, forgetting_factor
-from optid.identify.recursive.saved_state import SavedState
-from optid.identify.tracking.geometry import as_basis, orthonormal, principal_angles
+from optid.identify.recursive.state import SavedState, as_block, forgetting_factor
+from optid.identify.tracking.subspaces import as_basis, orthonormal, principal_angles
 
 METHODS = ("past", "opast")
 MISSING = ("fill", "skip", "refuse")
@@ -79,13 +78,10 @@ class SubspaceTracker(SavedState):
         self.sums, self.counts = np.zeros(2), np.zeros(3, dtype=np.int64)
 
     def update(self, x: ArrayLike) -> Array:
-        """Follow a block (N, n) or one sample (n,).
+        """Follow a block (N, n) or one sample (n,); return the distance (N,) of every sample from the subspace before.
 
-        Returns:
-            (N,) distance of every sample from the subspace before it was used; NaN where it was not.
-
-        Raises:
-            DataError: another shape, an infinite entry, or a missing one where missing="refuse", by name and sample.
+        It is NaN where the sample was not used. Another shape, an infinite entry, or a missing one where
+        missing="refuse", is a `DataError` that names channel and sample.
         """
         from optid.identify.tracking.kernel import track  # compiled code is loaded with the first sample
 
