@@ -31,24 +31,14 @@ from optid.models.state_space import StateSpace
 from optid.statistics.coloured import long_autoregression, response_of
 from optid.statistics.hankel import complete_runs
 
-ROUNDING = 1e-10
-"""Residuals below this share of the outputs are rounding: there is no noise to describe."""
-
-LONGEST = 40
-"""Lags of the autoregression of prediction errors at most."""
-
-EXACT = 1e-8
-"""Prediction errors relative to the outputs below which a record shows no noise model."""
-
+ROUNDING = 1e-10  # residuals below this share of the outputs are rounding: there is no noise to describe
+LONGEST = 40  # lags of the autoregression of prediction errors at most
+EXACT = 1e-8  # prediction errors relative to the outputs below which a record shows no noise model
 NEARLY_MARGINAL = 1 - 1e-4
 """Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
 
-RATIOS = (1e-2, 1.0, 1e2)
-"""Process over measurement noise of the observers behind the starts, in units of C."""
-
-TRIED = 2
-"""Observers whose errors are whitened, and then starts that are refined, the best of all."""
-
+RATIOS = (1e-2, 1.0, 1e2)  # process over measurement noise of the observers behind the starts, in units of C
+TRIED = 2  # observers whose errors are whitened, and then starts that are refined, the best of all
 BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
 """Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
 in."""

@@ -21,9 +21,7 @@ DECAYS, NOISES = (0.3, 0.6, 0.9), (-4.0, -1.0)
 """Decays per lag, and logarithms of the noise, from which the likelihood is climbed; from small sizes a climb may end
 where nothing but noise is left."""
 
-FLOOR = 1e-9
-"""Variance, as a share of the largest, that no coefficient falls below: beyond it K would be singular."""
-
+FLOOR = 1e-9  # variance, as a share of the largest, that no coefficient falls below: beyond it K would be singular
 BOUNDS = {"size": (-25.0, 12.0), "decay": (0.05, 0.998), "correlation": (-0.98, 0.98), "noise": (-30.0, 3.0)}
 """Of logarithms of variances relative to the output's, decays and correlations."""
 

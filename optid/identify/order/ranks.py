@@ -25,11 +25,8 @@ from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 LEVEL = 0.01
-SPAN = 10.0
-"""The level of the test is min(0.01, 10 / N): wrong decisions become rarer as the record grows."""
-
-FLOOR = 10.0
-"""Singular values below this many roundings of the outputs, times the size of R22, are zero."""
+SPAN = 10.0  # the level of the test is min(0.01, 10 / N): wrong decisions become rarer as the record grows
+FLOOR = 10.0  # singular values below this many roundings of the outputs, times the size of R22, are zero
 
 Positions = Sequence[int] | NDArray[np.intp]
 

@@ -17,8 +17,7 @@ from optid.arrays import Array
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics
 
-ROUNDING = 1e-10
-"""Share of the moments added to their diagonal: prediction errors below its root count as none."""
+ROUNDING = 1e-10  # share of the moments added to their diagonal: prediction errors below its root count as none
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,7 @@ from optid.registry import Rendered
 from optid.statistics.expansion import Expansion, check_channels, expand
 from optid.statistics.hankel import hankel_statistics
 
-FEWEST, PER_ROW = 2, 1.5
-"""Block rows at least; windows per row of the longest windows that are wanted."""
+FEWEST, PER_ROW = 2, 1.5  # block rows at least; windows per row of the longest windows that are wanted
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,11 +22,8 @@ from optid.identify.verdict import Verdict, verdict
 from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
 
-FIRST = 0.25
-"""Share of the budget that linear models have before the others begin."""
-
-RESERVED = 0.1
-"""Share of the budget that is kept for the fit of the choice."""
+FIRST = 0.25  # share of the budget that linear models have before the others begin
+RESERVED = 0.1  # share of the budget that is kept for the fit of the choice
 
 
 @dataclass(frozen=True, eq=False, repr=False)

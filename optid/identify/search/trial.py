@@ -17,11 +17,8 @@ from optid.models.functions import free_parameters
 WORSE = 1.3
 """A structure is given up when its errors on the first half of the blocks have so many times the energy of the best."""
 
-STARTS = 2
-"""Starts of output-error models on trial."""
-
-STEPS = 30
-"""Steps of the descents of state-space models on trial."""
+STARTS = 2  # starts of output-error models on trial
+STEPS = 30  # steps of the descents of state-space models on trial
 
 Key = tuple[str, tuple[tuple[str, Any], ...]]
 

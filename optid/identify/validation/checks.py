@@ -1,7 +1,7 @@
 """How good a model is on a record: errors of one-step prediction and simulation, residual tests, structure."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning, RankError
+from optid.errors import DataError, DataWarning, OptidError, RankError
 from optid.identify.record_checks import list_outside
 from optid.identify.validation.correlations import LEVEL, Correlation, autocorrelation, cross_correlation
 from optid.identify.validation.predictions import (
@@ -22,23 +22,20 @@ from optid.identify.validation.predictions import (
     simulated_or_nan,
 )
 from optid.identify.validation.structure import Structure, structure_test
-from optid.models.functions import has_feedback, static_functions
+from optid.models.functions import StaticFunction, has_feedback, static_functions
 from optid.registry import Rendered
 
 LAGS = 25
-
 KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent signal"}
 """What the argument of a static function is, by the family of the function."""
-
 ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(Rendered):
-    """What `validate` found; `print` it.
+    """What `validate` found on the record named `data`; `print` it.
 
     Attributes:
-        data: name of the record.
         horizon: samples ahead of the prediction besides one.
         predictors: errors, by output, of every predictor: "one step", "5 steps", "measured feedback" (the simulation
             that takes the outputs in the feedback from the record; only of models with nonlinear feedback),
@@ -127,7 +124,11 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
     for word in predictors(model)[1:]:
         if found := _simulated(model, raw, word, x0, notes):
             predicted[word] = found
-    outside = _outside(model, raw, notes)
+    outside = {}
+    for function, _, share in shares_outside(model, raw):
+        outside[function.name] = share
+        found = list_outside(KINDS[function.family], function.name, share, function.nonlinearity.basis)
+        notes.extend(note for note in found if note not in notes)
     structure = record_structure(model, raw, notes)
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
@@ -173,21 +174,18 @@ def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> 
     return outputs
 
 
-def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
-    shares = {}
+def shares_outside(model: Any, data: Data) -> Iterator[tuple[StaticFunction, Array, float]]:
+    """Yield the functions of a model, samples of their arguments, and the share outside the intervals of the bases.
+
+    Straight lines are known everywhere; functions of a latent signal that runs away in the record are left out.
+    """
     for function in static_functions(model):
-        if function.is_linear:  # known everywhere
-            shares[function.name] = 0.0
-            continue
-        name, basis = function.name, function.nonlinearity.basis
         try:
-            samples = function.samples(data)
-        except DataError:  # the simulation says so
+            x = np.zeros(0) if function.is_linear else function.samples(data)
+        except OptidError:  # the simulation says so
             continue
-        shares[name] = np.count_nonzero(basis.is_outside(samples)) / max(int(np.sum(~np.isnan(samples))), 1)
-        found = list_outside(KINDS[function.family], name, shares[name], basis)
-        notes.extend(note for note in found if note not in notes)
-    return shares
+        outside = np.count_nonzero(function.nonlinearity.basis.is_outside(x))
+        yield function, x, outside / max(int(np.sum(~np.isnan(x))), 1)
 
 
 def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> Structure | None:
@@ -195,13 +193,13 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
 
     Hammerstein models answer for their class, models with feedback or latent functions for their own residuals.
     """
-    notes = [] if notes is None else notes
     beyond = has_feedback(model) or bool(getattr(model, "latent", ()))
     if not beyond and not static_functions(model):
         return None
     runs = simulated_or_nan(model, data) if beyond else None
     if runs is not None and not all(np.isfinite(y).all() for y in runs):
         return None
+    notes = [] if notes is None else notes
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)

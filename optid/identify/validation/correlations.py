@@ -11,8 +11,7 @@ from scipy.special import chdtrc
 from optid.arrays import Array
 
 LEVEL = 0.01
-QUANTILE_99 = 2.5758293035489004
-"""Two-sided 99 % quantile of the standard normal distribution."""
+QUANTILE_99 = 2.5758293035489004  # two-sided 99 % quantile of the standard normal distribution
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,9 +27,7 @@ BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the re
 EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
 LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
-SPARE = 1
-"""Poles more than the order that noisy data show: what is too weak for that may still matter to a sharp test."""
-
+SPARE = 1  # poles more than the order that noisy data show: what is too weak for that may still matter to a sharp test
 FEW = 3  # functions per input with which the dynamics are looked for
 RADIUS, SLOWEST = 0.98, 20
 """Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
