@@ -28,7 +28,6 @@ class Comparison(Rendered):
 
     Attributes:
         names: one per model.
-        models: the models.
         data: the record, in raw units.
         horizon: samples ahead of the prediction besides one.
         fits: {predictor: (models, l) fits in %}, over the samples that all models predict; NaN where a model has no
@@ -51,13 +50,9 @@ class Comparison(Rendered):
         return tuple(checked.simulated for checked in self.validations)
 
     def best(self, predictor: str = SIMULATION) -> str:
-        """Return the name of the model with the largest mean fit over the outputs.
+        """Return the name of the model with the largest mean fit over the outputs, by a key of `fits`.
 
-        Args:
-            predictor: a key of `fits`.
-
-        Raises:
-            StructureError: no model has that predictor.
+        A predictor that no model has is a `StructureError`.
         """
         means = np.nanmean(self.fits[predictor], axis=1) if predictor in self.fits else np.array([np.nan])
         if np.isnan(means).all():
