@@ -253,7 +253,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
         solver: Any = "auto", accuracy: float = 1e-8, time_limit: float | None = None, isolate: bool | None = None,
         prove: bool = True, constraints: Sequence[Any] = (), solver_options: Mapping[str, Any] | None = None,
         raises: bool = True, **structure: Any) -> Fit:
-    """Fit a model to a record.
+    """Fit a model to a record: in raw units, with status, proof, constraint prices and times.
 
     Args:
         data: the record; a `Stream` for files larger than memory.
@@ -268,9 +268,6 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
         solver_options: native options of the solver.
         raises: False returns failures as values (``fit.solution.status``) instead of raising.
         structure: arguments of the formulation (na, nb, nk, basis, loss, gauge, ...).
-
-    Returns:
-        The model in raw units with status, proof, constraint prices and times.
 
     Raises:
         DataError, RankError: the record cannot determine the model.

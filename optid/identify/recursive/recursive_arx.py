@@ -61,12 +61,8 @@ class Trace:
     def split(self, c: int = 0, beta: float = 1.0) -> tuple[Array, Array, Array]:
         """Split Theta of input c by the plain SVD in the gauge of Algorithm 3.1: mu = beta s_1 u_1, b = v_1 / beta.
 
-        Args:
-            c: index of the input.
-            beta: the gauge, not zero; the first coefficient of b has its sign.
-
-        Returns:
-            mu (K, P), b (K, nb l) and s_2 / s_1 (K,), 0 where there is no second one.
+        The gauge beta is not zero, and the first coefficient of b has its sign. Returns mu (K, P), b (K, nb l) and
+        s_2 / s_1 (K,), 0 where there is no second one.
         """
         if beta == 0:
             raise StructureError("beta=0: the gauge is a number other than zero.")
@@ -150,13 +146,8 @@ class RecursiveARX(SavedState):
     def like(cls, data: Data | Stream, *, basis: Any, **settings: Any) -> "RecursiveARX":
         """Start with the channels, units and sampling time of a record, and the range of its inputs as intervals.
 
-        Args:
-            data: the record, in raw units; its samples are not used (see `read`).
-            basis: as in the class; one without interval takes the range of its input.
-            settings: na, nb and the other arguments of the class.
-
-        Raises:
-            DataError: detrended or scaled data.
+        The samples are not used (see `read`); detrended or scaled data are a `DataError`. A basis without interval
+        takes the range of its input; the settings are na, nb and the other arguments of the class.
         """
         _check_raw(data)
         return cls(basis=fitted_bases(data, basis), inputs=data.inputs, outputs=data.outputs,
@@ -165,16 +156,14 @@ class RecursiveARX(SavedState):
     # -- samples ---------------------------------------------------------------------------------------------------
 
     def update(self, u: ArrayLike, y: ArrayLike, weights: ArrayLike = 1.0) -> Array:
-        """Take in the next sample, or the next block of them.
+        """Take in the next sample, or the next block of them, and return the innovations y(t) - theta(t-1)^T phi(t).
+
+        They are (N, l), NaN where the row was not used and where the past did not determine the prediction.
 
         Args:
             u: (N, m) inputs, or (N,) for one input; one sample as (m,), or a number for one input. NaN = missing.
             y: (N, l) outputs, in the same way.
             weights: a(t) >= 0, one number or (N,); 0 leaves a row out.
-
-        Returns:
-            (N, l) innovations y(t) - theta(t-1)^T phi(t); NaN where the row was not used and where the past did not
-            determine the prediction.
 
         Raises:
             DataError: wrong shape, infinite sample, a sample outside a basis with outside="error". The state is then
@@ -193,10 +182,9 @@ class RecursiveARX(SavedState):
         return Trace(self.layout, after[after % every == 0], theta, innovations)
 
     def read(self, data: Data | Stream) -> list[Array]:
-        """Take in a whole record, every experiment with lags of its own; returns the innovations of each.
+        """Take in a whole record, every experiment with lags of its own; return the innovations of each.
 
-        Raises:
-            DataError: other channels than the model's, detrended or scaled data; and as `update`.
+        Other channels than the model's, detrended or scaled data are a `DataError`; and as `update`.
         """
         _check_raw(data)
         if data.inputs != self.layout.inputs or data.outputs != self.layout.outputs:
@@ -254,11 +242,7 @@ class RecursiveARX(SavedState):
 
     @property
     def theta(self) -> Array:
-        """The estimate (n, l), in the order of `layout.names()`.
-
-        Raises:
-            RankError: the rows so far do not determine it; the message names the column.
-        """
+        """The estimate (n, l), in the order of `layout.names()`; a `RankError` names a column not determined yet."""
         from scipy.linalg import solve_triangular
 
         return solve_triangular(self._determined(), self.root[: self.layout.n_columns, self.layout.n_columns :])
@@ -288,7 +272,7 @@ class RecursiveARX(SavedState):
         return _theta_matrices(self.theta, self.layout)
 
     def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinTF:
-        """Split off the rank-one factors of the present estimate.
+        """Split off the rank-one factors of the present estimate; refused as `theta`.
 
         Args:
             split: "whitened" (SVD in the Kronecker metric of the Gram matrix, close to the least-squares optimum) or
@@ -296,7 +280,6 @@ class RecursiveARX(SavedState):
             gauge: "norm", "gain" or "b0", as in `HammersteinTF.regauge`.
 
         Raises:
-            RankError: as `theta`.
             StructureError: unknown split or gauge.
         """
         one_of("split", split, SPLITS)
@@ -333,7 +316,7 @@ class RecursiveARX(SavedState):
 
 
 def _each(value: Any, m: int) -> tuple[Any, ...]:
-    """One entry per input; a list is taken as it is, and `Layout` refuses a wrong length."""
+    """One entry per input; of a list, `Layout` refuses a wrong length."""
     return tuple(value) if isinstance(value, list | tuple) else (value,) * m
 
 

@@ -67,7 +67,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
              classes: Sequence[str] = KINDS, constraints: Sequence[Any] = (), solver: Any = "auto",
              accuracy: float = 1e-8, workers: int | None = None,
              progress: Callable[[str], None] | None = None) -> Identification:
-    """Find a structure for a record by blocked cross-validation, and fit it.
+    """Find a structure for a record by blocked cross-validation, and fit it to the whole record.
 
     Every structure is fitted to the record without one block after another, and simulates the block that was left out
     from an initial state fitted to it. Classes of models follow each other from the simple to the rich; a richer one is
@@ -86,9 +86,6 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         accuracy: as of `optid.fit`.
         workers: processes; None for one per processor that is free to use.
         progress: is told a sentence after every trial; by default the log "optid", and a bar on a terminal.
-
-    Returns:
-        The model fitted to the whole record, with the table of what was tried and the reasons of the choice.
 
     Raises:
         DataError: not a record in memory.

@@ -25,8 +25,8 @@ class SubspaceTracker(SavedState):
     """The dominant r-dimensional subspace of a stream of zero-mean vectors; `update` changes it.
 
     A sample with missing entries is used through its least-squares coordinates on the rows of W that are present: the
-    missing entries are those the subspace says, and teach nothing. Where the entries do not determine the
-    coordinates the sample is passed over and counted.
+    missing entries are those the subspace says. Where the entries do not determine the coordinates the sample is passed
+    over and counted.
 
     Attributes:
         W: (n, r) the basis as the recursion carries it.
@@ -47,7 +47,7 @@ class SubspaceTracker(SavedState):
 
         Args:
             n: dimension of the vectors.
-            r: dimension of the subspace, below n.
+            r: of the subspace, below n.
             method: "past", nearly orthonormal, or "opast", orthonormal at every sample.
             forgetting: factor on earlier samples, in (0, 1]; remembers about 1 / (1 - forgetting) samples.
             start: (n, r) a first guess, orthonormalised; the first r coordinates when not given.
@@ -93,12 +93,12 @@ class SubspaceTracker(SavedState):
                             "'skip'.")
         if self.missing == "skip":
             block = np.where(lost.any(axis=1, keepdims=True), np.nan, block)
-        residuals, start = np.empty(len(block)), 0
+        residuals, start, orthogonal = np.empty(len(block)), 0, self.method == "opast"
         while start < len(block):
             part = slice(start, start + RENEWED - int(self.counts[0]) % RENEWED)
             track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block[part]), self.forgetting,
-                  self.method == "opast", residuals[part])
-            if self.method == "opast" and self.counts[0] % RENEWED == 0:
+                  orthogonal, residuals[part])
+            if orthogonal and self.counts[0] % RENEWED == 0:
                 columns, triangle = np.linalg.qr(self.W)
                 self.W[:] = columns * np.sign(np.diag(triangle))
             start = part.stop
@@ -136,12 +136,9 @@ class SubspaceTracker(SavedState):
         if not memory or not values[0] > 0:
             return 0
         values = np.maximum(values, 1e-15 * values[0])
-        lengths = []
-        for k in range(self.r + 1):
-            rest = values[k:]
-            spread = np.log(rest.mean()) - np.log(rest).mean()
-            lengths.append(memory * rest.size * spread + 0.5 * k * (2 * self.n - k) * np.log(max(memory, 2.0)))
-        return int(np.argmin(lengths))
+        rests = [values[k:] for k in range(self.r + 1)]
+        return int(np.argmin([memory * rest.size * (np.log(rest.mean()) - np.log(rest).mean())
+                              + 0.5 * k * (2 * self.n - k) * np.log(max(memory, 2.0)) for k, rest in enumerate(rests)]))
 
     def angles(self, nominal: ArrayLike) -> Array:
         """Return the principal angles to a nominal subspace (n, s), ascending, in radians."""
