@@ -67,9 +67,6 @@ def advise(fit: Any) -> tuple[Advice, ...]:
     return tuple(found.values())[:MOST]
 
 
-# -- the record ----------------------------------------------------------------------------------------------------
-
-
 def _on_record(fit: Any) -> Iterator[Advice]:
     data: Data = fit.data.raw()
     yield from _swapped(data)
@@ -143,9 +140,6 @@ def _halves(fit: Any) -> Iterator[Advice]:
                          f"data.split({middle}) gives both")
 
 
-# -- neighbouring structures -----------------------------------------------------------------------------------------
-
-
 def _tried(fit: Any) -> Iterator[Advice]:
     """Fit neighbouring structures; those that save much of the error of the free run are advised."""
     before = _score(fit.model, fit.data)
@@ -192,9 +186,6 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
                "--formulation hammerstein_ss.exact --nx 2 --feedback-basis polynomial:3",
                {"formulation": "hammerstein_ss.exact",
                 "replaced": {"nx": 2, "basis": basis, "feedback_basis": "polynomial:3", "iterations": 30}})
-
-
-# -- the model -------------------------------------------------------------------------------------------------------
 
 
 def _on_model(fit: Any) -> Iterator[Advice]:

@@ -151,8 +151,6 @@ class Fit(Rendered):
         return fit(self.data if data is None else data, formulation or self.formulation, prove=False,
                    **{**arguments, **changes})
 
-    # -- working with the model ------------------------------------------------------------------------------------
-
     @cached_property
     def params(self) -> Parameters:
         """Estimates with standard errors and 95 % intervals, by name: ``fit.params["a1"]``."""
@@ -203,8 +201,6 @@ class Fit(Rendered):
         if not isinstance(self.data, Data):
             raise DataError("the fit was made from a stream, whose samples are not kept: pass a record")
         return self.data
-
-    # -- copies ----------------------------------------------------------------------------------------------------
 
     def __copy__(self) -> "Fit":
         made = object.__new__(type(self))

@@ -86,8 +86,6 @@ class Uncertainty:
         check_probability(level, "level")
         return self if level == self.level else replace(self, level=float(level))
 
-    # -- coefficients --------------------------------------------------------------------------------------------
-
     @cached_property
     def a(self) -> Interval:
         """Coefficients of A, in the shape of ``model.a``."""
@@ -111,8 +109,6 @@ class Uncertainty:
     def offset(self) -> Interval:
         """Constants of the equations, (l,)."""
         return self.of(lambda model: model.offset)
-
-    # -- curves --------------------------------------------------------------------------------------------------
 
     @cached_property
     def f(self) -> tuple[Interval, ...]:

@@ -153,8 +153,6 @@ class RecursiveARX(SavedState):
         return cls(basis=fitted_bases(data, basis), inputs=data.inputs, outputs=data.outputs,
                    dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
-    # -- samples ---------------------------------------------------------------------------------------------------
-
     def update(self, u: ArrayLike, y: ArrayLike, weights: ArrayLike = 1.0) -> Array:
         """Take in the next sample, or the next block of them, and return the innovations y(t) - theta(t-1)^T phi(t).
 
@@ -232,8 +230,6 @@ class RecursiveARX(SavedState):
             self.past_u, self.past_y = past_u[count:], past_y[count:]
         return innovations, traced
 
-    # -- what is known now -------------------------------------------------------------------------------------------
-
     @property
     def statistics(self) -> Statistics:
         """Everything the rows say, the prior included, as the batch statistics of the same layout."""
@@ -297,8 +293,6 @@ class RecursiveARX(SavedState):
     def __repr__(self) -> str:
         return (f"RecursiveARX: {_channels(self.layout)}, na {self.layout.na}, nb {self.layout.nb}, "
                 f"nk {self.layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of {self.samples} samples")
-
-    # -- files -------------------------------------------------------------------------------------------------------
 
     def _head(self) -> dict[str, Any]:
         layout = self.layout

@@ -160,11 +160,11 @@ def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
     words = [bases(ladder.data, word) for word in ("polynomial:3", "triangular:6")]
     if not ladder.single:
-        model = partial(structure, INPUTS, "hammerstein_ss.exact")
-        yield [model(nx=k, basis=word) for k in dict.fromkeys([min(ladder.order(), 4), 2]) for word in words]
+        states = partial(structure, INPUTS, "hammerstein_ss.exact")
+        yield [states(nx=k, basis=word) for k in dict.fromkeys([min(ladder.order(), 4), 2]) for word in words]
         if not ladder.hopeless(INPUTS):
             a = ladder.arguments(INPUTS)
-            yield from climbed([model(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
+            yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
         return
 
     def model(n: int, nk: Sequence[int], basis: Any) -> Candidate:

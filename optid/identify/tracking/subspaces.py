@@ -92,9 +92,6 @@ def principal_angles(first: ArrayLike, second: ArrayLike) -> Array:
     return subspace_angles(a, b)[::-1]
 
 
-# -- the loss and its stationary points --------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class StationaryPoint:
     """One matrix W held against the theorems: its rank, J(W), and the norm of the gradient of J there.
@@ -146,7 +143,7 @@ def stationary_point(covariance: ArrayLike, basis: ArrayLike, indices: Sequence[
     else:
         kind = "maximum" if curvatures[-1] <= FLAT * scale else "saddle"
     return StationaryPoint(tuple(indices), projection_loss(covariance, basis), gradient,
-                           int(np.linalg.matrix_rank(basis)), curvatures, kind)
+                           int(np.linalg.matrix_rank(np.asarray(basis))), curvatures, kind)
 
 
 def stationary_points(covariance: ArrayLike, r: int, among: Sequence[int] | None = None) -> list[StationaryPoint]:
@@ -179,9 +176,6 @@ def _eigenvectors(indices: Sequence[int], n: int, what: str) -> list[int]:
 def _descending(c: Array) -> tuple[Array, Array]:
     values, vectors = np.linalg.eigh((c + c.T) / 2)
     return values[::-1], vectors[:, ::-1]
-
-
-# -- reconstruction ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -144,8 +144,8 @@ def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, l
                         ) -> Array:
     """Return impulse responses (T, J) that span q^-(delay + i) / A(q)^2, i = 0 ... 2n + extra, A with the given poles.
 
-    With A^2 in the denominator (A where it is not squared) the span contains B / A' for poles near the given ones, up to
-    the square of their error. All begin after the delay; the extra lags are for pulses and further delays. The
+    With A^2 in the denominator (A where it is not squared) the span contains B / A' for poles near the given ones, up
+    to the square of their error. All begin after the delay; the extra lags are for pulses and further delays. The
     responses are cut after `longest` samples at the latest.
     """
     every = np.concatenate([poles, poles]) if squared else poles
