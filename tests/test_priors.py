@@ -9,7 +9,7 @@ import optid
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.equation_error.compression import compress
-from optid.identify.equation_error.priors import KERNELS, families, likeliest
+from optid.identify.equation_error.priors import KERNELS, families, kernel, likeliest
 
 G = lfilter([0.0, 1.0, 0.5], [1.0, -1.5, 0.7], np.r_[1.0, np.zeros(99)])
 
@@ -33,10 +33,10 @@ def statistics(data, lags, **changes):
 @pytest.mark.parametrize("word", KERNELS)
 @pytest.mark.parametrize("decay, correlation", [(0.3, 0.5), (0.95, -0.9), (0.7, 0.0)])
 def test_kernels_are_covariances(word, decay, correlation):
-    kernel = KERNELS[word](40, decay, correlation)
-    assert np.allclose(kernel, kernel.T)
-    assert np.linalg.eigvalsh(kernel).min() > -1e-12 * kernel[0, 0]
-    assert np.all(np.diff(np.diag(kernel)) < 0) and kernel[0, 0] == pytest.approx(decay)
+    found = kernel(word, 40, decay, correlation)
+    assert np.allclose(found, found.T)
+    assert np.linalg.eigvalsh(found).min() > -1e-12 * found[0, 0]
+    assert np.all(np.diff(np.diag(found)) < 0) and found[0, 0] == pytest.approx(decay)
 
 
 @pytest.mark.parametrize("word", KERNELS)

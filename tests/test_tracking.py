@@ -8,15 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from optid.errors import DataError, ModelFileError, RankError, StructureError
+from optid.errors import DataError, RankError, StructureError
 from optid.identify.tracking import (
     SubspaceTracker,
     constrained_reconstruction,
     fantope_certificate,
-    filled,
-    loss_gradient,
-    loss_hessian,
-    oblique_projector,
+    loss_derivatives,
     optimal_reconstruction,
     principal_angles,
     projection_loss,
@@ -138,16 +135,6 @@ def test_restart_from_a_file_is_bit_identical(method, tmp_path):
     assert parts.names == whole.names
 
 
-def test_damaged_state_is_refused(tmp_path):
-    path = SubspaceTracker(6, 2).save(tmp_path / "state.npz")
-    path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(ModelFileError, match="complete state"):
-        SubspaceTracker.load(path)
-    np.savez(tmp_path / "other.npz", head="{}", W=0, root=0, sums=0, counts=0)
-    with pytest.raises(ModelFileError, match="version 1"):
-        SubspaceTracker.load(tmp_path / "other.npz")
-
-
 def test_missing_entries_are_filled_from_the_subspace():
     c = covariance(values=np.array([5, 3, 1e-4, 1e-4, 1e-4, 1e-4]))
     x = samples(c, 4000)
@@ -257,7 +244,7 @@ def test_derivatives_by_differences(n, r, seed):
     r = min(r, n)
     rng = np.random.default_rng(seed)
     c, w = covariance(seed, rng.random(n) + 0.1), rng.normal(size=(n, r))
-    hessian, gradient = loss_hessian(c, w), loss_gradient(c, w)
+    gradient, hessian = loss_derivatives(c, w)
     x = rng.normal(size=(3, n))
     direct = [np.sum((v - w @ w.T @ v) ** 2) for v in x]
     assert projection_loss(x.T @ x / 3, w) == pytest.approx(np.mean(direct))
@@ -266,7 +253,7 @@ def test_derivatives_by_differences(n, r, seed):
         step[column] = 1e-6
         d = step.reshape(r, n).T
         slope = (projection_loss(c, w + d) - projection_loss(c, w - d)) / 2e-6
-        bend = (loss_gradient(c, w + d) - loss_gradient(c, w - d)).T.ravel() / 2e-6
+        bend = (loss_derivatives(c, w + d)[0] - loss_derivatives(c, w - d)[0]).T.ravel() / 2e-6
         assert gradient.T.ravel()[column] == pytest.approx(slope, abs=1e-5)
         assert hessian[:, column] == pytest.approx(bend, abs=1e-5)
 
@@ -277,7 +264,7 @@ def test_descent_from_everywhere_ends_at_the_minimum():
     for seed in range(10):
         w = np.random.default_rng(seed).normal(size=(6, 2))
         for _ in range(4000):
-            w = w - 0.02 * loss_gradient(c, w) / max(1, np.linalg.norm(w) ** 2)
+            w = w - 0.02 * loss_derivatives(c, w)[0] / max(1, np.linalg.norm(w) ** 2)
         assert projection_loss(c, w) == pytest.approx(1.9, abs=1e-8)
         assert w.T @ w == pytest.approx(np.eye(2), abs=1e-6)
 
@@ -295,13 +282,10 @@ def test_turning_one_direction_changes_the_loss_by_the_formula():
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(3, 8), st.integers(0, 10_000))
-def test_angles_against_scipy_and_the_projector_norm(n, seed):
-    from scipy.linalg import subspace_angles
-
+def test_the_largest_angle_is_that_of_the_projector_norm(n, seed):
     rng = np.random.default_rng(seed)
     a, b = rng.normal(size=(n, 2)), rng.normal(size=(n, 2))
     found = principal_angles(a, b)
-    assert found == pytest.approx(np.sort(subspace_angles(a, b)), abs=1e-7)
     pa, ub = np.linalg.qr(a)[0], np.linalg.qr(b)[0]
     assert np.sin(found[-1]) == pytest.approx(np.linalg.norm(ub - pa @ pa.T @ ub, 2))
     assert principal_angles(a, rng.normal(size=(n, 1))).shape == (1,)
@@ -344,20 +328,26 @@ def test_bound_is_the_value_of_the_semidefinite_programme(lost):
     assert "no subspace holds more" in str(found) and max(map(len, str(found).splitlines())) <= 80
 
 
-def test_certificates_refuse_what_they_cannot_prove():
-    c = covariance()
-    with pytest.raises(DataError, match="uses the lost coordinates"):
-        fantope_certificate(c, rotation(6)[:, :2], lost=[0])
-    with pytest.raises(DataError, match="smallest eigenvalue"):
-        fantope_certificate(-c, rotation(6)[:, :2])
-    with pytest.raises(StructureError, match="coordinates from 0"):
-        fantope_certificate(c, rotation(6)[:, :2], lost=[6])
-    with pytest.raises(StructureError, match="finite"):
-        fantope_certificate(c, rotation(6)[:, :2], np.nan)
-    with pytest.raises(RankError, match="1 dimensions"):
-        fantope_certificate(c, np.ones((6, 2)))
-    with pytest.raises(DataError, match="not symmetric"):
-        fantope_certificate(np.triu(c) + 1, rotation(6)[:, :2])
+def refusals():
+    c, w = covariance(), rotation(6)[:, :2]
+    yield lambda: fantope_certificate(c, w, lost=[0]), DataError, "uses the lost coordinates"
+    yield lambda: fantope_certificate(-c, w), DataError, "smallest eigenvalue"
+    yield lambda: fantope_certificate(c, w, lost=[6]), StructureError, "coordinates from 0"
+    yield lambda: fantope_certificate(c, w, np.nan), StructureError, "finite"
+    yield lambda: fantope_certificate(c, np.ones((6, 2))), RankError, "1 dimensions"
+    yield lambda: fantope_certificate(np.triu(c) + 1, w), DataError, "not symmetric"
+    yield lambda: constrained_reconstruction(c, 2, within=np.eye(6)[:, :1]), StructureError, "dimension 1 only"
+    yield (lambda: constrained_reconstruction(c, 2, within=surviving(6, [0]), containing=np.eye(6)[:, 0]),
+           StructureError, "not among the surviving")
+    yield lambda: constrained_reconstruction(c, 1, containing=np.eye(6)[:, :2]), StructureError, "2 directions"
+    yield lambda: surviving(2, [0, 1]), StructureError, "not all of them"
+    yield lambda: suboptimal_reconstruction(c, [1, 1]), StructureError, "distinct"
+
+
+@pytest.mark.parametrize("call, error, words", list(refusals()))
+def test_what_cannot_be_proved_or_projected_is_refused(call, error, words):
+    with pytest.raises(error, match=words):
+        call()
 
 
 # -- reconstruction --------------------------------------------------------------------------------------------------
@@ -397,61 +387,3 @@ def test_no_admissible_projector_beats_the_constrained_one(seed, lost, kept):
         other = space @ rng.normal(size=(6 - lost, 3 - kept))
         w = np.linalg.qr(other if held is None else np.hstack([held, other]))[0]
         assert np.trace(c) - np.trace(w.T @ c @ w) >= found.loss - 1e-9
-
-
-def test_contradictory_constraints_are_refused():
-    c = covariance()
-    with pytest.raises(StructureError, match="dimension 1 only"):
-        constrained_reconstruction(c, 2, within=np.eye(6)[:, :1])
-    with pytest.raises(StructureError, match="not among the surviving"):
-        constrained_reconstruction(c, 2, within=surviving(6, [0]), containing=np.eye(6)[:, 0])
-    with pytest.raises(StructureError, match="2 directions"):
-        constrained_reconstruction(c, 1, containing=np.eye(6)[:, :2])
-    with pytest.raises(StructureError, match="not all of them"):
-        surviving(2, [0, 1])
-    with pytest.raises(StructureError, match="distinct"):
-        suboptimal_reconstruction(c, [1, 1])
-
-
-def test_weighted_oblique_projector_has_the_least_error():
-    rng = np.random.default_rng(0)
-    s, noise = rng.normal(size=(5, 2)), covariance(1, np.array([3, 1, 0.5, 0.1, 0.01]))
-    best = oblique_projector(s, noise=noise)
-    assert best @ s == pytest.approx(s) and best @ best == pytest.approx(best)
-    assert oblique_projector(s, noise=noise + s @ s.T) == pytest.approx(best)  # covariance of the sum
-    assert oblique_projector(s) == pytest.approx(s @ np.linalg.pinv(s))
-    for _ in range(50):
-        other = oblique_projector(s, rng.normal(size=(5, 2)))
-        assert other @ s == pytest.approx(s)
-        assert np.trace(other @ noise @ other.T) >= np.trace(best @ noise @ best.T)
-    with pytest.raises(RankError, match="meets"):
-        oblique_projector(np.eye(3)[:, :1], np.eye(3)[:, 1:2])
-    with pytest.raises(StructureError, match="one of them"):
-        oblique_projector(s, s, noise=noise)
-
-
-def test_filled_entries():
-    c = covariance(2)
-    w = optimal_reconstruction(c, 2).basis
-    x = np.random.default_rng(0).normal(size=(50, 2)) @ w.T
-    holes = x.copy()
-    holes[::2, 1], holes[::3, 4] = np.nan, np.nan
-    kept = holes.copy()
-    assert filled(holes, w) == pytest.approx(x, abs=1e-10)
-    assert np.array_equal(holes, kept, equal_nan=True)
-    assert filled(holes[0], w) == pytest.approx(x[0], abs=1e-10)
-    y = samples(c, 40_000)
-    gaps = y.copy()
-    gaps[:, 3] = np.nan
-    left = [0, 1, 2, 4, 5]
-    slope = np.linalg.lstsq(y[:, left], y[:, 3], rcond=None)[0]
-    mean = filled(gaps, covariance=c)[:, 3]
-    assert mean == pytest.approx(y[:, left] @ slope, abs=0.1)
-    error = [np.mean((y[:, 3] - v) ** 2) for v in (mean, filled(gaps, w)[:, 3])]
-    assert error[0] < error[1]
-    with pytest.raises(RankError, match="sample 1"):
-        filled([[1.0] * 6, [1.0] + [np.nan] * 5], w)
-    with pytest.raises(StructureError, match="either"):
-        filled(x, w, covariance=c)
-    with pytest.raises(DataError, match="coordinate 2 is inf at sample 0"):
-        filled([1, np.inf, 0, 0, 0, 0], w)

@@ -9,8 +9,7 @@ from optid.arrays import check_integer
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 
-ROWS_PER_UNKNOWN = 1.1
-"""Errors that a fit needs for each of its unknowns."""
+ROWS_PER_UNKNOWN = 1.1  # errors that a fit needs for each of its unknowns
 
 
 def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:

@@ -4,9 +4,10 @@ Neighbouring samples are not independent, so that single samples left out would 
 sides of a block are experiments of their own, and so is the block: its initial state is fitted to it.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,24 +16,13 @@ from optid.data.record import Data, as_list
 from optid.data.stretches import between_gaps
 from optid.errors import DataError, OptidError, RankError
 
-SHORTEST = 10
-"""Samples of a part of an experiment at least: shorter ones say more of their initial state than of the plant."""
-
-LEAD = 0.33
-"""Share of a block to which its initial state is fitted."""
-
-LEAST = 30
-"""Samples of that part at least."""
-
-NEAR = 0.15
-"""A border of experiments this near to the border of two blocks, as a share of their length, takes its place."""
-
-RUNAWAY = 10.0
-"""A run diverges where it leaves so many times the range of the outputs."""
+SHORTEST = 10  # samples of a part of an experiment: shorter ones say more of their initial state than of the plant
+LEAD, LEAST = 0.33, 30  # share of a block to which its initial state is fitted; samples of that part at least
+NEAR = 0.15  # a border of experiments this near to that of two blocks, as a share of their length, takes its place
+RUNAWAY = 10.0  # a run diverges where it leaves so many times the range of the outputs
 
 
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """Samples first to last - 1 of one experiment."""
 
     experiment: int
@@ -42,23 +32,14 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """A record cut into blocks.
-
-    Attributes:
-        data: the record.
-        parts: the parts of experiments that make each block.
-    """
+    """A record cut into blocks, each made of parts of experiments."""
 
     data: Data
     parts: tuple[tuple[Part, ...], ...]
 
     @classmethod
     def of(cls, data: Data, count: int = 4) -> "Blocks":
-        """Cut a record into blocks of nearly equal length.
-
-        Raises:
-            RankError: a record too short for so many blocks.
-        """
+        """Cut a record into blocks of nearly equal length; one too short for that is a `RankError`."""
         check_integer(count, "blocks", 2)
         lengths = [e.n_samples for e in data.experiments]
         ends = np.cumsum(lengths)
@@ -66,11 +47,13 @@ class Blocks:
         if total < count * SHORTEST:
             raise RankError(f"{total} samples are too few for cross-validation in {count} blocks of at least "
                             f"{SHORTEST}: record more, or name the orders and use `optid.fit`")
-        cuts = [0, *(_snapped(round(k * total / count), ends, NEAR * total / count) for k in range(1, count)), total]
-        starts = ends - lengths
+        cuts = [0]
+        for cut in (round(k * total / count) for k in range(1, count)):
+            border = int(ends[np.argmin(np.abs(ends - cut))])
+            cuts.append(border if abs(border - cut) <= NEAR * total / count else cut)
         parts = []
-        for low, high in zip(cuts, cuts[1:]):
-            inside = [Part(i, max(low - s, 0), min(high, e) - s) for i, (s, e) in enumerate(zip(starts, ends))
+        for low, high in zip(cuts, [*cuts[1:], total]):
+            inside = [Part(i, max(low - s, 0), min(high, e) - s) for i, (s, e) in enumerate(zip(ends - lengths, ends))
                       if s < high and e > low]
             parts.append(tuple(p for p in inside if p.last - p.first >= SHORTEST) or tuple(inside))
         return cls(data, tuple(parts))
@@ -80,33 +63,22 @@ class Blocks:
 
     def without(self, block: int) -> Data:
         """Return the record without a block; what is left on its two sides are experiments of their own."""
-        cut: dict[int, list[Part]] = {}
-        for part in self.parts[block]:
-            cut.setdefault(part.experiment, []).append(part)
         kept = []
         for i, e in enumerate(self.data.experiments):
-            borders = [0, *(x for part in cut.get(i, []) for x in (part.first, part.last)), e.n_samples]
+            cut = [x for part in self.parts[block] if part.experiment == i for x in part[1:]]
+            borders = [0, *cut, e.n_samples]
             kept += [Part(i, int(a), int(b)) for a, b in zip(borders[::2], borders[1::2]) if b - a >= SHORTEST]
-        return self._joined(kept)
+        return joined(self.data, kept)
 
     def block(self, block: int) -> Data:
         """Return a block, cut where an input is missing: a simulation needs every one of them."""
-        return between_gaps(self._joined(self.parts[block]), 2)
-
-    def _joined(self, parts: Any) -> Data:
-        return Data.join(*(self.data.select(experiments=p.experiment).window(p.first, p.last) for p in parts))
+        return between_gaps(joined(self.data, self.parts[block]), 2)
 
     @cached_property
     def outputs(self) -> tuple[Array, Array]:
         """Mean squared deviation of the outputs from their means (l,), and their range (l,)."""
         y = np.vstack([e.y for e in self.data.raw().experiments])
         return np.nanvar(y, axis=0), np.nanmax(y, axis=0) - np.nanmin(y, axis=0)
-
-    @staticmethod
-    def _free_run(model: Any, part: Data) -> list[Array]:
-        """Simulate a block from states fitted to its beginning: more would let slow modes follow what they cannot."""
-        states = [model.initial_state(start) for start in _led(part)]
-        return as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
 
     def errors(self, model: Any, block: int, horizon: int | None = None) -> tuple[Array, Array]:
         """Return the energy of the errors of a model on a block, and what it is measured by, by output: (l,), (l,).
@@ -117,11 +89,17 @@ class Blocks:
         Args:
             model: the model.
             block: number of the block.
-            horizon: samples ahead of the prediction; None for the free run.
+            horizon: samples ahead of the prediction; None for the free run, from states fitted to the beginning of the
+                block: more would let slow modes follow what they cannot.
         """
         part, (variance, span) = self.block(block).raw(), self.outputs
         try:  # what runs away is told by its energy
-            found = self._free_run(model, part) if horizon is None else as_list(model.predict(part, horizon))
+            if horizon is None:
+                states = [model.initial_state(part.select(experiments=i).window(0, _lead(e.n_samples)))
+                          for i, e in enumerate(part.experiments)]
+                found = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
+            else:
+                found = as_list(model.predict(part, horizon))
         except OptidError:
             return np.full(self.data.l, np.inf), np.zeros(self.data.l)
         y, run = np.vstack([e.y for e in part.experiments]), np.vstack(found)
@@ -135,10 +113,9 @@ class Blocks:
         return np.where(wild, np.inf, energy), variance * here.sum(axis=0)
 
 
-def _led(part: Data) -> list[Data]:
-    """Return the beginning of every experiment, to which its initial state is fitted."""
-    return [part.select(experiments=i).window(0, min(max(round(LEAD * e.n_samples), LEAST), e.n_samples))
-            for i, e in enumerate(part.experiments)]
+def joined(data: Data, parts: Iterable[Part]) -> Data:
+    """Return parts of a record as experiments."""
+    return Data.join(*(data.select(experiments=p.experiment).window(p.first, p.last) for p in parts))
 
 
 def pooled_fit(energy: Array, measure: Array) -> float:
@@ -148,6 +125,5 @@ def pooled_fit(energy: Array, measure: Array) -> float:
     return float(100 * np.mean(1 - np.sqrt(energy.sum(axis=0) / np.maximum(measure.sum(axis=0), 1e-300))))
 
 
-def _snapped(cut: int, ends: Array, near: float) -> int:
-    nearest = int(ends[np.argmin(np.abs(ends - cut))])
-    return nearest if abs(nearest - cut) <= near else cut
+def _lead(samples: int) -> int:
+    return min(max(round(LEAD * samples), LEAST), samples)

@@ -5,6 +5,7 @@ its own samples and as many after it as there are lags. All structures are colum
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +14,16 @@ from optid.arrays import Array
 from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data.record import Data
-from optid.errors import RankError
-from optid.identify.blocks import Blocks, Part
+from optid.errors import OptidError, RankError
+from optid.identify.blocks import Blocks, Part, joined
 from optid.statistics import Layout, Statistics, accumulate
 
 Places = NDArray[np.intp]
 
 ROWS_PER_COLUMN = 4
 RIDGE = 1e-12
-
-SHARP = 0.2
-"""Share of the errors' energy that the first lag with an effect must save for a delay to be taken for real."""
-
-SLIGHT = 0.05
-"""What all the lags before it may save together, as a share of that."""
+SHARP = 0.2  # share of the errors' energy that the first lag with an effect must save for a delay to be taken for real
+SLIGHT = 0.05  # what all the lags before it may save together, as a share of that
 
 
 @dataclass(frozen=True)
@@ -57,61 +54,51 @@ class LagSums:
         while na * data.l + lags * width + 1 > rows / ROWS_PER_COLUMN and na + lags > 3:
             na, lags = max(na - 1, 1), max(lags - 2, 2)
         self.data, self.layout = data, Layout(na, (lags,) * data.m, (0,) * data.m, bases, data.outputs, data.inputs)
-        self.whole = self._of([Part(i, 0, e.n_samples) for i, e in enumerate(data.experiments)])
-        reach = self.layout.first_row
-        self.blocks = [self._of([Part(p.experiment, max(p.first - reach, 0),
-                                      min(p.last + reach, data.experiments[p.experiment].n_samples)) for p in parts])
-                       for parts in blocks.parts]
+        lengths, reach = [e.n_samples for e in data.experiments], self.layout.first_row
+        self.whole = self._of([Part(i, 0, n) for i, n in enumerate(lengths)])
+        self.blocks = [self._of([Part(i, max(first - reach, 0), min(last + reach, lengths[i]))
+                                 for i, first, last in parts]) for parts in blocks.parts]
+        self._y = self.layout.n_columns + np.arange(data.l, dtype=np.intp)
+        gram, count = self.whole.gram, max(self.whole.rows, 1)
+        variance = gram[self._y, self._y] / count - (gram[self.layout.offset, self._y] / count) ** 2
+        self._variance = np.maximum(variance, 1e-300)
 
     def _of(self, parts: list[Part]) -> Statistics:
         long = [p for p in parts if p.last - p.first > self.layout.first_row]
         if not long:
             raise RankError(f"no block is longer than {self.layout.first_row} lags")
-        return accumulate(Data.join(*(self.data.select(experiments=p.experiment).window(p.first, p.last)
-                                      for p in long)), self.layout)
+        return accumulate(joined(self.data, long), self.layout)
 
     def columns(self, na: int, nb: int, nk: tuple[int, ...]) -> Places:
         """Return the columns of a smaller structure."""
-        past, lags = self.layout.na * self.data.l, self.layout.nb[0]
-        found, start = list(range(na * self.data.l)), past
-        for basis, delay in zip(self.layout.bases, nk):
-            first = start + min(delay, lags) * basis.size
-            found += range(first, min(first + nb * basis.size, start + lags * basis.size))
-            start += lags * basis.size
-        return np.array([*found, start], dtype=np.intp)
+        found, lags = list(range(na * self.data.l)), self.layout.nb[0]
+        for c, (basis, delay) in enumerate(zip(self.layout.bases, nk)):
+            block = self.layout.block(c)
+            first = block.start + min(delay, lags) * basis.size
+            found += range(first, min(first + nb * basis.size, block.stop))
+        return np.array([*found, self.layout.offset], dtype=np.intp)
 
     def error(self, na: int, nb: int, nk: tuple[int, ...]) -> float:
         """Return the mean squared one-step error of the blocks that were left out of the fit, over the variances."""
-        columns, y = self.columns(na, nb, nk), self._targets
-        energy, rows = np.zeros(self.data.l), 0
+        columns = self.columns(na, nb, nk)
+        both, energy, rows = np.concatenate([columns, self._y]), np.zeros(self.data.l), 0
         for block in self.blocks:
-            theta = _solved(self.whole.gram - block.gram, columns, y)
-            both = np.concatenate([columns, y])
-            weights = np.vstack([-theta, np.eye(y.size)])
+            theta = _solved(self.whole.gram - block.gram, columns, self._y)
+            weights = np.vstack([-theta, np.eye(self.data.l)])
             energy += np.einsum("ij,ik,kj->j", weights, block.gram[np.ix_(both, both)], weights)
             rows += block.rows
         return float(np.mean(energy / np.maximum(rows, 1) / self._variance))
 
-    @property
-    def _targets(self) -> Places:
-        return self.layout.n_columns + np.arange(self.data.l, dtype=np.intp)
-
-    @property
-    def _variance(self) -> Array:
-        gram, rows, y = self.whole.gram, max(self.whole.rows, 1), self._targets
-        variance = gram[y, y] / rows - (gram[self.layout.offset, y] / rows) ** 2
-        return np.maximum(variance, 1e-300)
-
     def remainder(self, columns: Places) -> float:
         """Return what least squares on some columns leaves of the outputs of the whole record, over the variances."""
-        gram, y = self.whole.gram, self._targets
+        gram, y = self.whole.gram, self._y
         theta = _solved(gram, columns, y)
         rest = gram[y, y] - np.einsum("ij,ij->j", theta, gram[np.ix_(columns, y)])
         return float(np.mean(np.maximum(rest, 0.0) / max(self.whole.rows, 1) / self._variance))
 
 
 def scan(sums: LagSums, delays: list[tuple[int, ...]]) -> list[Autoregression]:
-    """Compare autoregressions of all orders with some delays; the best of each delay first."""
+    """Compare autoregressions of all orders with some delays; the best first."""
     layout = sums.layout
     found = [Autoregression(na, nb, nk, sums.error(na, nb, nk)) for nk in delays for na in range(1, layout.na + 1)
              for nb in range(1, min(layout.nb[0] - max(nk), 8) + 1)]
@@ -126,15 +113,27 @@ def sharp_delays(sums: LagSums) -> tuple[int, ...]:
     """
     layout, found = sums.layout, []
     lags = layout.nb[0]
-    for c in range(layout.m):
-        others = tuple(0 for _ in range(layout.m))
-        rest = [sums.remainder(sums.columns(layout.na, lags, (*others[:c], k, *others[c + 1 :])))
-                for k in range(lags)]
+    for one in np.eye(layout.m, dtype=int):
+        rest = [sums.remainder(sums.columns(layout.na, lags, tuple(k * one))) for k in range(lags)]
         saved = np.diff(np.log(np.maximum(rest, RIDGE)))
         delay = int(np.argmax(saved)) if saved.size else 0
         sharp = delay and saved[delay] >= SHARP and saved[:delay].sum() <= SLIGHT * saved[delay]
         found.append(delay if sharp else 0)
     return tuple(found)
+
+
+def shown_delays(model: Any, data: Data) -> list[tuple[int, ...] | None]:
+    """Return the sharp delays of a record that straight lines show, and the functions of a model; None: too short.
+
+    What acts through an even function shows no delay in a linear model.
+    """
+    found: list[tuple[int, ...] | None] = []
+    for bases in (linear(data), tuple(f.basis for f in model.nonlinearities)):
+        try:
+            found.append(sharp_delays(LagSums(Blocks.of(data), bases)))
+        except OptidError:
+            found.append(None)
+    return found
 
 
 def linear(data: Data) -> tuple[Basis, ...]:

@@ -28,16 +28,13 @@ from optid.solving.solve import Outcome, Procedure, run
 
 @dataclass(frozen=True, repr=False)
 class Fit(Rendered):
-    """A fitted model with the evidence for it.
+    """A fitted model with the evidence for it: formulation, its arguments and the record lead to the outcome.
 
     A pickled fit keeps its results. Its programme is not among them: it is posed and solved again when it is asked for
     (by `program`, `uncertainty` or `resolve`), which needs constraints that can be pickled.
 
     Attributes:
         outcome: what the formulation ended with; see `program`, `solution`, `model`, `figures` and `steps`.
-        formulation: its name.
-        arguments: what it was called with.
-        data: the record.
         prices: activity and price of every user constraint.
         findings: what the examination of the record found, one sentence each.
         seconds: wall time of the whole call.
@@ -146,19 +143,13 @@ class Fit(Rendered):
 
     def refit(self, *, data: Data | Stream | None = None, formulation: str | None = None,
               replaced: Mapping[str, Any] | None = None, **changes: Any) -> "Fit":
-        """Fit again with changes, without a proof.
+        """Fit again, without a proof: with another record or formulation, and with changes of the arguments.
 
-        Args:
-            data: another record.
-            formulation: another formulation.
-            replaced: its arguments, in place of those of this fit.
-            changes: arguments that are to differ.
+        The arguments are those of this fit, or those that have `replaced` them.
         """
-        arguments = dict(self.arguments if replaced is None else replaced)
+        arguments = self.arguments if replaced is None else replaced
         return fit(self.data if data is None else data, formulation or self.formulation, prove=False,
                    **{**arguments, **changes})
-
-    # -- working with the model ------------------------------------------------------------------------------------
 
     @cached_property
     def params(self) -> Parameters:
@@ -174,11 +165,9 @@ class Fit(Rendered):
         return self.model.predict(self._record() if data is None else data, horizon)
 
     def simulate(self, u: Any = None, x0: Any = None) -> Any:
-        """Compute the outputs from inputs (N, m) or a record, as `Model.simulate`.
+        """Compute the outputs from inputs (N, m) in raw units or a record, as `Model.simulate`; by default that fitted.
 
-        Args:
-            u: inputs in raw units, or a record; the record of the fit when not given.
-            x0: initial state; by default zero for inputs, and what fits best for a record.
+        The initial state x0 is zero for inputs, and what fits best for a record, when it is not given.
         """
         given = self._record() if u is None else u
         return self.model.simulate(given, x0=x0 if x0 is not None else "fit" if isinstance(given, Data) else "zero")
@@ -212,8 +201,6 @@ class Fit(Rendered):
         if not isinstance(self.data, Data):
             raise DataError("the fit was made from a stream, whose samples are not kept: pass a record")
         return self.data
-
-    # -- copies ----------------------------------------------------------------------------------------------------
 
     def __copy__(self) -> "Fit":
         made = object.__new__(type(self))
@@ -262,7 +249,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
         solver: Any = "auto", accuracy: float = 1e-8, time_limit: float | None = None, isolate: bool | None = None,
         prove: bool = True, constraints: Sequence[Any] = (), solver_options: Mapping[str, Any] | None = None,
         raises: bool = True, **structure: Any) -> Fit:
-    """Fit a model to a record.
+    """Fit a model to a record: in raw units, with status, proof, constraint prices and times.
 
     Args:
         data: the record; a `Stream` for files larger than memory.
@@ -277,9 +264,6 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
         solver_options: native options of the solver.
         raises: False returns failures as values (``fit.solution.status``) instead of raising.
         structure: arguments of the formulation (na, nb, nk, basis, loss, gauge, ...).
-
-    Returns:
-        The model in raw units with status, proof, constraint prices and times.
 
     Raises:
         DataError, RankError: the record cannot determine the model.
@@ -309,17 +293,8 @@ def resolve(fit: Fit, parameters: Mapping[str, float], *, solver: Any = "auto", 
             raises: bool = True) -> Fit:
     """Solve the programme of a fit again with other parameter values, starting from its solution.
 
-    Nothing is compressed or compiled again.
-
-    Args:
-        fit: an earlier fit.
-        parameters: new values of the programme's parameters, such as ``weight`` of the nuclear norm.
-        solver: as in `fit`.
-        accuracy: as in `fit`.
-        raises: as in `fit`.
-
-    Raises:
-        StructureError: the programme has no such parameter; names the nearest.
+    Nothing is compressed or compiled again. The parameters are those of the programme, such as ``weight`` of the
+    nuclear norm; another name is a `StructureError`. The other arguments are as in `fit`.
     """
     started = time.perf_counter()
     program = fit.program

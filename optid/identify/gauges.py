@@ -8,8 +8,7 @@ import numpy as np
 from optid.errors import StructureError
 from optid.models.gauges import GAUGES, gauge_factor
 
-FIXED = GAUGES[:-1]
-"""The gauges that fix the scale."""
+FIXED = GAUGES[:-1]  # the gauges that fix the scale
 
 
 def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np.ndarray | None = None) -> Any:

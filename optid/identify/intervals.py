@@ -24,17 +24,14 @@ REACH = 8.0  # inequalities further away than this many standard deviations of t
 
 @dataclass(frozen=True, eq=False)
 class LocalEstimate:
-    """An estimate in whitened tangent coordinates.
+    """An estimate in whitened tangent coordinates v, and inequalities rows (r, n) @ v + slack (r,) >= 0, slack >= 0.
 
     Attributes:
         centre: (n,) minimum without the inequalities, relative to the fit.
         scatter: (n, m) S, the centre has covariance S Sᵀ. Draws are made in the m coordinates, which should not depend
             on how a basis of the tangent space was found: every machine then makes the same.
         dof: degrees of freedom of the noise estimate inside S.
-        rows: (r, n) and
-        slack: (r,) >= 0 of the inequalities rows @ v + slack >= 0.
-        draws: number of random draws, at least 100 (`StructureError`).
-        seed: their seed.
+        draws: number of random draws, at least 100 (`StructureError`); seed: their seed.
     """
 
     centre: Array
@@ -71,17 +68,11 @@ class LocalEstimate:
         return spread, project(self.centre + spread, rows, slack), project(spread, rows, slack)
 
     def limits(self, slopes: Array, level: float) -> tuple[Array, Array, Array]:
-        """Return the standard error and the two ends, relative to the fit, of linear functions of v.
+        """Return the standard error (q,) and the two ends, lower <= 0 <= upper, of q functions of v with slopes (q, n).
 
         The quantiles of the projected draws are corrected by what those of the draws themselves miss of Student's,
-        which are known: most of the noise of a finite number of draws is common to both.
-
-        Args:
-            slopes: (q, n) derivatives of q quantities.
-            level: probability inside.
-
-        Returns:
-            (error, lower, upper), each (q,), lower <= 0 <= upper.
+        which are known: most of the noise of a finite number of draws is common to both. The level is the probability
+        inside.
         """
         error = np.linalg.norm(slopes @ self.scatter, axis=1)
         half = float(stdtrit(self.dof, 0.5 + level / 2)) * error

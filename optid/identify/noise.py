@@ -11,6 +11,7 @@ hence K and Re.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from operator import itemgetter
 
@@ -31,24 +32,14 @@ from optid.models.state_space import StateSpace
 from optid.statistics.coloured import long_autoregression, response_of
 from optid.statistics.hankel import complete_runs
 
-ROUNDING = 1e-10
-"""Residuals below this share of the outputs are rounding: there is no noise to describe."""
-
-LONGEST = 40
-"""Lags of the autoregression of prediction errors at most."""
-
-EXACT = 1e-8
-"""Prediction errors relative to the outputs below which a record shows no noise model."""
-
+ROUNDING = 1e-10  # residuals below this share of the outputs are rounding: there is no noise to describe
+LONGEST = 40  # lags of the autoregression of prediction errors at most
+EXACT = 1e-8  # prediction errors relative to the outputs below which a record shows no noise model
 NEARLY_MARGINAL = 1 - 1e-4
 """Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
 
-RATIOS = (1e-2, 1.0, 1e2)
-"""Process over measurement noise of the observers behind the starts, in units of C."""
-
-TRIED = 2
-"""Observers whose errors are whitened, and then starts that are refined, the best of all."""
-
+RATIOS = (1e-2, 1.0, 1e2)  # process over measurement noise of the observers behind the starts, in units of C
+TRIED = 2  # observers whose errors are whitened, and then starts that are refined, the best of all
 BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
 """Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
 in."""
@@ -127,10 +118,7 @@ def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correl
 def output_noise(model: HammersteinSS) -> Array:
     """Return the covariance (l, l) of the noise at the outputs, process and measurement noise together.
 
-    It is infinite where a pole on or outside the unit circle is driven by the noise.
-
-    Raises:
-        StructureError: the model has no noise covariances.
+    It is infinite where a pole on or outside the unit circle is driven by the noise; refused as `noise_spectrum`.
     """
     from scipy.linalg import solve_discrete_lyapunov
 
@@ -150,7 +138,6 @@ def _innovations(model: HammersteinSS) -> Array:
 
 
 def _largest(signals: Sequence[Array]) -> float:
-    """Largest modulus of any sample that is present."""
     return max(float(np.nanmax(np.abs(s), initial=0.0)) for s in signals)
 
 
@@ -161,14 +148,14 @@ def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Arra
     """
     part = _part(rest, C.size)
     starts = _starts(A, C, part)[:TRIED]
-    if part is not rest:
+    if part is rest:
+        found = [refined(A, C, gain, rest) for gain in starts]
+    else:
         found = [refined(A, C, gain, part, arrived=NEARLY) for gain in starts]
         found.sort(key=lambda pair: log_determinant(pair[1]))
         same = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part))
         optima = [found[0][0], *(gain for gain, covariance in found[1:] if log_determinant(covariance) > same)]
         found = [refined(A, C, gain, rest, part) for gain in optima]
-    else:
-        found = [refined(A, C, gain, rest) for gain in starts]
     return min(found, key=lambda pair: log_determinant(pair[1]))
 
 
@@ -192,16 +179,12 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
 
     observers: list[Array] = [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
-        try:
+        with suppress(StructureError):
             observers.append(observer_gain(A, C, ratio))
-        except StructureError:
-            continue
     found = sorted(map(measured, observers), key=itemgetter(0))
     for _, gain in found[:TRIED]:
-        try:
+        with suppress(StructureError, ValueError):  # too few in a row, or a zero on the unit circle
             found.append(measured(whitening_gain(A, C, gain, whitened(A, C, gain, rest))))
-        except (StructureError, ValueError):  # too few in a row, or a zero on the unit circle
-            continue
     return [gain for _, gain in sorted(found, key=itemgetter(0))]
 
 

@@ -97,16 +97,6 @@ def _departures(x: Array) -> Array:
     """Distance of every sample from the running median, which goes on straight at the ends."""
     if x.size < WINDOW:
         return np.abs(x - np.median(x)) if x.size else x
-    half = WINDOW // 2
-    course = _running_median(x)
-    for line in (course, course[::-1]):  # views of its two ends
-        slope = (line[2 * half] - line[half]) / half if x.size > 3 * half else 0.0
-        line[:half] = line[half] - slope * np.arange(half, 0, -1)
-    return np.abs(x - course)
-
-
-def _running_median(x: Array) -> Array:
-    """Return the median of `WINDOW` samples about every sample that has as many before and behind; else the sample."""
     half, course = WINDOW // 2, x.copy()
     if x.size <= SHORT:
         windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
@@ -115,7 +105,10 @@ def _running_median(x: Array) -> Array:
         from scipy.ndimage import median_filter
 
         course[half:-half] = median_filter(x, WINDOW)[half:-half]
-    return course
+    for line in (course, course[::-1]):  # views of its two ends
+        slope = (line[2 * half] - line[half]) / half if x.size > 3 * half else 0.0
+        line[:half] = line[half] - slope * np.arange(half, 0, -1)
+    return np.abs(x - course)
 
 
 def _wild(parts: Sequence[Array]) -> list[np.ndarray]:

@@ -26,10 +26,7 @@ class Parameter(NamedTuple):
 class Parameters(Rendered, Sequence):
     """Estimated parameters in their order, by place or by name: ``fit.params["a1"].estimate``.
 
-    Attributes:
-        rows: the parameters.
-        level: probability that an interval contains the truth.
-        reason: why there are no standard errors, "" where there are some.
+    An interval contains the truth with probability `level`; the reason says why there are no standard errors.
     """
 
     rows: tuple[Parameter, ...]
@@ -102,10 +99,8 @@ def function_parameters(function: StaticFunction, known: Any) -> list[Parameter]
 def criteria(fit: Any) -> tuple[float, float]:
     """Return AIC and BIC of a fit: minus twice the log likelihood of its one-step errors, plus the price of parameters.
 
-    The errors count as Gaussian with the covariance they have; samples with a missing output are left out.
-
-    Raises:
-        DataError: a stream, whose samples are gone, or fewer errors than outputs.
+    The errors count as Gaussian with the covariance they have; samples with a missing output are left out. A stream,
+    whose samples are gone, or fewer errors than outputs are a `DataError`.
     """
     errors = np.vstack(fit.residuals if isinstance(fit.residuals, tuple) else (fit.residuals,))
     errors = errors[np.isfinite(errors).all(axis=1)]

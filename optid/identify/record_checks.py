@@ -23,16 +23,13 @@ BLOCK_ROWS = 10  # of a subspace method that chooses them itself
 
 
 def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:
-    """Examine inputs and outputs against the bases that are to be identified from them.
+    """Return what weakens an answer, one sentence each, and issue every sentence as a `DataWarning`, too.
 
     Args:
         data: the record.
         bases: one fitted basis per input.
         arguments: of the formulation; its lags (nb, or block_rows of a subspace method) are held against the spectral
             lines of the inputs. A tolerance among them says that a singular regressor is wanted: it is then a warning.
-
-    Returns:
-        What weakens the answer, one sentence each; every sentence is also issued as a `DataWarning`.
 
     Raises:
         DataError: a constant or missing channel, too few levels to determine the basis, or too few spectral lines to
@@ -65,10 +62,9 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
 def examine_figures(figures: Mapping[str, Any]) -> list[str]:
     """Say how the compressed problem stands, and which readings a robust loss has left out by their residuals.
 
-    Args:
-        figures: of a fit, as far as they are there: rows used, the candidates there would be without missing samples,
-            estimated condition number of the column-scaled expanded regressor, and the condition number of R11, the
-            regressors of a subspace method projected on its instruments.
+    The figures are those of a fit, as far as they are there: rows used, the candidates there would be without missing
+    samples, estimated condition number of the column-scaled expanded regressor, and that of R11, the regressors of a
+    subspace method projected on its instruments.
     """
     checks = {"condition": check_condition, "condition of R11": check_instruments}
     found = [sentence for key in checks if key in figures for sentence in _sentences(checks[key](figures[key]))]
@@ -129,12 +125,9 @@ def _present(role: str, name: str, records: Sequence[np.ndarray]) -> np.ndarray:
 
 def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
     """Number of lags at which the functions of input c are regressors, as far as the arguments tell."""
-    if "block_rows" in arguments:
-        nx = arguments.get("nx")
-        chosen = max(BLOCK_ROWS, 2 * nx if isinstance(nx, int) else 0)
-        given = chosen if arguments["block_rows"] is None else arguments["block_rows"]
-    else:
-        given = arguments.get("nb")
+    given, nx = arguments.get("block_rows", arguments.get("nb")), arguments.get("nx")
+    if "block_rows" in arguments and given is None:
+        given = max(BLOCK_ROWS, 2 * nx if isinstance(nx, int) else 0)
     if isinstance(given, list | tuple):
         given = given[c] if c < len(given) else None
     return int(given) if isinstance(given, int | np.integer) and given > 0 else None

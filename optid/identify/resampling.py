@@ -21,6 +21,7 @@ from optid.identify.fitting import Fit
 from optid.identify.fitting import fit as refit
 from optid.identify.uncertainty import Refits, Uncertainty, aligned
 from optid.models import HammersteinTF
+from optid.models.functions import free_parameters
 from optid.models.recursions import autoregression
 from optid.progress import track
 
@@ -29,10 +30,9 @@ FAILED = 0.1  # share of refits without a point above which the user is told
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
-    """The outcome of a residual bootstrap; both intervals offer what `optid.identify.uncertainty.Uncertainty` offers.
+    """The outcome of a residual bootstrap; its intervals are quantiles of the refits, ``percentile.source.models``.
 
     Attributes:
-        percentile: quantiles of the refits; the models are in ``percentile.source.models``.
         basic: the same reflected at the estimate, which undoes a bias instead of doubling it.
         failed: refits that gave no point.
     """
@@ -94,21 +94,15 @@ def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
     """Yield the resampled records, in the units of the record fitted."""
     data: Data = fit.data  # type: ignore[assignment]
     model = fit.program.recover(fit.solution.values)
-    residuals = _residuals(model, data)
+    rows = np.vstack([e.y - model.predict_record(e.u, e.y) for e in data.experiments])
+    rows = rows[~np.isnan(rows).any(axis=1)]
+    # centred, with the variance of the equation error
+    residuals = (rows - rows.mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - free_parameters(model) / model.l, 1.0))
     rng = np.random.default_rng(seed)
     for _ in range(runs):
         outputs = iter([_simulated(model, e.u, e.y, residuals[rng.integers(len(residuals), size=len(e.y))])
                         for e in data.experiments])
         yield data.mapped(lambda u: u, lambda _, outputs=outputs: next(outputs))
-
-
-def _residuals(model: HammersteinTF, data: Data) -> Array:
-    """Complete rows of one-step residuals over all experiments, centred, with the variance of the equation error."""
-    rows = np.vstack([e.y - model.predict_record(e.u, e.y) for e in data.experiments])
-    rows = rows[~np.isnan(rows).any(axis=1)]
-    l = model.l  # noqa: E741
-    parameters = model.na * l * l + l + sum(f.mu.size + b.size - 1 for f, b in zip(model.nonlinearities, model.b))
-    return (rows - rows.mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - parameters / l, 1.0))
 
 
 def _simulated(model: HammersteinTF, u: Array, y: Array, errors: Array) -> Array:

@@ -14,8 +14,6 @@ from optid.identify.validation.predictions import prediction_fit
 from optid.progress import track
 
 PENALTIES = ("ridge", "curvature", "weight")
-GRID = 13
-SPAN = 1e6
 
 
 @dataclass(frozen=True)
@@ -85,17 +83,9 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
 
 def fit_by_holdout(data: Data, formulation: str, *, penalty: str, weights: Sequence[float] | None = None,
                    holdout: float = 0.3, **arguments: Any) -> Fit:
-    """Choose the weight of a penalty by hold-out and fit the whole record with it.
+    """Choose the weight of a penalty by hold-out and fit the whole record with it; arguments as in `path`.
 
     The chosen weight is in ``fit.arguments[penalty]``; the findings name it with its score.
-
-    Args:
-        data: the record.
-        formulation: name of the formulation.
-        penalty: as in `path`.
-        weights: as in `path`.
-        holdout: as in `path`, above 0.
-        arguments: as for `optid.fit`.
     """
     if not holdout > 0:
         raise StructureError("hold-out needs a share above 0")
@@ -110,7 +100,7 @@ def fit_by_holdout(data: Data, formulation: str, *, penalty: str, weights: Seque
 def default_weights(data: Data) -> np.ndarray:
     """Return 13 weights over six decades, the largest a hundredth of the energy of the outputs about their mean."""
     energy = sum(float(np.nansum((e.y - np.nanmean(e.y, axis=0)) ** 2)) for e in data.experiments)
-    return 0.01 * energy * np.logspace(-np.log10(SPAN), 0, GRID)
+    return 0.01 * energy * np.logspace(-6, 0, 13)
 
 
 def _ratio(one: Fit) -> float:

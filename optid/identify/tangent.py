@@ -44,7 +44,7 @@ class Tangent:
 
     Attributes:
         rebuild: from the values of the variables, by name, to the model in the units, gauge and signs of the fit.
-        shapes: shapes of the variables of the programme by name, in the order of x.
+        shapes: of the variables of the programme by name, in the order of x.
         x: (n_x,) solution, every variable flattened column by column.
         directions: (n_x, n) dx/dv, v the whitened tangent coordinates.
         local: the estimate in these coordinates.
@@ -69,11 +69,7 @@ class Tangent:
         return self.local.limits(self.slopes(quantity), level)
 
     def slopes(self, quantity: Quantity) -> Array:
-        """Derivatives (q, n) of a quantity in the whitened tangent coordinates, by central differences.
-
-        Raises:
-            StructureError: the quantity changes its shape with the model.
-        """
+        """Derivatives (q, n) of a quantity in the whitened tangent coordinates, by central differences."""
         columns = []
         for above, below, gap in self._neighbours:
             high, low = (np.ravel(np.asarray(quantity(model), dtype=float)) for model in (above, below))
@@ -96,15 +92,9 @@ class Tangent:
 
 
 def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, seed: int) -> Tangent:
-    """Linearise a fit.
+    """Linearise a fit whose programme carries its compressed least-squares problem; arguments as in `uncertainty`.
 
     The noise estimate comes from the minimum without the inequalities, so that active ones do not bias it.
-
-    Args:
-        fit: a fit whose programme carries its compressed least-squares problem.
-        rebuild: as in `Tangent`.
-        draws: random draws for intervals under inequalities.
-        seed: their seed.
 
     Raises:
         StructureError: a fit that is no least squares (robust loss, nuclear norm), or an active constraint that has no
@@ -160,11 +150,7 @@ def _refuse(fit: Any) -> None:
 
 
 def whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]]) -> tuple[Array, Array, Array]:
-    """Return (free directions, R, Q) with effect @ free = Q R, after scaling every unknown by its effect.
-
-    Raises:
-        RankError: what has no effect, by name.
-    """
+    """Return (free directions, R, Q) with effect @ free = Q R; unknowns without effect are a `RankError` by name."""
     sizes = np.linalg.norm(effect, axis=0)
     for name, part in _unpacked(shapes, sizes).items():
         if np.any(part <= NO_EFFECT * np.max(sizes)):

@@ -23,13 +23,10 @@ from optid.identify.tangent import Quantity, Tangent, linearise
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """Estimates with their errors; every array has the shape of the quantity.
+    """Estimates with their errors and the ends of their intervals; every array has the shape of the quantity.
 
     Attributes:
-        value: the estimate.
         error: standard error; under inequalities the root mean square deviation of the constrained estimate.
-        lower: lower end.
-        upper: upper end.
         at: where a curve was evaluated (input or frequency), None for coefficients.
     """
 
@@ -42,12 +39,9 @@ class Interval:
 
 @dataclass(frozen=True, eq=False)
 class Refits:
-    """Intervals from the scatter of refits.
+    """Intervals from the scatter of refits of a reference model, in its gauge and with its signs.
 
-    Attributes:
-        reference: the fitted model.
-        models: the refitted models, in its gauge and with its signs.
-        kind: "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
+    The kind is "percentile" (quantiles of the refits) or "basic" (the same reflected at the estimate).
     """
 
     reference: Any
@@ -70,11 +64,9 @@ class Refits:
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """Intervals around a fitted model, in raw units and in its gauge.
+    """Intervals around a fitted model, in raw units and in its gauge, which contain the truth with probability `level`.
 
     Attributes:
-        model: the fitted model.
-        level: probability that an interval contains the truth.
         source: where they come from.
         point: (m,) inputs at which `table` lists the static gain of a state-space model; None for zero.
     """
@@ -93,8 +85,6 @@ class Uncertainty:
         """Return the same intervals at another level, a probability."""
         check_probability(level, "level")
         return self if level == self.level else replace(self, level=float(level))
-
-    # -- coefficients --------------------------------------------------------------------------------------------
 
     @cached_property
     def a(self) -> Interval:
@@ -120,8 +110,6 @@ class Uncertainty:
         """Constants of the equations, (l,)."""
         return self.of(lambda model: model.offset)
 
-    # -- curves --------------------------------------------------------------------------------------------------
-
     @cached_property
     def f(self) -> tuple[Interval, ...]:
         """Band of every nonlinearity on the grid of its basis; see `band`."""
@@ -146,14 +134,10 @@ class Uncertainty:
         return replace(found, at=points)
 
     def frequency_response(self, w: ArrayLike | None = None) -> tuple[Interval, Interval]:
-        """Return the bands of magnitude and phase (radians, unwrapped along w) of the linear part A^-1 B.
+        """Return the bands (k, l, m) of magnitude and phase (radians, unwrapped along w) of the linear part A^-1 B.
 
-        Args:
-            w: (k,) frequencies in radians per unit of time; 200 up to the Nyquist frequency when not given.
-
-        Returns:
-            magnitude and phase, each of shape (k, l, m), in the gauge of the model. The magnitude is treated on a
-            logarithmic scale, so that its band is positive.
+        They are in the gauge of the model, at frequencies w (k,) in radians per unit of time; 200 up to the Nyquist
+        frequency when not given. The magnitude is treated on a logarithmic scale, so that its band is positive.
         """
         nyquist = np.pi / self.model.dt
         points = np.linspace(nyquist / 200, nyquist, 200) if w is None else np.atleast_1d(np.asarray(w, dtype=float))
@@ -166,13 +150,9 @@ class Uncertainty:
         return size, replace(turn, at=points)
 
     def of(self, quantity: Quantity) -> Interval:
-        """Return the interval of any smooth real function of the model.
+        """Return the interval of any smooth real function of the model, such as ``lambda m: m.static_gain(0.5)``.
 
-        Args:
-            quantity: model -> number or array, such as ``lambda model: model.static_gain(0.5)``.
-
-        Raises:
-            StructureError: a quantity that is not real or changes its shape with the model.
+        A quantity that is not real, or changes its shape with the model, is a `StructureError`.
         """
         value = np.asarray(quantity(self.model))
         if np.iscomplexobj(value):
@@ -198,9 +178,8 @@ class Uncertainty:
     def _state_quantities(self) -> tuple[list[str], Quantity]:
         model, point = self.model, np.zeros(self.model.m) if self.point is None else self.point
         poles = model.poles[model.poles.imag >= 0]
-        paired = [bool(pole.imag) for pole in poles]
-        names = [f"pole {i + 1}{part}" for i, pair in enumerate(paired)
-                 for part in ([", real", ", imaginary"] if pair else [""])]
+        names = [f"pole {i + 1}{part}" for i, pole in enumerate(poles)
+                 for part in ([", real", ", imaginary"] if pole.imag else [""])]
         try:
             model.static_gain(point)
             names += [f"static gain[{y},{u}]" for y in model.outputs for u in model.inputs]
@@ -210,8 +189,8 @@ class Uncertainty:
 
         def quantity(model: Any) -> Array:
             nearest = [model.poles[np.argmin(np.abs(model.poles - pole))] for pole in poles]
-            parts = [part for pole, pair in zip(nearest, paired) for part in ([pole.real, pole.imag] if pair else
-                                                                              [pole.real])]
+            parts = [part for now, pole in zip(nearest, poles)
+                     for part in ([now.real, now.imag] if pole.imag else [now.real])]
             return np.append(parts, np.ravel(model.static_gain(point)) if gains else [])
 
         return names, quantity
@@ -252,9 +231,8 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
 
 def aligned(model: Any, reference: Any) -> Any:
     """Give every f and B of a model the sign nearest to that of a reference; predictions do not change."""
-    functions = [-1.0 if float(np.sum(f.mu * other.mu)) < 0 else 1.0
-                 for f, other in zip(model.nonlinearities, reference.nonlinearities)]
-    signs = np.array(functions)
+    signs = np.array([-1.0 if float(np.sum(f.mu * other.mu)) < 0 else 1.0
+                      for f, other in zip(model.nonlinearities, reference.nonlinearities)])
     if np.all(signs > 0):
         return model
     turned = tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities))

@@ -8,6 +8,7 @@ functions suit the record. It speaks of this record only.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,32 +17,22 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
-from optid.identify.delays import LagSums, linear, sharp_delays
-from optid.identify.validation.checks import record_structure
+from optid.identify.delays import shown_delays
+from optid.identify.validation.checks import record_structure, shares_outside
 from optid.identify.validation.correlations import cross_correlation
 from optid.identify.validation.predictions import fit_percent, one_step, simulated_or_nan
-from optid.models.functions import has_feedback, static_functions
+from optid.models.functions import has_feedback
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
 
 GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 """Fits in % from which on, and below which, a model is called so; the second is that of its worst block."""
 
-OVERFIT = 12.0
-"""Points that the cross-validated fit may be below that on the record itself."""
-
-GAP = 15.0
-"""Points that the one-step prediction may be better than the free run."""
-
-CORRELATED = 0.25
-"""Largest correlation of residuals and past inputs; their p-values say nothing on long records."""
-
-STRUCTURE = 0.1
-"""Share of the residual variance that another structure may save in a model that is called good."""
-
-OUTSIDE = 0.01
-"""Share of the samples that may lie outside the interval of a function."""
-
+OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
+GAP = 15.0  # points that the one-step prediction may be better than the free run
+CORRELATED = 0.25  # largest correlation of residuals and past inputs; their p-values say nothing on long records
+STRUCTURE = 0.1  # share of the residual variance that another structure may save in a model that is called good
+OUTSIDE = 0.01  # share of the samples that may lie outside the interval of a function
 LAGS = 25
 
 
@@ -92,79 +83,59 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     raw = data.raw()
     y = np.vstack([e.y for e in raw.experiments])
     runs, predicted = simulated_or_nan(model, raw), one_step(model, raw)
-    own = float(np.mean(fit_percent(y, np.vstack(runs))))
-    ahead = float(np.mean(fit_percent(y, np.vstack(predicted))))
-    score = own if pooled is None else pooled
-    words = "cross-validated fit" if pooled is not None else "simulation fit"
-    parts = [Finding(words, _points(score), score >= POOR_FIT)]
+    own, ahead = (float(np.mean(fit_percent(y, np.vstack(found)))) for found in (runs, predicted))
+    score, lost = (own, 0.0) if pooled is None else (pooled, own - pooled)
+    parts = [Finding("simulation fit" if pooled is None else "cross-validated fit", _points(score), score >= POOR_FIT)]
     by_block = _by_block(raw, runs) if cross_validated is None else np.asarray(cross_validated)
-    worst = float(np.min(by_block)) if by_block.size else np.nan
+    worst = float(np.min(by_block, initial=np.inf))
     if by_block.size:
         parts.append(Finding("its worst block", f"{_points(worst)} (median {_points(float(np.median(by_block)))})",
                              worst >= GOOD_BLOCK - (GOOD_FIT - POOR_FIT)))
     if pooled is not None:
-        parts.append(Finding("loss on blocks left out", _points(own - pooled, " points"), own - pooled <= OVERFIT))
+        parts.append(Finding("loss on blocks left out", _points(lost, " points"), lost <= OVERFIT))
     if np.isfinite(ahead) and np.isfinite(own):
         parts.append(Finding("one step ahead, above that", _points(ahead - own, " points"), ahead - own <= GAP))
-    parts += _residuals(raw, predicted)
-    parts += _delays(model, raw)
     steady = bool(model.is_stable) or (has_feedback(model) and np.isfinite(own))
-    parts.append(Finding("stability", "stable" if steady else "unstable", steady))
-    parts += [*_ranges(model, raw), *_structure(model, raw)]
-    return Verdict(_word(score, worst, pooled is not None and own - pooled > OVERFIT, parts), tuple(parts), score)
-
-
-def _word(score: float, worst: float, overfitted: bool, parts: Sequence[Finding]) -> str:
+    parts += [_residuals(raw, predicted), *_delays(model, raw),
+              Finding("stability", "stable" if steady else "unstable", steady),
+              *_ranges(model, raw), *_structure(model, raw)]
     if not score >= USELESS_FIT:
-        return USELESS
-    if score < POOR_FIT or overfitted:
-        return POOR
-    failed = [part for part in parts if part.counts and not part.passed]
-    return GOOD if score >= GOOD_FIT and not worst < GOOD_BLOCK and not failed else FAIR
+        word = USELESS
+    elif score < POOR_FIT or lost > OVERFIT:
+        word = POOR
+    else:
+        failed = any(part.counts and not part.passed for part in parts)
+        word = GOOD if score >= GOOD_FIT and not worst < GOOD_BLOCK and not failed else FAIR
+    return Verdict(word, tuple(parts), score)
 
 
-def _residuals(data: Data, predicted: Sequence[Array]) -> list[Finding]:
+def _residuals(data: Data, predicted: Sequence[Array]) -> Finding:
     residuals = [e.y - p for e, p in zip(data.experiments, predicted)]
     lags = min(LAGS, max(e.n_samples for e in data.experiments) // 4)
     largest, place = 0.0, ""
-    for o, output in enumerate(data.outputs):
-        for c, channel in enumerate(data.inputs):
-            found = cross_correlation([r[:, o] for r in residuals], [e.u[:, c] for e in data.experiments], output,
-                                      channel, lags)
-            values = np.abs(found.values[found.lags >= 0])
-            if np.isfinite(values).any() and np.nanmax(values) > largest:
-                largest, place = float(np.nanmax(values)), f" ({output} on {channel})" if data.m * data.l > 1 else ""
-    return [Finding("largest correlation of residuals and inputs", f"{largest:.2f}{place}", largest <= CORRELATED)]
+    for (o, output), (c, channel) in product(enumerate(data.outputs), enumerate(data.inputs)):
+        found = cross_correlation([r[:, o] for r in residuals], [e.u[:, c] for e in data.experiments], output, channel,
+                                  lags)
+        size = float(np.nanmax(np.abs(found.values[found.lags >= 0]), initial=0.0))
+        if size > largest:
+            largest, place = size, f" ({output} on {channel})" if data.m * data.l > 1 else ""
+    return Finding("largest correlation of residuals and inputs", f"{largest:.2f}{place}", largest <= CORRELATED)
 
 
 def _delays(model: Any, data: Data) -> list[Finding]:
     """Say where inputs act later than the lags that the model has."""
-    reach = getattr(model, "nk", None)
-    if reach is None:
+    if not hasattr(model, "nk"):
         return []
-    delays = np.zeros(data.m, dtype=int)
-    for bases in (linear(data), tuple(f.basis for f in model.nonlinearities)):
-        try:  # what acts through an even function shows no delay in a linear model
-            delays = np.maximum(delays, sharp_delays(LagSums(Blocks.of(data), bases)))
-        except OptidError:
-            return []
-    late = [(name, k) for name, k, first, b in zip(data.inputs, delays, reach, model.b) if k >= first + len(b)]
-    shown = ", ".join(f"{name} acts after {k} samples" for name, k in late)
-    return [Finding("delay", shown or "within the lags", not late)]
+    delays = [delay for delay in shown_delays(model, data) if delay is not None]
+    if len(delays) < 2:
+        return []
+    late = [f"{name} acts after {k} samples" for name, k, first, b in zip(
+        data.inputs, np.max(delays, axis=0), model.nk, model.b) if k >= first + len(b)]
+    return [Finding("delay", ", ".join(late) or "within the lags", not late)]
 
 
 def _ranges(model: Any, data: Data) -> list[Finding]:
-    found = []
-    for function in static_functions(model):
-        if function.is_linear:
-            continue
-        try:
-            samples = function.samples(data)
-        except OptidError:
-            continue
-        share = np.count_nonzero(function.nonlinearity.basis.is_outside(samples)) / max(
-            int(np.sum(~np.isnan(samples))), 1)
-        found.append((share, function.name))
+    found = [(share, f.name) for f, _, share in shares_outside(model, data) if not f.is_linear]
     if not found:
         return []
     share, name = max(found)
@@ -193,8 +164,8 @@ def _by_block(data: Data, runs: Sequence[Array]) -> Array:
     for parts in blocks.parts:
         error = np.vstack([(runs[p.experiment] - data.experiments[p.experiment].y)[p.first : p.last] for p in parts])
         here = np.isfinite(error)
-        found.append(pooled_fit(np.sum(np.where(here, error, 0.0) ** 2, axis=0)[None],
-                                (variance * here.sum(axis=0))[None]) if here.any() else -np.inf)
+        energy, measure = np.sum(np.where(here, error, 0.0) ** 2, axis=0), variance * here.sum(axis=0)
+        found.append(pooled_fit(energy[None], measure[None]) if here.any() else -np.inf)
     return np.array(found)
 
 

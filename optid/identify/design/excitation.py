@@ -14,15 +14,8 @@ from optid.bases import Bases, FeedbackBases
 from optid.data.channels import count_levels
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError, nearest
+from optid.identify.design import rules
 from optid.identify.design.response import FrequencyResponse, frequency_response
-from optid.identify.design.rules import (
-    FEW_LEVELS,
-    Check,
-    check_condition,
-    check_feedback,
-    check_levels,
-    check_lines,
-)
 from optid.statistics.expansion import Expansion, expand
 from optid.statistics.hankel import hankel_statistics
 
@@ -41,13 +34,9 @@ zone and noise."""
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """An excitation to be applied, and what may be expected of a record taken with it.
+    """An excitation (N, m) of a kind, read-only, and what may be expected of a record taken with it.
 
     Attributes:
-        u: (N, m) inputs, read-only.
-        dt: sampling time.
-        inputs: names of the inputs.
-        kind: "multisine", "chirp", "noise" or "levels".
         condition: expected condition number of the windows of the expanded regressor, columns scaled.
         rows: samples of a window.
         functions: signals in the expanded regressor.
@@ -66,7 +55,7 @@ class Excitation:
     functions: int
     band: tuple[float, float]
     outputs: tuple[float, ...]
-    checks: tuple[Check, ...]
+    checks: tuple[rules.Check, ...]
     how: str
 
     def __str__(self) -> str:
@@ -134,7 +123,7 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     measured = frequency_response(like)
     # held levels have the spectrum that holding gives them
     limits = (0.0, 0.5 / (hold * like.dt)) if kind == "levels" else _band(band, measured)
-    few = FEW_LEVELS if levels is None else 0  # who asks for a number of levels is not warned of it
+    few = rules.FEW_LEVELS if levels is None else 0  # who asks for a number of levels is not warned of it
     top = 0.9 * float(measured.frequency[-1])
 
     def weight(c: int, frequency: Array) -> Array:
@@ -142,18 +131,15 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         return 1 / np.maximum(gain / gain.max(), 1 / BOOST)
 
     def realised(draw: int) -> Excitation:
-        columns = []
-        for c, (low, high) in enumerate(ranges):
-            x = _signal(kind, n, (low, high), like.dt, limits, partial(weight, c) if shaped else None, hold, periods,
-                        seed + draw * like.m + c)
-            if kind == "chirp":
-                x = np.roll(x, c * n // (SWEEPS * like.m))  # inputs that sweep in step could not be distinguished
-            if levels is not None:
-                step = (high - low) / (levels - 1)
-                x = low + step * np.round((x - low) / step)
-            columns.append(x)
-        return _expected(np.column_stack(columns), kind, like, measured, limits, basis, feedback_basis, rows, few,
-                         seed + draw)
+        u = np.column_stack([_signal(kind, n, span, like.dt, limits, partial(weight, c) if shaped else None, hold,
+                                     periods, seed + draw * like.m + c) for c, span in enumerate(ranges)])
+        if kind == "chirp":  # inputs that sweep in step could not be distinguished
+            u = np.column_stack([np.roll(x, c * n // (SWEEPS * like.m)) for c, x in enumerate(u.T)])
+        if levels is not None:
+            low, high = np.transpose(ranges)
+            step = (high - low) / (levels - 1)
+            u = low + step * np.round((u - low) / step)
+        return _expected(u, kind, like, measured, limits, basis, feedback_basis, rows, few, seed + draw)
 
     while True:
         draws = map(realised, range(1 if kind == "chirp" else candidates))
@@ -185,7 +171,6 @@ def _check(kind: str, band: Any, shaped: bool, **counts: int | None) -> None:
 
 
 def _ranges(like: Data, amplitude: Any) -> list[tuple[float, float]]:
-    """Return (low, high) of every input."""
     try:
         given = np.transpose(like.ranges()) if amplitude is None else np.asarray(amplitude, dtype=float)
         return [(float(low), float(high)) for low, high in np.broadcast_to(given, (like.m, 2))]
@@ -235,35 +220,29 @@ def _signal(kind: str, n: int, span: tuple[float, float], dt: float, band: tuple
 
 def _expected(u: Array, kind: str, like: Data, measured: FrequencyResponse, band: tuple[float, float], basis: Bases,
               feedback_basis: FeedbackBases, rows: int, few: int, seed: int) -> Excitation:
-    """Predict what a record taken with u (N, m) would be like and hold it against the rules.
-
-    Without functions of the outputs the condition number is that of the designed signal itself, so it holds for every
-    record taken with it. Otherwise the outputs are predicted (`_predicted`).
-    """
+    """Predict what a record taken with u (N, m) would be like and hold it against the rules."""
     y = _predicted(u, like, measured, seed)
     record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)  # functions of outputs that are nearly linear: `check_feedback`
         expansion = expand(record, basis, feedback_basis)
     condition = expanded_condition(record, expansion, rows)
-    checks = [check_levels(name, u[:, c], expansion.inputs[c], few) for c, name in enumerate(like.inputs)]
-    checks += [check_lines(name, [u[:, c]], expansion.inputs[c], rows) for c, name in enumerate(like.inputs)]
-    checks += [check_feedback(like.outputs[family.output], family.share) for family in expansion.feedback]
-    checks.append(check_condition(condition))
+    channels = list(zip(like.inputs, u.T, expansion.inputs))
+    checks = (*(rules.check_levels(name, x, one, few) for name, x, one in channels),
+              *(rules.check_lines(name, [x], one, rows) for name, x, one in channels),
+              *(rules.check_feedback(like.outputs[family.output], family.share) for family in expansion.feedback),
+              rules.check_condition(condition))
     how = "from the designed signal itself, which the plant does not change"
     if expansion.feedback:
         how = (f"from the designed signal and outputs predicted through the frequency response of "
                f"{like.name or 'the record'} ({measured.segments} segments) with its disturbance; a plant that is far "
                "from linear will differ")
     return Excitation(u, like.dt, like.inputs, kind, condition, rows, expansion.p + expansion.q, band,
-                      tuple(float(s) for s in y.std(axis=0)), tuple(checks), how)
+                      tuple(float(s) for s in y.std(axis=0)), checks, how)
 
 
 def _predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> Array:
-    """Predict the outputs (N, l) in the steady state, linearly, with a disturbance of the measured spectrum.
-
-    The mean of the outputs is that of the record.
-    """
+    """Predict the outputs (N, l) about the mean of the record: steady state, linear, with the measured disturbance."""
     n = len(u)
     frequency: Array = np.arange(1, n // 2 + 1) / (n * like.dt)
     spectrum = np.fft.rfft(u - u.mean(axis=0), axis=0)[1:]
@@ -280,10 +259,8 @@ def _predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> 
 def expanded_condition(data: Data, expansion: Expansion, rows: int) -> float:
     """Return the condition number of all windows of so many samples of the expanded signals, columns scaled.
 
-    It is that about their means, estimated in the 1-norm; inf when the windows are singular.
-
-    Raises:
-        RankError: no complete window.
+    It is that about their means, estimated in the 1-norm; inf when the windows are singular. A record without a
+    complete window is a `RankError`.
     """
     count = expansion.p + expansion.q
     return hankel_statistics(data.records, rows, lambda raw: expansion(raw)[:, :count], names=expansion.names[:count],

@@ -50,12 +50,9 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
     """Measure the frequency response by averaged spectra (Welch 1967; Bendat and Piersol, Random Data, for coherence).
 
     Hann windows that overlap by half; segments that touch a missing sample are left out; experiments are averaged.
-    G = S_yu S_uu^-1 at every frequency.
-
-    Args:
-        data: the record.
-        segment: samples of a segment; when not given a quarter of the longest experiment (less with four inputs or
-            more), and at least 32. Resonances narrower than its inverse are flattened, and leave disturbance behind.
+    G = S_yu S_uu^-1 at every frequency. A segment has a quarter of the samples of the longest experiment when it is not
+    given (less with four inputs or more), and at least 32. Resonances narrower than its inverse are flattened, and
+    leave disturbance behind.
 
     Raises:
         StructureError: a segment of fewer than 8 samples.

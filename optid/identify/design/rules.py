@@ -19,8 +19,7 @@ from optid.statistics.hankel import complete_runs
 Severity = Literal["fine", "warning", "error"]
 
 FEW_LEVELS = 20  # below this many distinct values a curve between them is interpolation, not identification
-HIDDEN, DOMINANT = 1e-3, 1e-2
-"""Share of the variance beside a few sinusoids that is noise on a singular record, or a weak excitation."""
+HIDDEN, DOMINANT = 1e-3, 1e-2  # share of the variance beside a few sinusoids: noise on a singular record, or weak
 WORST_CONDITION = 1e7  # condition number beyond which the estimates keep less than half of their digits
 
 LONGEST = 4096  # samples looked at; more would tell nothing new about a few lines
@@ -31,13 +30,9 @@ JOINT, STEPS = 6, 3
 
 @dataclass(frozen=True)
 class Check:
-    """What one rule says of one channel or record.
+    """What one rule says of one channel or record: the number that was measured, the finding with its remedy.
 
-    Attributes:
-        rule: "levels", "lines", "feedback", "excitation" or "instruments".
-        number: what was measured.
-        severity: "fine", "warning" or "error".
-        sentence: the finding with its remedy.
+    The rules are "levels", "lines", "feedback", "excitation" and "instruments".
     """
 
     rule: str
@@ -50,15 +45,10 @@ class Check:
 
 
 def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Check:
-    """Hold the number of distinct values of an input against the functions of its basis.
+    """Hold the number of distinct values of an input (N,), none missing, against the functions of its fitted basis.
 
-    n levels determine n - 1 functions besides the constant; a binary signal shows a straight line whatever f is.
-
-    Args:
-        name: of the input.
-        u: (N,) samples without missing ones.
-        basis: the fitted basis.
-        few: number of values below which the curve between them counts as interpolation.
+    n levels determine n - 1 functions besides the constant; a binary signal shows a straight line whatever f is. With
+    fewer than `few` the curve between them counts as interpolation.
     """
     severity, sentence = "fine", f"input {name!r} takes many levels"
     levels = count_levels(u[:4096])
@@ -91,9 +81,7 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
         records: (N,) samples per experiment; NaN = missing. The longest stretch of each without one is looked at.
         basis: the fitted basis.
         lags: regressors per function: block rows of a subspace method, coefficients of B of an equation-error one.
-
-    Returns:
-        The check; its number is the regressors excited, by all experiments together at most.
+            The number of the check is the regressors excited, by all experiments together at most.
     """
     needed = lags * basis.size
     most = max(1, -(-(needed - 1) // 2) - 1)  # with one line more there are enough
@@ -122,14 +110,10 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
 
 
 def check_feedback(name: str, share: float) -> Check:
-    """Hold the spread of feedback functions that is orthogonal to 1 and y against their whole spread.
+    """Hold the share of the spread of feedback functions of an output that is orthogonal to 1 and y against limits.
 
     A linear feedback cannot be told from the dynamics: (A, B, linear part of E g) and (A - L C, B - L D, that part
-    + L y) behave alike for every L.
-
-    Args:
-        name: of the output.
-        share: spread outside 1 and y over the spread of the functions (`optid.statistics.expansion.Feedback.share`).
+    + L y) behave alike for every L. See `optid.statistics.expansion.Feedback.share`.
     """
     severity, remedy = "fine", ""
     if share < LINEAR:
@@ -148,10 +132,9 @@ def check_condition(number: float) -> Check:
     Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input. The number
     is inf where they are singular.
     """
-    if number > WORST_CONDITION:
-        return Check("excitation", number, "warning", f"the expanded regressor is poorly excited: condition number "
-                     f"{number:.1e}; use fewer functions or lags, or a richer input")
-    return Check("excitation", number, "fine", f"condition number of the expanded regressor: {number:.2g}")
+    return _held("excitation", number, "condition number of the expanded regressor: ",
+                 f"the expanded regressor is poorly excited: condition number {number:.1e}; use fewer functions or "
+                 "lags, or a richer input")
 
 
 def check_instruments(number: float) -> Check:
@@ -159,11 +142,14 @@ def check_instruments(number: float) -> Check:
 
     With instruments that do not reach the regressors it grows with the root of the number of samples.
     """
-    if number > WORST_CONDITION:
-        return Check("instruments", number, "warning", f"the instruments hardly reach the regressors: cond(R11) = "
-                     f"{number:.1e}. Use augmented instruments (hammerstein_ss.asivid), fewer block rows or functions, "
-                     "or an input with more lines and levels")
-    return Check("instruments", number, "fine", f"cond(R11) = {number:.2g}")
+    return _held("instruments", number, "cond(R11) = ",
+                 f"the instruments hardly reach the regressors: cond(R11) = {number:.1e}. Use augmented instruments "
+                 "(hammerstein_ss.asivid), fewer block rows or functions, or an input with more lines and levels")
+
+
+def _held(rule: str, number: float, words: str, warning: str) -> Check:
+    poor = number > WORST_CONDITION
+    return Check(rule, number, "warning" if poor else "fine", warning if poor else f"{words}{number:.2g}")
 
 
 def many_lines(x: Array, most: int, tolerance: float) -> bool:

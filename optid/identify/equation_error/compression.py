@@ -32,11 +32,10 @@ from optid.structures.rank_one import RankOne
 
 @dataclass(frozen=True)
 class EquationError:
-    """Least squares in z with the names needed to read it.
+    """Least squares in z, ``‖R z - s‖² + remainder`` with one rank-one block per input, and the names to read it.
 
     Attributes:
         statistics: of one pass over the record.
-        problem: ``‖R z - s‖² + remainder`` with one rank-one block per input.
         columns: (n_columns, l) position in z of every coefficient of the regressor.
         meta: dt, names and units for the model.
         units: from those of the problem (`optid.program.units`) to those of the record.
@@ -136,12 +135,8 @@ class EquationError:
               gauge: str, flip: bool = True) -> HammersteinTF:
         """Build the model in the units of the record from one (mu, b) per input, b of shape `b_shape`.
 
-        Args:
-            values: holds ``a`` and ``offset``.
-            mus: coefficients of the nonlinearities, one array per input.
-            bs: numerator coefficients, one array per input.
-            gauge: the gauge to report in.
-            flip: make the first non-zero of every b positive.
+        The values hold ``a`` and ``offset``; the gauge is the one to report in, and `flip` makes the first non-zero of
+        every b positive.
         """
         ny, na = self.layout.l, self.layout.na
         a = np.asarray(values.get("a", np.zeros(0)))
@@ -166,8 +161,8 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
         data: the record.
         na: order of A.
         nb: number of numerator coefficients, one per input or one for all.
-        nk: delay in samples, one per input or one for all.
-        basis: one basis for all inputs or one per input; a basis without interval takes the range of its input.
+        nk: delay in samples, likewise.
+        basis: likewise; a basis without interval takes the range of its input.
         ridge: weight of ``‖Theta‖²``.
         curvature: weight of the integral of ``f''²`` summed over the columns of Theta.
         weights: nonnegative row weights per experiment, or None.

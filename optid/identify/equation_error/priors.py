@@ -6,7 +6,6 @@ variance of the noise, maximise the likelihood of the outputs with all coefficie
 flat prior. The triangular factor of the record is all that this needs.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -20,46 +19,32 @@ from optid.statistics import Statistics
 DECAYS, NOISES = (0.3, 0.6, 0.9), (-4.0, -1.0)
 """Decays per lag, and logarithms of the noise, from which the likelihood is climbed; from small sizes a climb may end
 where nothing but noise is left."""
-
-FLOOR = 1e-9
-"""Variance, as a share of the largest, that no coefficient falls below: beyond it K would be singular."""
-
+FLOOR = 1e-9  # variance, as a share of the largest, that no coefficient falls below: beyond it K would be singular
 BOUNDS = {"size": (-25.0, 12.0), "decay": (0.05, 0.998), "correlation": (-0.98, 0.98), "noise": (-30.0, 3.0)}
 """Of logarithms of variances relative to the output's, decays and correlations."""
 
 
-def tuned_correlated(lags: int, decay: float, correlation: float = 0.0) -> Array:
-    """Return K[i, j] = decay^max(i, j), "tc"."""
+KERNELS = ("tc", "dc", "ss")
+
+
+def kernel(word: str, lags: int, decay: float, correlation: float = 0.0) -> Array:
+    """Return K[i, j], (lags, lags): "tc", tuned and correlated, decay^max(i, j).
+
+    "dc", diagonal and correlated, decay^((i + j) / 2) correlation^|i - j|; "ss", the second-order stable spline,
+    3 (d^(i + j + max) / 2 - d^(3 max) / 6) with d^3 = decay.
+    """
     i = np.arange(1, lags + 1)
-    return decay ** np.maximum.outer(i, i).astype(float)
-
-
-def diagonal_correlated(lags: int, decay: float, correlation: float = 0.0) -> Array:
-    """Return K[i, j] = decay^((i + j) / 2) correlation^|i - j|, "dc"."""
-    i = np.arange(1, lags + 1)
-    return decay ** (np.add.outer(i, i) / 2) * correlation ** np.abs(np.subtract.outer(i, i))
-
-
-def stable_spline(lags: int, decay: float, correlation: float = 0.0) -> Array:
-    """Return the second-order stable spline 3 (d^(i + j + max) / 2 - d^(3 max) / 6) with d^3 = decay, "ss"."""
-    i = np.arange(1, lags + 1)
-    most = np.maximum.outer(i, i)
-    return 3 * (decay ** ((np.add.outer(i, i) + most) / 3.0) / 2 - decay ** most.astype(float) / 6)
-
-
-KERNELS: dict[str, Callable[..., Array]] = {
-    "tc": tuned_correlated, "dc": diagonal_correlated, "ss": stable_spline}
+    both, most = np.add.outer(i, i), np.maximum.outer(i, i).astype(float)
+    if word == "tc":
+        return decay**most
+    if word == "dc":
+        return decay ** (both / 2) * correlation ** np.abs(np.subtract.outer(i, i))
+    return 3 * (decay ** ((both + most) / 3.0) / 2 - decay**most / 6)
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of the coefficients before the record.
-
-    Attributes:
-        columns: (n,) columns of the regressor it is about.
-        covariance: (n, n) of their coefficients.
-        noise: (l,) variance of the noise of every output.
-    """
+    """Covariance (n, n) of the coefficients of columns (n,) of the regressor; variance (l,) of the noise of outputs."""
 
     columns: np.ndarray
     covariance: Array
@@ -68,8 +53,7 @@ class Prior:
     def rows(self, places: np.ndarray) -> Array:
         """Return the rows that the prior adds to the least squares in z, those of every output below one another.
 
-        Args:
-            places: (n_columns, l) position in z of every coefficient of the regressor.
+        The places (n_columns, l) are the positions in z of every coefficient of the regressor.
         """
         inverse = solve_triangular(np.linalg.cholesky(self.covariance), np.eye(self.columns.size), lower=True)
         found = np.zeros((self.noise.size, self.columns.size, places.size))
@@ -91,12 +75,7 @@ def families(layout: Layout) -> list[list[np.ndarray]]:
 
 
 def likeliest(word: str, statistics: Statistics) -> Prior:
-    """Return the prior of a kernel under which the record is most likely.
-
-    Args:
-        word: one of `KERNELS`.
-        statistics: of the record.
-    """
+    """Return the prior of a kernel, one of `KERNELS`, under which the record is most likely."""
     from scipy.optimize import minimize
 
     layout, n = statistics.layout, statistics.layout.n_columns
@@ -116,10 +95,10 @@ def likeliest(word: str, statistics: Statistics) -> Prior:
     def covariance(x: Array) -> Array:
         found, at = np.zeros((n - 1, n - 1)), 0
         for group, size, own in zip(groups, most, x[: each * len(groups)].reshape(-1, each)):
-            kernel = size * np.exp(own[0]) * KERNELS[word](len(group[0]), *own[1:])
-            kernel += FLOOR * kernel[0, 0] * np.eye(len(kernel))
+            block = size * np.exp(own[0]) * kernel(word, len(group[0]), *own[1:])
+            block += FLOOR * block[0, 0] * np.eye(len(block))
             for part in group:
-                found[at : at + len(part), at : at + len(part)] = kernel
+                found[at : at + len(part), at : at + len(part)] = block
                 at += len(part)
         return found
 

@@ -39,13 +39,9 @@ CLOSED = 1e-9  # relative gap at which a convex loss needs no further pass
 
 
 def parse_loss(loss: str) -> tuple[str, float]:
-    """Read "squares", "huber", "huber:1.5" or "l1".
+    """Return the kind and the threshold, in robust standard deviations, of "squares", "huber", "huber:1.5" or "l1".
 
-    Returns:
-        The kind and its threshold in robust standard deviations.
-
-    Raises:
-        StructureError: unknown loss or impossible threshold.
+    An unknown loss or an impossible threshold is a `StructureError`.
     """
     kind, _, number = str(loss).partition(":")
     if kind not in ("squares", "huber", "l1"):
@@ -70,7 +66,7 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
         data: the record.
         pose: states the programme of a compressed record.
         convex: whether a dual bound exists.
-        structure: arguments of `compress`: na, nb, nk, basis, ridge, curvature and prior.
+        structure: of `compress`.
     """
     kind, threshold = parse_loss(loss)
     structure["degree"] = 1 if kind == "l1" else 2
@@ -99,8 +95,8 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
         return replace(pose(compressed), start=start, certify=None, scale=scale), weights
 
     while True:
-        if used.weights is not None:
-            problem = compress(data, weights=used.weights, **structure)
+        if used.count:
+            problem = compress(data, weights=used.only(np.ones(e.n_samples) for e in data.experiments), **structure)
             base = pose(problem)
             scale = base.scale
         program, weights, spread, width = base, [], 0.0, 0.0
@@ -121,7 +117,8 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
         if not solution.has_point:
             return None
         sizes = _sizes(used.residuals(problem, solution))
-        if kind == "l1" and _steady(sizes, weights):
+        # no residual has outgrown by much the weight it was given
+        if kind == "l1" and all(float(np.nanmax(2 * w * r, initial=0.0)) < 1.03 for w, r in zip(weights, sizes)):
             width = max(width / 3, spread * threshold)  # the kink sharpens as the rounded problem is solved
         found = _evidence(program, solution, sizes, weights, kind, width, convex)
         stalled = final and best - found.objective <= 1e-12 * max(abs(found.objective), 1e-300)
@@ -147,26 +144,24 @@ class _Rows:
         self._examined = [wild.copy() for wild in self._wild]
 
     @property
-    def weights(self) -> list[np.ndarray] | None:
-        """One for every row that counts, zero for the others; None where all of them count."""
-        return self.only(np.ones(len(wild)) for wild in self._wild) if self._count() else None
+    def count(self) -> int:
+        """Number of wild readings."""
+        return sum(int(wild.sum()) for wild in self._wild)
 
     def only(self, weights: Iterable[np.ndarray]) -> list[np.ndarray]:
         """Return weights with zeros in the rows that do not count."""
-        return [w * ~self._touched(wild) for w, wild in zip(weights, self._wild)]
+        return [w * ~touched for w, touched in zip(weights, self._touched())]
 
-    def _count(self) -> int:
-        return sum(int(wild.sum()) for wild in self._wild)
-
-    def _touched(self, wild: np.ndarray) -> np.ndarray:
+    def _touched(self) -> list[np.ndarray]:
         """Tell the rows whose output, or one of its past outputs, is wild."""
-        return np.convolve(np.any(wild, axis=1), np.ones(self._layout.na + 1))[: len(wild)] > 0
+        return [np.convolve(np.any(wild, axis=1), np.ones(self._layout.na + 1))[: len(wild)] > 0
+                for wild in self._wild]
 
     def residuals(self, problem: EquationError, solution: Solution) -> list[np.ndarray]:
         """Return the one-step residuals (N, l), NaN in rows that do not count."""
         errors = residuals(self._data, self._layout, problem.regression(solution.values))
-        for error, wild in zip(errors, self._wild):
-            error[self._touched(wild)] = np.nan
+        for error, touched in zip(errors, self._touched()):
+            error[touched] = np.nan
         return errors
 
     def leave_out(self, errors: list[np.ndarray], theta: np.ndarray) -> bool:
@@ -176,7 +171,7 @@ class _Rows:
         found = find_additive_outliers(errors, theta[: na * l].reshape(na, l, l), np.maximum(spread, 1e-300))
         found = [new & ~wild & ~np.isnan(e.y) for new, wild, e in zip(found, self._wild, self._data.experiments)]
         more = sum(int(new.sum()) for new in found)
-        if not 0 < more <= MOST * self._data.n_samples - self._count():
+        if not 0 < more <= MOST * self._data.n_samples - self.count:
             return False
         for wild, new in zip(self._wild, found):
             wild |= new
@@ -192,11 +187,6 @@ class _Rows:
                 if any(part.size for part in samples):
                     found[f"{word} of {name}"] = list_samples(samples)
         return found
-
-
-def _steady(sizes: list[np.ndarray], weights: list[np.ndarray]) -> bool:
-    """Whether no residual has outgrown by much the weight it was given."""
-    return all(float(np.nanmax(2 * w * r, initial=0.0)) < 1.03 for w, r in zip(weights, sizes))
 
 
 def _sizes(errors: list[np.ndarray]) -> list[np.ndarray]:

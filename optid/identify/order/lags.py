@@ -42,12 +42,7 @@ class Lags:
 
 @dataclass(frozen=True)
 class LagScan:
-    """All structures that were compared.
-
-    Attributes:
-        candidates: in the order of the scan.
-        rows: rows that all of them share.
-    """
+    """All structures that were compared, in the order of the scan, on rows that they share."""
 
     candidates: tuple[Lags, ...]
     rows: int
@@ -75,7 +70,7 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
         data: the record; NaN = missing. All candidates use the rows of the largest one.
         bases: one basis per input, with an interval; `Linear` for an ARX model.
         na: largest number of output lags; fewer where the record is short.
-        nb: largest number of input lags; likewise.
+        nb: of input lags; likewise.
         nk: largest delay; likewise.
         test: a part held out, judged by the coefficients of `data`; None for none.
 
@@ -90,30 +85,30 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
         na, nb, nk = max(na - 1, 0), max(nb - 1, 1), max(nk - 1, 0)
     layout = Layout(na, (nb + nk,) * data.m, (0,) * data.m, tuple(bases), data.outputs, data.inputs)
     statistics = collect(data, layout)
-    change = _contraction(statistics)
-    other = None
+    change, held_out = _contraction(statistics), None
     if test is not None:
         long = [i for i, e in enumerate(test.experiments) if e.n_samples > layout.first_row]
         if not long:
             raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or "
                             "nothing.")
         part = accumulate(test.select(experiments=long), layout)  # it need not determine the parameters
-        other = change.T @ part.gram @ change, part.rows
-    judge = partial(_judge, layout, statistics.root @ change, statistics.rows, other)
+        held_out = change.T @ part.gram @ change / part.rows
+    judge = partial(_judge, layout, statistics.root @ change, statistics.rows, held_out)
     pairs = [(b, k) for k in range(nk + 1) for b in range(1, nb + 1)]
     found = [judge(a, (b,) * data.m, (k,) * data.m) for a in range(na + 1) for b, k in pairs]
     if data.m > 1:
         best = min(found, key=lambda c: c.bic)
         for c in range(data.m):
-            found += [judge(best.na, _put(best.nb, c, b), _put(best.nk, c, k)) for b, k in pairs]
+            found += [judge(best.na, (*best.nb[:c], b, *best.nb[c + 1 :]), (*best.nk[:c], k, *best.nk[c + 1 :]))
+                      for b, k in pairs]
             best = min(found, key=lambda c: c.bic)
         found += [judge(a, best.nb, best.nk) for a in range(na + 1)]
     return LagScan(tuple(dict.fromkeys(found)), statistics.rows)
 
 
-def _judge(layout: Layout, root: Array, rows: int, other: tuple[Array, int] | None, na: int, nb: tuple[int, ...],
+def _judge(layout: Layout, root: Array, rows: int, held_out: Array | None, na: int, nb: tuple[int, ...],
            nk: tuple[int, ...]) -> Lags:
-    """Fit one structure by the root (n, n) of the largest one; `other` is the Gram matrix of the part held out."""
+    """Fit one structure by the root (n, n) of the largest one, judge it by the moments of the part held out."""
     l, lags = layout.l, layout.nb[0]  # noqa: E741
     past = layout.na * l
     inputs = [past + c * lags + lag for c in range(layout.m) for lag in range(nk[c], nk[c] + nb[c])]
@@ -127,14 +122,10 @@ def _judge(layout: Layout, root: Array, rows: int, other: tuple[Array, int] | No
     k = l * columns.size + sum(basis.size - 1 for basis in layout.bases)
     likelihood = rows * float(np.linalg.slogdet(covariance)[1])
     fit = float("nan")
-    if other is not None:
-        gram, count = other
-        both = np.concatenate([columns, targets])
-        gram = gram[np.ix_(both, both)]
-        weights = np.vstack([-theta, np.eye(l)])
-        mean = gram[columns.size - 1, columns.size :] / count
-        spread = np.diag(gram)[columns.size :] / count - mean**2
-        errors = np.maximum(np.einsum("ij,ik,kj->j", weights, gram, weights), 0) / count
+    if held_out is not None:
+        both, weights = np.concatenate([columns, targets]), np.vstack([-theta, np.eye(l)])
+        spread = held_out[targets, targets] - held_out[constant, targets] ** 2
+        errors = np.maximum(np.einsum("ij,ik,kj->j", weights, held_out[np.ix_(both, both)], weights), 0)
         fit = float(100 * np.mean(1 - np.sqrt(errors / np.maximum(spread, 1e-300))))
     aic, aicc, bic = criteria(likelihood, k, rows, l)
     return Lags(na, nb, nk, float(aic), float(aicc), float(bic), fit)
@@ -166,10 +157,5 @@ def residual_weights(statistics: Statistics) -> Array:
     """Return what puts every output (l,) into units of its residual; one where there is one output."""
     n, root = statistics.layout.n_columns, statistics.root
     rest, energy = np.sum(root[n:, n:] ** 2, axis=0), np.sum(root[:, n:] ** 2, axis=0)
-    if rest.size == 1:
-        return np.ones(1)
-    return 1 / np.sqrt(np.maximum(np.maximum(rest / statistics.rows, 1e-24 * energy), 1e-300))
-
-
-def _put(values: tuple[int, ...], c: int, value: int) -> tuple[int, ...]:
-    return (*values[:c], value, *values[c + 1 :])
+    size = np.maximum(np.maximum(rest / statistics.rows, 1e-24 * energy), 1e-300)
+    return np.ones(1) if rest.size == 1 else 1 / np.sqrt(size)

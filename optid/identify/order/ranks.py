@@ -25,25 +25,22 @@ from optid.statistics.hankel import HankelStatistics, hankel_statistics
 from optid.statistics.rq import rq
 
 LEVEL = 0.01
-SPAN = 10.0
-"""The level of the test is min(0.01, 10 / N): wrong decisions become rarer as the record grows."""
-
-FLOOR = 10.0
-"""Singular values below this many roundings of the outputs, times the size of R22, are zero."""
+SPAN = 10.0  # the level of the test is min(0.01, 10 / N): wrong decisions become rarer as the record grows
+FLOOR = 10.0  # singular values below this many roundings of the outputs, times the size of R22, are zero
 
 Positions = Sequence[int] | NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class RankTest:
-    """Singular values of R22 and what they would be, were the order n0 = 0, 1, ..., r - 1.
+    """Singular values (r,) of R22 / sqrt(j) and what they would be, were the order n0 = 0, 1, ..., r - 1.
+
+    They are in units of the output, or without unit where the outputs are scaled.
 
     Attributes:
-        singular_values: (r,) of R22 / sqrt(j), in units of the output, or without unit where the outputs are scaled.
         statistics: (r,) T(n0), the sum of the squares of those after the first n0.
-        expected: (r,) expectation of T(n0) if the order is n0; it falls like 1 / j.
-        thresholds: (r,) quantile of T(n0) at the level if the order is n0.
-        p_values: (r,) probability of a larger T(n0) if the order is n0.
+        expected, thresholds, p_values: (r,) expectation of T(n0) if the order is n0, which falls like 1 / j; its
+            quantile at the level; the probability of a larger one.
         floor: singular values up to here are rounding.
         level: probability with which a true order is to be rejected.
         windows: number j of windows.
@@ -93,9 +90,8 @@ class RankTest:
     def ratio_order(self) -> int:
         """The i with the largest s_i / s_{i+1}, at most half of the singular values; 0 when all are rounding."""
         size = self.singular_values.size
-        if self.singular_values[0] <= self.floor or size < 2:
-            return 0
-        return largest_gap(self.singular_values, min(size - 2, size // 2), self.floor)
+        rounding = self.singular_values[0] <= self.floor or size < 2
+        return 0 if rounding else largest_gap(self.singular_values, min(size - 2, size // 2), self.floor)
 
     @property
     def reason(self) -> str:
@@ -124,17 +120,11 @@ def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, in
                offset: bool = True, level: float | None = None) -> RankTest:
     """Test the ranks of the projected outputs; several outputs count relative to their sizes.
 
-    Args:
-        records: raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs.
-        expansion: the signals.
-        alpha: future block rows; the past has as many, and so has the reach of the serial correlation.
-        instruments: as in `Expansion.positions`; noise of any colour leaves past and future inputs valid, and functions
-            of outputs simulated from them.
-        offset: whether a constant is among instruments and regressors.
-        level: as in `rank_test`.
-
-    Raises:
-        RankError: too short a record, or instruments that do not reach the regressors.
+    The records are raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs. The past
+    has as many block rows as the future, alpha, and so has the reach of the serial correlation. Instruments are as in
+    `Expansion.positions`, with a constant among them and the regressors where there is an offset: noise of any colour
+    leaves past and future inputs valid, and functions of outputs simulated from them. Level and errors are as in
+    `rank_test`.
     """
     statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
@@ -152,11 +142,11 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
         statistics: moments of windows of `rows` + reach samples; the reach is the largest lag between windows whose
             correlation counts. The future block rows suffice: noise windows further apart share no sample.
         instruments: positions of Z in the first `rows` block rows (`HankelStatistics.at`; 0 is the constant).
-        regressors: positions of Phi there.
-        outputs: positions of Y there.
+        regressors: of Phi there.
+        outputs: of Y there.
         rows: block rows of the instruments, regressors and outputs together.
         level: probability of rejecting the true order; min(0.01, 10 / j) when not given.
-        largest: largest order to be chosen, (alpha - 1) l for alpha future block rows of l outputs.
+        largest: order to be chosen, (alpha - 1) l for alpha future block rows of l outputs.
         scale: (y,) size of every row of Y, by which it is divided: several outputs in different units; None for ones.
 
     Raises:

@@ -17,18 +17,16 @@ from optid.arrays import Array
 from optid.statistics.expansion import Expansion
 from optid.statistics.hankel import HankelStatistics
 
-ROUNDING = 1e-10
-"""Share of the moments added to their diagonal: prediction errors below its root count as none."""
+ROUNDING = 1e-10  # share of the moments added to their diagonal: prediction errors below its root count as none
 
 
 @dataclass(frozen=True, eq=False)
 class StateCriteria:
-    """Criteria by number of states n = 0, 1, ..., k - 1; smaller is better, but for the fit.
+    """Criteria (k,) by number of states n = 0, 1, ..., k - 1; smaller is better, but for the fit.
 
     Attributes:
-        aic, aicc, bic: (k,) Akaike's criterion, with its small-sample correction, and Schwarz's.
-        fit: (k,) fit in % on the part held out, mean over the outputs and over 1, ..., alpha samples ahead; NaN where
-            nothing was.
+        aic, aicc, bic: Akaike's criterion, with its small-sample correction, and Schwarz's.
+        fit: in % on the part held out, mean over the outputs and over 1, ..., alpha samples ahead; NaN without one.
         windows: number of prediction errors per output and horizon.
     """
 
@@ -55,15 +53,10 @@ def criteria(likelihood: Any, parameters: Any, samples: int, outputs: int) -> tu
 
 def state_criteria(statistics: HankelStatistics, expansion: Expansion, alpha: int, largest: int,
                    train: HankelStatistics | None = None, test: HankelStatistics | None = None) -> StateCriteria:
-    """Compare the orders 0 ... largest.
+    """Compare the orders 0 ... largest by moments of windows of at least 2 alpha samples, alpha past and future ones.
 
-    Args:
-        statistics: moments of windows of at least 2 alpha samples of the signals.
-        expansion: the signals.
-        alpha: block rows of the past and of the future.
-        largest: largest order.
-        train: the same of the part that is fitted, with the same centre; None for no hold-out.
-        test: the same of the part held out.
+    `train` are the moments of the part that is fitted, with the same centre, `test` those of the part held out; None
+    for no hold-out.
     """
     l = expansion.l  # noqa: E741
     covariances, j = _errors(statistics, statistics, expansion, alpha, largest), statistics.windows

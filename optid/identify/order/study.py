@@ -18,22 +18,19 @@ from optid.registry import Rendered
 from optid.statistics.expansion import Expansion, check_channels, expand
 from optid.statistics.hankel import hankel_statistics
 
-FEWEST, PER_ROW = 2, 1.5
-"""Block rows at least; windows per row of the longest windows that are wanted."""
+FEWEST, PER_ROW = 2, 1.5  # block rows at least; windows per row of the longest windows that are wanted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OrderStudy(Rendered):
-    """What `order` found; `print` it.
+    """What `order` found on the record named `data`; `print` it.
 
     Attributes:
-        data: name of the record.
         block_rows: future block rows.
         ranks: test of the singular values.
         states: criteria by number of states, on prediction errors.
         lags: scan of na, nb, nk, the best of which is recommended; None when `notes` says why.
-        nx: recommended number of states.
-        reasons: why.
+        nx: recommended number of states, for these reasons.
         notes: what weakens the result; each was also given as a DataWarning.
     """
 
@@ -107,9 +104,8 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
 def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:
     """Return the future block rows: as given, or 10, or more for a large order, or fewer on a short record.
 
-    Raises:
-        StructureError: fewer than 2, or not more than the order asked for per output.
-        RankError: an experiment shorter than three times the block rows, which is named.
+    Fewer than 2, or not more than the order asked for per output, are a `StructureError`; an experiment shorter than
+    three times the block rows, which is named, is a `RankError`.
     """
     alpha = check_integer(given, "block_rows", FEWEST) if given is not None else expansion.block_rows(
         records, nx, spans=3, per_row=PER_ROW, least=FEWEST)

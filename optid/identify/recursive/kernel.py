@@ -23,17 +23,11 @@ UNDETERMINED = 1e-12
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rotate(root: Array, row: Array, first: int, last: int, fade: float) -> float:
-    """Rotate a row into some rows of an upper triangular factor, which are multiplied by a factor before.
+    """Rotate a row into some rows of an upper triangular factor, which are multiplied by `fade` before.
 
-    Args:
-        root: (s, s) upper triangular, diagonal >= 0; changed in place.
-        row: (s,) what remains of it is orthogonal to the columns from `first` to `last`; changed in place.
-        first: first of these columns.
-        last: one past the last of them.
-        fade: root of the forgetting factor.
-
-    Returns:
-        Product of the cosines: (1 + phi^T P phi)^(-1/2) for a regressor phi and P after forgetting.
+    The root (s, s), diagonal >= 0, and the row (s,) change in place: what remains of the row is orthogonal to the
+    columns from `first` to `last` - 1. The product of the cosines is returned, (1 + phi^T P phi)^(-1/2) for a regressor
+    phi and P after forgetting.
     """
     kept, size = 1.0, row.size
     for i in range(first, last):
@@ -60,7 +54,7 @@ def absorb(
     root: Array, signals: Array, y: Array, source: NDArray[np.intp], lag: NDArray[np.intp], used: NDArray[np.bool_],
     weights: Array, forgetting: float, rows: int, innovations: Array, marks: NDArray[np.bool_], traced: Array,
 ) -> int:
-    """Rotate the rows of one stretch into the factor.
+    """Rotate the rows of one stretch into the factor, and return the number of rows used so far.
 
     Args:
         root: (n + l, n + l) upper triangular, diagonal >= 0; changed in place.
@@ -75,9 +69,6 @@ def absorb(
         innovations: (T, l) prediction errors before each update; entries of rows not used stay as they are.
         marks: (T,) samples after which the estimate is recorded.
         traced: (number of marks, n, l) the recorded estimates.
-
-    Returns:
-        Number of rows used so far.
     """
     n, l = source.size + 1, y.shape[1]  # noqa: E741 - the field's letter
     size, reach = n + l, len(y) - len(used)

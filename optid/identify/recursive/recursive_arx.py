@@ -11,6 +11,7 @@ arithmetic and does not lose symmetry or definiteness in long runs.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -23,15 +24,13 @@ from optid.data.channels import channel_fields, listed, sampling_time
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.recursive.estimates import Trace, past_coefficients, theta_matrices
-from optid.identify.recursive.intake import as_block, forgetting_factor, prior_factor
-from optid.identify.recursive.saved_state import SavedState
+from optid.identify.recursive.state import SavedState, as_block, forgetting_factor
 from optid.models import HammersteinTF
 from optid.models.layout import Layout
 from optid.models.nonlinearity import Nonlinearity
 from optid.statistics import Statistics
 from optid.statistics.blocks import check_inside, row_weights, used_rows
-from optid.statistics.factors import dependent_column
+from optid.statistics.factors import add_to_root, dependent_column
 from optid.structures.lifted_regression import leading_pairs, lifted_problem, positions
 from optid.structures.whitening import invert_triangular
 
@@ -41,12 +40,49 @@ SPLITS = ("whitened", "plain")
 COUNTS = ("samples", "candidates", "rows", "since_restart")
 
 
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """The estimate over time: theta (K, n, l) after `samples` (K,), NaN while the rows do not determine it.
+
+    Its rank-one factors are those of Luo, Algorithm 3.1 (Bai, Automatica 34, 1998); the innovations (N, l) are those of
+    every sample of the block.
+    """
+
+    layout: Layout
+    samples: Any
+    theta: Array
+    innovations: Array
+
+    @property
+    def a(self) -> Array:
+        """Coefficients of A over time: (K, na), or (K, na, l, l) for several outputs."""
+        return _past_coefficients(self.theta, self.layout)
+
+    def split(self, c: int = 0, beta: float = 1.0) -> tuple[Array, Array, Array]:
+        """Split Theta of input c by the plain SVD in the gauge of Algorithm 3.1: mu = beta s_1 u_1, b = v_1 / beta.
+
+        The gauge beta is not zero, and the first coefficient of b has its sign. Returns mu (K, P), b (K, nb l) and
+        s_2 / s_1 (K,), 0 where there is no second one.
+        """
+        if beta == 0:
+            raise StructureError("beta=0: the gauge is a number other than zero.")
+        known = np.asarray(np.isfinite(self.theta).all(axis=(1, 2)))
+        left, size, right = np.linalg.svd(_theta_matrices(self.theta[known], self.layout)[c], full_matrices=False)
+        sign = np.where(right[:, :1, 0] < 0, -1.0, 1.0)
+        second = size[:, 1] if size.shape[1] > 1 else np.zeros(len(size))
+        found = (beta * (sign * size[:, :1]) * left[:, :, 0], sign * right[:, 0] / beta,
+                 second / np.where(size[:, 0] > 0, size[:, 0], 1.0))
+        mu, b, ratio = (np.full((len(known), *part.shape[1:]), np.nan) for part in found)
+        mu[known], b[known], ratio[known] = found
+        return mu, b, ratio
+
+
 class RecursiveARX(SavedState):
     """A Hammerstein-ARX model that is updated as samples arrive.
 
     It is a state: `update` changes it. The estimate is over-parametrised, one matrix Theta_c per input; `model` splits
-    off the rank-one factors whenever it is asked. Nothing is forgotten while nothing is learned: a row that touches a
-    missing sample, or has weight zero, leaves the information as it is, while the lags move on.
+    off the rank-one factors. A row that touches a missing sample, or has weight zero, leaves the information as it is,
+    while the lags move on.
 
     Attributes:
         layout: the columns of phi.
@@ -103,38 +139,29 @@ class RecursiveARX(SavedState):
         self.dt = sampling_time(dt)
         self.input_units, self.output_units = names["input_units"], names["output_units"]
         self.samples = self.candidates = self.rows = 0
-        self.root = prior_factor(theta0, P0, self.layout)
+        self.root = _prior_factor(theta0, P0, self.layout)
         self.restart()
 
     @classmethod
     def like(cls, data: Data | Stream, *, basis: Any, **settings: Any) -> "RecursiveARX":
         """Start with the channels, units and sampling time of a record, and the range of its inputs as intervals.
 
-        Args:
-            data: the record, in raw units; its samples are not used (see `read`).
-            basis: as in the class; one without interval takes the range of its input.
-            settings: na, nb and the other arguments of the class.
-
-        Raises:
-            DataError: detrended or scaled data.
+        The samples are not used (see `read`); detrended or scaled data are a `DataError`. A basis without interval
+        takes the range of its input; the settings are na, nb and the other arguments of the class.
         """
         _check_raw(data)
         return cls(basis=fitted_bases(data, basis), inputs=data.inputs, outputs=data.outputs,
                    dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
-    # -- samples ---------------------------------------------------------------------------------------------------
-
     def update(self, u: ArrayLike, y: ArrayLike, weights: ArrayLike = 1.0) -> Array:
-        """Take in the next sample, or the next block of them.
+        """Take in the next sample, or the next block of them, and return the innovations y(t) - theta(t-1)^T phi(t).
+
+        They are (N, l), NaN where the row was not used and where the past did not determine the prediction.
 
         Args:
             u: (N, m) inputs, or (N,) for one input; one sample as (m,), or a number for one input. NaN = missing.
             y: (N, l) outputs, in the same way.
             weights: a(t) >= 0, one number or (N,); 0 leaves a row out.
-
-        Returns:
-            (N, l) innovations y(t) - theta(t-1)^T phi(t); NaN where the row was not used and where the past did not
-            determine the prediction.
 
         Raises:
             DataError: wrong shape, infinite sample, a sample outside a basis with outside="error". The state is then
@@ -153,15 +180,13 @@ class RecursiveARX(SavedState):
         return Trace(self.layout, after[after % every == 0], theta, innovations)
 
     def read(self, data: Data | Stream) -> list[Array]:
-        """Take in a whole record, every experiment with lags of its own; returns the innovations of each.
+        """Take in a whole record, every experiment with lags of its own; return the innovations of each.
 
-        Raises:
-            DataError: other channels than the model's, detrended or scaled data; and as `update`.
+        Other channels than the model's, detrended or scaled data are a `DataError`; and as `update`.
         """
         _check_raw(data)
         if data.inputs != self.layout.inputs or data.outputs != self.layout.outputs:
-            raise DataError(f"The data have {', '.join(data.inputs)} -> {', '.join(data.outputs)}, the model "
-                            f"{', '.join(self.layout.inputs)} -> {', '.join(self.layout.outputs)}: use data.select.")
+            raise DataError(f"The data have {_channels(data)}, the model {_channels(self.layout)}: use data.select.")
         innovations = []
         for chunks in [data] if isinstance(data, Stream) else [[(e.u, e.y)] for e in data.experiments]:
             self.restart()
@@ -205,8 +230,6 @@ class RecursiveARX(SavedState):
             self.past_u, self.past_y = past_u[count:], past_y[count:]
         return innovations, traced
 
-    # -- what is known now -------------------------------------------------------------------------------------------
-
     @property
     def statistics(self) -> Statistics:
         """Everything the rows say, the prior included, as the batch statistics of the same layout."""
@@ -215,22 +238,14 @@ class RecursiveARX(SavedState):
 
     @property
     def theta(self) -> Array:
-        """The estimate (n, l), in the order of `layout.names()`.
-
-        Raises:
-            RankError: the rows so far do not determine it; the message names the column.
-        """
+        """The estimate (n, l), in the order of `layout.names()`; a `RankError` names a column not determined yet."""
         from scipy.linalg import solve_triangular
 
         return solve_triangular(self._determined(), self.root[: self.layout.n_columns, self.layout.n_columns :])
 
     @property
     def P(self) -> Array:
-        """The matrix P (n, n) of Algorithm 3.2; times the noise variance, the covariance of the estimate.
-
-        Raises:
-            RankError: as `theta`.
-        """
+        """The matrix P (n, n) of Algorithm 3.2; times the noise variance, the covariance of `theta`, and as that."""
         inverse = invert_triangular(self._determined(), lower=False)
         return inverse @ inverse.T
 
@@ -246,17 +261,14 @@ class RecursiveARX(SavedState):
 
     @property
     def matrices(self) -> tuple[Array, ...]:
-        """Theta_c (P_c, nb_c l) of every input, lags inner, outputs outer.
+        """Theta_c (P_c, nb_c l) of every input, lags inner, outputs outer; refused as `theta`.
 
         The ratio of its second to its first singular value tells how far the record is from a Hammerstein system.
-
-        Raises:
-            RankError: as `theta`.
         """
-        return theta_matrices(self.theta, self.layout)
+        return _theta_matrices(self.theta, self.layout)
 
     def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinTF:
-        """Split off the rank-one factors of the present estimate.
+        """Split off the rank-one factors of the present estimate; refused as `theta`.
 
         Args:
             split: "whitened" (SVD in the Kronecker metric of the Gram matrix, close to the least-squares optimum) or
@@ -264,15 +276,14 @@ class RecursiveARX(SavedState):
             gauge: "norm", "gain" or "b0", as in `HammersteinTF.regauge`.
 
         Raises:
-            RankError: as `theta`.
             StructureError: unknown split or gauge.
         """
         one_of("split", split, SPLITS)
         layout, theta = self.layout, self.theta
         core = lifted_problem(self.statistics, positions(layout)).core
-        pairs = leading_pairs(core, theta_matrices(theta, layout), split == "whitened")
+        pairs = leading_pairs(core, _theta_matrices(theta, layout), split == "whitened")
         return HammersteinTF(
-            a=past_coefficients(theta, layout),
+            a=_past_coefficients(theta, layout),
             b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(layout.bases, pairs)),
             nk=layout.nk, offset=theta[layout.offset], dt=self.dt, inputs=layout.inputs, outputs=layout.outputs,
@@ -280,12 +291,8 @@ class RecursiveARX(SavedState):
         ).regauge(gauge)
 
     def __repr__(self) -> str:
-        layout = self.layout
-        return (f"RecursiveARX: {', '.join(layout.inputs)} -> {', '.join(layout.outputs)}, na {layout.na}, "
-                f"nb {layout.nb}, nk {layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of "
-                f"{self.samples} samples")
-
-    # -- files -------------------------------------------------------------------------------------------------------
+        return (f"RecursiveARX: {_channels(self.layout)}, na {self.layout.na}, nb {self.layout.nb}, "
+                f"nk {self.layout.nk}, forgetting {self.forgetting:g}; {self.rows} rows of {self.samples} samples")
 
     def _head(self) -> dict[str, Any]:
         layout = self.layout
@@ -303,8 +310,12 @@ class RecursiveARX(SavedState):
 
 
 def _each(value: Any, m: int) -> tuple[Any, ...]:
-    """One entry per input; a list is taken as it is, and `Layout` refuses a wrong length."""
+    """One entry per input; of a list, `Layout` refuses a wrong length."""
     return tuple(value) if isinstance(value, list | tuple) else (value,) * m
+
+
+def _channels(of: Any) -> str:
+    return f"{', '.join(of.inputs)} -> {', '.join(of.outputs)}"
 
 
 def _check_raw(data: Data | Stream) -> None:
@@ -321,3 +332,42 @@ def _columns(layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         lag.append(np.repeat(np.array(lags), basis.size))
         start += basis.size
     return np.concatenate(source).astype(np.intp), np.concatenate(lag).astype(np.intp)
+
+
+def _past_coefficients(theta: Array, layout: Layout) -> Array:
+    """Return the coefficients of A, (..., na) or (..., na, l, l) for several outputs, from theta (..., n, l)."""
+    na, l = layout.na, layout.l  # noqa: E741
+    a = theta[..., : na * l, :].reshape(*theta.shape[:-2], na, l, l).swapaxes(-1, -2)
+    return a[..., 0, 0] if l == 1 else a
+
+
+def _theta_matrices(theta: Array, layout: Layout) -> tuple[Array, ...]:
+    """Return Theta_c (..., P_c, nb_c l) from the coefficients (..., n, l)."""
+    found, (*several, _, l) = [], theta.shape  # noqa: E741
+    for c, (b, basis) in enumerate(zip(layout.nb, layout.bases)):
+        block = theta[..., layout.block(c), :].reshape(*several, b, basis.size, l)
+        found.append(np.moveaxis(block, -3, -1).reshape(*several, basis.size, l * b))
+    return tuple(found)
+
+
+def _prior_factor(theta0: Any, P0: Any, layout: Layout) -> Array:
+    """Return the factor [R | R theta_0; 0 | 0] with R^T R = P_0^-1."""
+    n, l = layout.n_columns, layout.l  # noqa: E741
+    theta, covariance = np.asarray(theta0, dtype=float), np.asarray(P0, dtype=float)
+    if theta.shape not in ((), (n,), (n, l)) or not np.all(np.isfinite(theta)):
+        raise StructureError(f"theta0 has shape {theta.shape}: it must be a number, ({n},) or ({n}, {l}), all finite.")
+    if covariance.shape not in ((), (n,), (n, n)):
+        raise StructureError(f"P0 has shape {covariance.shape}: it must be a number, ({n},) or ({n}, {n}).")
+    if covariance.ndim < 2:
+        if not np.all(covariance > 0):
+            raise StructureError("P0 must be positive: it is a covariance. Infinity means no prior.")
+        factor = np.diag(np.broadcast_to(1 / np.sqrt(covariance), n))
+    else:
+        skew = np.abs(covariance - covariance.T).max() > 1e-10 * np.abs(covariance).max()
+        if skew or not np.linalg.eigvalsh(covariance)[0] > 0:
+            raise StructureError("P0 is not a symmetric positive definite matrix; give (n,) variances to use infinity.")
+        factor = add_to_root(np.zeros((n, n)), invert_triangular(np.linalg.cholesky(covariance)))
+    root = np.zeros((n + l, n + l))
+    root[:n, :n] = factor
+    root[:n, n:] = factor @ np.broadcast_to(theta[:, None] if theta.ndim == 1 else theta, (n, l))
+    return root

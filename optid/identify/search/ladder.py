@@ -6,6 +6,7 @@ them, so that it grows orders only as long as that helps. Later rungs begin wher
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,32 +23,17 @@ Rung = Generator[list[Candidate], list[Trial], None]
 LINEAR, INPUTS, FEEDBACK, LATENT = KINDS = ("linear", "input functions", "feedback", "latent signals")
 """Classes of models, each richer than those before."""
 
-PATIENCE = 2
-"""Orders in a row that may fail to improve before a ladder ends."""
-
-LARGEST = 10
-"""Largest number of states."""
-
-FEW_LEVELS = 5
-"""Levels of an input up to which nothing shows between them how a function would go on."""
-
-CLEAR = 0.2
-"""Median over the blocks of the log ratio of error energies that a richer class must save."""
-
-BEHIND = 3.0
-"""Points of cross-validated fit behind the choice so far, from which on a class is given up."""
-
-PATIENT = 12.0
-"""The same where the class leaves much less of the record itself."""
-
-PROMISING = 0.7
-"""What much less is: the share of the error on the record that it leaves."""
-
+PATIENCE = 2  # orders in a row that may fail to improve before a ladder ends
+LARGEST = 10  # largest number of states
+FEW_LEVELS = 5  # levels of an input up to which nothing shows between them how a function would go on
+CLEAR = 0.2  # median over the blocks of the log ratio of error energies that a richer class must save
+BEHIND = 3.0  # points of cross-validated fit behind the choice so far, from which on a class is given up
+PATIENT = 12.0  # the same where the class leaves much less of the record itself
+PROMISING = 0.7  # what much less is: the share of the error on the record that it leaves
 EQUAL = 0.02
 """Share of the error by which structures of a class may differ and still be as good: the smaller one is taken."""
 
-FINEST = 0.01
-"""Share of the error (100 % less the cross-validated fit) that counts as an improvement."""
+FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
 
 
 @dataclass
@@ -69,20 +55,17 @@ class Ladder:
     @classmethod
     def of(cls, blocks: Blocks) -> "Ladder":
         """Look for delays and orders of autoregressions in the sums of the record."""
-        data, m = blocks.data, blocks.data.m
+        data = blocks.data
         sums = LagSums(blocks, linear(data))
-        delays, found = [(0,) * m, sharp_delays(sums)], []
+        found = [(0,) * data.m, sharp_delays(sums)]
         if not few_levels(data):
             try:  # what acts through an even function shows in no linear model
                 found.append(sharp_delays(LagSums(blocks, fitted_bases(data, "polynomial:3"), na=4, lags=12)))
             except OptidError:
                 pass
-        delays = list(dict.fromkeys([*delays, *found]))
-        regressions = []
-        for delay in delays:
-            best = scan(sums, [delay])
-            regressions += [(one.na, one.nb, one.nk) for one in best[:1]]
-        return cls(data, delays, regressions, {})
+        delays = list(dict.fromkeys(found))
+        best = [one for delay in delays for one in scan(sums, [delay])[:1]]
+        return cls(data, delays, [(one.na, one.nb, one.nk) for one in best], {})
 
     @property
     def single(self) -> bool:
@@ -93,24 +76,22 @@ class Ladder:
         """Return the best complete trial of a class, or of some formulations of it."""
         found = [t for t in self.trials.values() if t.candidate.kind == kind and np.isfinite(t.score)
                  and (not formulations or t.candidate.formulation in formulations)]
-        if not found:
-            return None
-        most = max(t.score for t in found)
-        return min((t for t in found if t.score >= most - EQUAL * (100 - most)), key=lambda t: t.parameters)
+        most = max((t.score for t in found), default=0.0)
+        return min((t for t in found if t.score >= most - EQUAL * (100 - most)), key=lambda t: t.parameters,
+                   default=None)
 
     def choice(self) -> Trial | None:
         """Return what is chosen so far: a richer class has to win clearly."""
         chosen = None
-        for kind in KINDS:
-            best = self.best(kind)
-            if best is not None and (chosen is None or (best.score > chosen.score and gain(chosen, best) > CLEAR)):
+        for best in filter(None, map(self.best, KINDS)):
+            if chosen is None or (best.score > chosen.score and gain(chosen, best) > CLEAR):
                 chosen = best
         return chosen
 
     def rival(self, kind: str) -> Trial | None:
         """Return what a candidate of a class has to beat; linear models are compared among themselves."""
-        found = [t for t in (self.best(kind), None if kind == LINEAR else self.choice()) if t is not None]
-        return max(found, key=lambda t: t.score, default=None)
+        found = [self.best(kind), None if kind == LINEAR else self.choice()]
+        return max(filter(None, found), key=lambda t: t.score, default=None)
 
     def hopeless(self, kind: str) -> bool:
         """Whether what has been tried of a class is so far behind that finer choices will not help."""
@@ -120,22 +101,14 @@ class Ladder:
         richer = (100 - best.estimation) < PROMISING * (100 - chosen.estimation)
         return best.score < chosen.score - (PATIENT if richer else BEHIND)
 
-    def arguments(self, kind: str) -> Mapping[str, Any]:
-        """Return the arguments of the best structure of a class; there is one."""
-        best = self.best(kind)
-        assert best is not None
-        return best.candidate.arguments
+    def arguments(self, kind: str, *formulations: str) -> Mapping[str, Any]:
+        """Return the arguments of the best structure of a class, or of formulations of it; none where there is none."""
+        best = self.best(kind, *formulations)
+        return {} if best is None else best.candidate.arguments
 
     def order(self) -> int:
         """Return the number of states that has been best in a linear model."""
-        found = self.best(LINEAR, "ss.exact", "hammerstein_ss.sid")
-        return int(found.candidate.arguments["nx"]) if found else 2
-
-    def lags(self) -> tuple[int, tuple[int, ...]]:
-        """Return the number of lags and the delays that have been best in a linear output-error model."""
-        found = self.best(LINEAR, "oe.exact")
-        return (int(found.candidate.arguments["na"]), tuple(found.candidate.arguments["nk"])) if found else (
-            2, self.delays[-1])
+        return int(self.arguments(LINEAR, "ss.exact", "hammerstein_ss.sid").get("nx", 2))
 
 
 def gain(simple: Trial, rich: Trial) -> float:
@@ -168,112 +141,90 @@ def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
 
 def linear_models(ladder: Ladder) -> Rung:
     """Autoregressions, subspace models of 1, 2, ... states, output-error models, and what refines the best of them."""
-    yield [Candidate(LINEAR, "arx", {"na": na, "nb": nb, "nk": list(nk)}) for na, nb, nk in ladder.regressions]
+    model = partial(structure, LINEAR)
+    yield [model("arx", na=na, nb=nb, nk=list(nk)) for na, nb, nk in ladder.regressions]
     if ladder.single:
         for delay in ladder.delays:
-            yield from climbed([_output_error(n, delay)] for n in range(1, 8))
-    yield from climbed([_subspace(n)] for n in range(1, LARGEST + 1))
-    best = ladder.best(LINEAR, "hammerstein_ss.sid")
-    n = int(best.candidate.arguments["nx"]) if best else 2
+            yield from climbed([model("oe.exact", na=n, nb=n, nk=list(delay))] for n in range(1, 8))
+    yield from climbed([model("hammerstein_ss.sid", nx=n, basis="linear")] for n in range(1, LARGEST + 1))
     if not ladder.single:
-        yield [_free_run(k) for k in dict.fromkeys([n, 2])]
-        yield from climbed([_free_run(k)] for k in range(n + 1, min(n + 3, LARGEST) + 1))
-    if ladder.single and (best := ladder.best(LINEAR, "oe.exact")):  # fewer zeros, and a delay one sample off
-        na, nk = best.candidate.arguments["na"], best.candidate.arguments["nk"]
-        yield [Candidate(LINEAR, "oe.exact", {"na": na, "nb": nb, "nk": list(nk)})
-               for nb in dict.fromkeys([1, max(na - 1, 1), na + 2])]
+        n = int(ladder.arguments(LINEAR, "hammerstein_ss.sid").get("nx", 2))
+        yield [model("ss.exact", nx=k) for k in dict.fromkeys([n, 2])]
+        yield from climbed([model("ss.exact", nx=k)] for k in range(n + 1, min(n + 3, LARGEST) + 1))
+    elif a := ladder.arguments(LINEAR, "oe.exact"):  # fewer zeros, and a delay one sample off
+        yield [model("oe.exact", na=a["na"], nb=nb, nk=list(a["nk"]))
+               for nb in dict.fromkeys([1, max(a["na"] - 1, 1), a["na"] + 2])]
 
 
 def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
     words = [bases(ladder.data, word) for word in ("polynomial:3", "triangular:6")]
     if not ladder.single:
-        n = ladder.order()
-        yield [_state_space(INPUTS, k, basis=word) for k in dict.fromkeys([min(n, 4), 2]) for word in words]
+        states = partial(structure, INPUTS, "hammerstein_ss.exact")
+        yield [states(nx=k, basis=word) for k in dict.fromkeys([min(ladder.order(), 4), 2]) for word in words]
         if not ladder.hopeless(INPUTS):
             a = ladder.arguments(INPUTS)
-            yield from climbed([_state_space(INPUTS, k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
+            yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
         return
-    n, delay = ladder.lags()
-    delays = list(dict.fromkeys([delay, *ladder.delays]))
-    yield [_hammerstein_oe(k, nk, word) for k in dict.fromkeys([min(n, 3), 2]) for nk in delays for word in words]
+
+    def model(n: int, nk: Sequence[int], basis: Any) -> Candidate:
+        return structure(INPUTS, "hammerstein_oe.exact", na=n, nb=n, nk=list(nk), basis=basis)
+
+    a = ladder.arguments(LINEAR, "oe.exact") or {"na": 2, "nk": ladder.delays[-1]}
+    delays = list(dict.fromkeys([tuple(a["nk"]), *ladder.delays]))
+    yield [model(k, nk, word) for k in dict.fromkeys([min(int(a["na"]), 3), 2]) for nk in delays for word in words]
     if ladder.hopeless(INPUTS):
         return
     a = ladder.arguments(INPUTS)
-    yield from climbed([_hammerstein_oe(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
+    yield from climbed([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
     a = ladder.arguments(INPUTS)
-    yield [_hammerstein_oe(a["na"], a["nk"], bases(ladder.data, word))
+    yield [model(a["na"], a["nk"], bases(ladder.data, word))
            for word in ("polynomial:2", "polynomial:5", "triangular:4", "triangular:10")]
     a = ladder.arguments(INPUTS)
     near = [[max(k + step, 0) for k in a["nk"]] for step in (-1, 1)]
-    yield [_hammerstein_oe(a["na"], nk, a["basis"]) for nk in near if nk != a["nk"]]
+    yield [model(a["na"], nk, a["basis"]) for nk in near if nk != a["nk"]]
 
 
 def feedback(ladder: Ladder) -> Rung:
     """Static functions of the outputs that are fed back, with or without functions of the inputs."""
-    yield [_state_space(FEEDBACK, n, basis=basis, feedback_basis="polynomial:3")
-           for n in (2, 3) for basis in _inner(ladder)]
+    model = partial(structure, FEEDBACK, "hammerstein_ss.exact")
+    best, plain = ladder.best(INPUTS), ladder.best(LINEAR)
+    helped = best is not None and (plain is None or best.score > plain.score)
+    inner = ["linear", *([best.candidate.arguments["basis"]] if helped and best else [])]
+    yield [model(nx=n, basis=basis, feedback_basis="polynomial:3") for n in (2, 3) for basis in inner]
     if ladder.hopeless(FEEDBACK):
         return
     a = ladder.arguments(FEEDBACK)
-    yield [_state_space(FEEDBACK, a["nx"], basis=a["basis"], feedback_basis=word)
+    yield [model(nx=a["nx"], basis=a["basis"], feedback_basis=word)
            for word in ("polynomial:2", "polynomial:4", "triangular:6")]
     a = ladder.arguments(FEEDBACK)
-    yield from climbed([_state_space(FEEDBACK, n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
+    yield from climbed([model(nx=n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
                        for n in range(a["nx"] + 1, 7))
 
 
 def latent_signals(ladder: Ladder) -> Rung:
     """Static functions of signals inside, which are combinations of states and inputs."""
-    n = min(ladder.order(), 4)
-    yield [_latent(k, 1, "polynomial:3", direct) for k in dict.fromkeys([2, n]) for direct in (False, True)]
+    def model(n: int, channels: int, basis: str, direct: bool) -> Candidate:
+        return structure(LATENT, "lfr.exact", nx=n, channels=channels, latent_basis=basis, direct=direct)
+
+    orders = dict.fromkeys([2, min(ladder.order(), 4)])
+    yield [model(k, 1, "polynomial:3", direct) for k in orders for direct in (False, True)]
     if ladder.hopeless(LATENT):
         return
+    nx = ladder.arguments(LATENT)["nx"]
+    yield [model(nx, 2, "polynomial:3", direct) for direct in (False, True)]
     a = ladder.arguments(LATENT)
-    yield [_latent(a["nx"], 2, "polynomial:3", direct) for direct in (False, True)]
-    a = ladder.arguments(LATENT)
-    yield [_latent(a["nx"] + 1, a["channels"], a["latent_basis"], a["direct"]),
-           *(_latent(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:5", "bspline:4"))]
-
-
-def classes_for(data: Data, asked: Sequence[str]) -> list[str]:
-    """Return the classes that a record allows among those asked for."""
-    return [kind for kind in KINDS if kind in asked and (kind == LINEAR or not few_levels(data))]
+    yield [model(a["nx"] + 1, a["channels"], a["latent_basis"], a["direct"]),
+           *(model(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:5", "bspline:4"))]
 
 
 RUNGS: dict[str, Callable[[Ladder], Rung]] = {
     LINEAR: linear_models, INPUTS: input_functions, FEEDBACK: feedback, LATENT: latent_signals}
 
 
-def _output_error(n: int, nk: Sequence[int]) -> Candidate:
-    return Candidate(LINEAR, "oe.exact", {"na": n, "nb": n, "nk": list(nk)})
-
-
-def _hammerstein_oe(n: int, nk: Sequence[int], basis: Any) -> Candidate:
-    return Candidate(INPUTS, "hammerstein_oe.exact", {"na": n, "nb": n, "nk": list(nk), "basis": basis})
-
-
-def _subspace(n: int) -> Candidate:
-    return Candidate(LINEAR, "hammerstein_ss.sid", {"nx": n, "basis": "linear"})
-
-
-def _free_run(n: int) -> Candidate:
-    return Candidate(LINEAR, "ss.exact", {"nx": n})
-
-
-def _state_space(kind: str, n: int, **arguments: Any) -> Candidate:
-    return Candidate(kind, "hammerstein_ss.exact", {"nx": n, **arguments})
-
-
-def _latent(n: int, channels: int, basis: str, direct: bool) -> Candidate:
-    return Candidate(LATENT, "lfr.exact", {"nx": n, "channels": channels, "latent_basis": basis, "direct": direct})
-
-
-def _inner(ladder: Ladder) -> list[Any]:
-    """Bases of the inputs inside a richer class: straight lines, and what has helped."""
-    best, plain = ladder.best(INPUTS), ladder.best(LINEAR)
-    helped = best is not None and (plain is None or best.score > plain.score)
-    return ["linear", *([best.candidate.arguments["basis"]] if helped and best else [])]
+def structure(kind: str, formulation: str, **arguments: Any) -> Candidate:
+    """Return a candidate of a class."""
+    return Candidate(kind, formulation, arguments)
 
 
 def _levels(data: Data, c: int) -> int:

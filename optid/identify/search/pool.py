@@ -5,6 +5,7 @@ import signal
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -21,9 +22,7 @@ class Pool:
 
     def __init__(self, function: Callable[[Any], Any], count: int) -> None:
         """Fork `count` processes."""
-        self._function = function
-        self._connections: list[Any] = []
-        self._children: list[Any] = []
+        self._function, self._connections, self._children = function, list[Any](), list[Any]()
         if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
             return
         context = multiprocessing.get_context("fork")
@@ -40,10 +39,7 @@ class Pool:
     def run(self, tasks: Sequence[Any], deadline: float, told: Callable[[Any], None]) -> list[Any]:
         """Return the results in the order of the tasks, None for those that time or a process did not last for.
 
-        Args:
-            tasks: arguments of the function.
-            deadline: by `time.monotonic`.
-            told: is told every result as it comes.
+        The deadline is by `time.monotonic`; `told` is told every result as it comes.
         """
         results: list[Any] = [None] * len(tasks)
         if not self._connections:
@@ -52,8 +48,7 @@ class Pool:
                     results[i] = self._function(task)
                     told(results[i])
             return results
-        waiting, busy = list(range(len(tasks)))[::-1], {}
-        idle = list(self._connections)
+        waiting, busy, idle = list(range(len(tasks)))[::-1], {}, list(self._connections)
         while (waiting and idle) or busy:
             while waiting and idle and time.monotonic() < deadline:
                 connection = idle.pop()
@@ -89,9 +84,6 @@ class Pool:
 
 def _work(connection: Connection, function: Callable[[Any], Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    while True:
-        try:
-            task = connection.recv()
-        except EOFError:
-            return
-        connection.send(function(task))
+    with suppress(EOFError):
+        while True:
+            connection.send(function(connection.recv()))

@@ -15,18 +15,15 @@ from optid.data.record import Data, not_a_record
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
-from optid.identify.search.ladder import CLEAR, KINDS, LINEAR, RUNGS, Ladder, classes_for, gain
+from optid.identify.search.ladder import CLEAR, KINDS, LINEAR, RUNGS, Ladder, few_levels, gain
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, tried
 from optid.identify.verdict import Verdict, verdict
 from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
 
-FIRST = 0.25
-"""Share of the budget that linear models have before the others begin."""
-
-RESERVED = 0.1
-"""Share of the budget that is kept for the fit of the choice."""
+FIRST = 0.25  # share of the budget that linear models have before the others begin
+RESERVED = 0.1  # share of the budget that is kept for the fit of the choice
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,8 +36,7 @@ class Identification(Rendered):
         best: the best trial of every class that had one, by class.
         trials: all of them, in the order in which they were made.
         reasons: why this one, a sentence each.
-        horizon: samples ahead that were compared; None for the free run.
-        blocks: number of blocks.
+        horizon, blocks: as in `identify`.
         stopped: what ended the search early, or "".
         seconds: wall time.
     """
@@ -71,7 +67,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
              classes: Sequence[str] = KINDS, constraints: Sequence[Any] = (), solver: Any = "auto",
              accuracy: float = 1e-8, workers: int | None = None,
              progress: Callable[[str], None] | None = None) -> Identification:
-    """Find a structure for a record by blocked cross-validation, and fit it.
+    """Find a structure for a record by blocked cross-validation, and fit it to the whole record.
 
     Every structure is fitted to the record without one block after another, and simulates the block that was left out
     from an initial state fitted to it. Classes of models follow each other from the simple to the rich; a richer one is
@@ -91,9 +87,6 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         workers: processes; None for one per processor that is free to use.
         progress: is told a sentence after every trial; by default the log "optid", and a bar on a terminal.
 
-    Returns:
-        The model fitted to the whole record, with the table of what was tried and the reasons of the choice.
-
     Raises:
         DataError: not a record in memory.
         RankError: a record too short for the blocks.
@@ -107,7 +100,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         raise StructureError(f"budget is a number of seconds above 0; got {budget!r}")
     for word in classes:
         one_of("classes", word, KINDS)
-    possible = classes_for(data, classes)
+    possible = [kind for kind in KINDS if kind in classes and (kind == LINEAR or not few_levels(data))]
     if not possible:
         raise StructureError("no input has more than five levels: only linear models can be told apart, add 'linear' "
                              "to the classes")
@@ -117,7 +110,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     cut = Blocks.of(data, blocks)
     ladder, stopped = Ladder.of(cut), ""
     end = clock + (1 - RESERVED) * budget
-    count = _processors() if workers is None else check_integer(workers, "workers")
+    free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = free if workers is None else check_integer(workers, "workers")
 
     def attempt(task: tuple[Candidate, Trial | None, float]) -> Trial:
         candidate, rival, deadline = task
@@ -135,7 +129,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     best = {kind: trial for kind in KINDS if (trial := ladder.best(kind)) is not None}
     chosen = ladder.choice()
     if chosen is None:
-        raise _nothing(ladder)
+        raise _nothing(list(ladder.trials.values()))
     found = fit(data, chosen.candidate.formulation, solver=solver, accuracy=accuracy, constraints=rules,
                 **chosen.candidate.arguments)
     why = reasons(ladder, best)
@@ -187,18 +181,18 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
             current = trial
             continue
         saved = gain(current, trial)
-        amount = f"{trial.score:.1f} % against {current.score:.1f} %"
-        median = f"{100 * (1 - np.exp(-saved)):.0f} % of the error energy in the median block"
+        sentence = f"{kind}: {trial.score:.1f} % against {current.score:.1f} %"
+        median = f"saves {100 * (1 - np.exp(-saved)):.0f} % of the error energy in the median block"
         if trial.score > current.score and saved > CLEAR:
-            found.append(f"{kind}: {amount}, and saves {median}: taken")
+            found.append(f"{sentence}, and {median}: taken")
             current = trial
         elif trial.score > current.score:
-            found.append(f"{kind}: {amount}, but saves {median}, less than {100 * (1 - np.exp(-CLEAR)):.0f} %: left")
+            found.append(f"{sentence}, but {median}, less than {100 * (1 - np.exp(-CLEAR)):.0f} %: left")
         else:
-            found.append(f"{kind}: {amount}: left")
+            found.append(f"{sentence}: left")
     for kind in KINDS:
-        if kind not in best and any(t.candidate.kind == kind for t in ladder.trials.values()):
-            several = [t for t in ladder.trials.values() if t.candidate.kind == kind]
+        several = [t for t in ladder.trials.values() if t.candidate.kind == kind]
+        if kind not in best and several:
             found.append(f"{kind}: none of {len(several)} structures was as good as what is chosen "
                          f"(first: {several[0].reason})")
     return found
@@ -211,14 +205,9 @@ def _told(ladder: Ladder, progress: Callable[[str], None], clock: float, budget:
              f"{trial.candidate.formulation} {trial.candidate.words}: {outcome}")
 
 
-def _nothing(ladder: Ladder) -> Exception:
-    trials = list(ladder.trials.values())
+def _nothing(trials: Sequence[Trial]) -> Exception:
     if not trials:
         return RankError("no structure could be tried: the budget was over before the first")
     words = [t.reason for t in trials]
     common = max(set(words), key=words.count)
     return SolverFailed(f"none of {len(trials)} structures could be fitted and cross-validated; most often: {common}")
-
-
-def _processors() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

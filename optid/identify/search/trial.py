@@ -17,24 +17,15 @@ from optid.models.functions import free_parameters
 WORSE = 1.3
 """A structure is given up when its errors on the first half of the blocks have so many times the energy of the best."""
 
-STARTS = 2
-"""Starts of output-error models on trial."""
-
-STEPS = 30
-"""Steps of the descents of state-space models on trial."""
+STARTS = 2  # starts of output-error models on trial
+STEPS = 30  # steps of the descents of state-space models on trial
 
 Key = tuple[str, tuple[tuple[str, Any], ...]]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A structure: what `optid.fit` is to be called with.
-
-    Attributes:
-        kind: class of models, such as "linear".
-        formulation: its name.
-        arguments: of the formulation.
-    """
+    """A structure of a class of models, such as "linear": formulation and arguments for `optid.fit`."""
 
     kind: str
     formulation: str
@@ -48,7 +39,9 @@ class Candidate:
     @property
     def words(self) -> str:
         """The arguments as one writes them on the command line."""
-        return " ".join(f"--{name.replace('_', '-')} {_word(value)}" for name, value in self.arguments.items())
+        texts = {name: " ".join(map(str, value)) if isinstance(value, list | tuple) else value
+                 for name, value in self.arguments.items()}
+        return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in texts.items())
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +49,9 @@ class Trial:
     """What became of a candidate.
 
     Attributes:
-        candidate: the structure.
         estimation: fit in % of the free run on the record it was fitted to.
-        energy: (b, l) energy of its errors on the blocks that were tried.
+        energy: (b, l) energy of its errors on the blocks that were tried, in that order.
         measure: (b, l) what it is measured by, see `Blocks.errors`.
-        order: the blocks, in the order of `energy`.
         parameters: number of parameters of the model.
         seconds: CPU time.
         status: of the solver on the whole record, or "refused".
@@ -113,7 +104,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
         deadline: by `time.monotonic`; where there is no rival, it takes the time it needs.
     """
     clock, found = time.process_time(), Trial(candidate)
-    arguments = {**candidate.arguments, **spared(candidate),
+    arguments = {**candidate.arguments, **_spared(candidate),
                  **({"constraints": tuple(constraints)} if constraints else {})}
 
     def fitted(data: Any) -> Any:
@@ -140,22 +131,28 @@ def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Tr
                     estimation=pooled_fit(np.array(energies), np.array(measures)))
     if rival is not None and known.estimation < rival.score:
         yield replace(known, reason="fits the record itself less than its rival fits blocks left out")
-    order, energy, measure = halves(len(blocks)), [], []
+    order: tuple[int, ...] = (*range(0, len(blocks), 2), *range(1, len(blocks), 2))  # every other one first
+    known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
     for done, b in enumerate(order, start=1):
         if rival is not None and time.monotonic() > deadline:  # without a rival there is nothing to fall back to
             yield replace(known, reason="out of time")
-        found = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
-        energy.append(found[0])
-        measure.append(found[1])
-        known = replace(known, energy=np.array(energy), measure=np.array(measure), order=tuple(order[:done]))
-        if not np.isfinite(found[0]).all():
+        energy, measure = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
+        known = replace(known, energy=np.vstack([known.energy, energy]), measure=np.vstack([known.measure, measure]),
+                        order=order[:done])
+        if not np.isfinite(energy).all():
             yield replace(known, reason=f"its run diverges in block {b + 1}")
-        if rival is not None and 2 * done == len(order) and _behind(known, rival):
-            yield replace(known, reason="falls behind its rival on the first half of the blocks")
+        if rival is not None and 2 * done == len(order):
+            places = [rival.order.index(one) for one in known.order]
+            if _loss(known.energy, known.measure) > WORSE * _loss(rival.energy[places], rival.measure[places]):
+                yield replace(known, reason="falls behind its rival on the first half of the blocks")
     yield known
 
 
-def spared(candidate: Candidate) -> dict[str, Any]:
+def _loss(energy: Array, measure: Array) -> float:
+    return float(np.sum(energy.sum(axis=0) / np.maximum(measure.sum(axis=0), 1e-300)))
+
+
+def _spared(candidate: Candidate) -> dict[str, Any]:
     """Return the arguments that make a trial quicker than the fit of the structure that is chosen."""
     if candidate.formulation.endswith("oe.exact"):
         return {"starts": STARTS}
@@ -163,19 +160,3 @@ def spared(candidate: Candidate) -> dict[str, Any]:
         once = {"tries": 1} if candidate.formulation == "lfr.exact" else {}
         return {"iterations": STEPS, "block_rows": max(10, 2 * candidate.arguments["nx"] + 4), **once}
     return {}
-
-
-def halves(count: int) -> tuple[int, ...]:
-    """Return the blocks in the order they are tried: every other one first."""
-    return (*range(0, count, 2), *range(1, count, 2))
-
-
-def _behind(known: Trial, rival: Trial) -> bool:
-    places = [rival.order.index(b) for b in known.order]
-    ours, theirs = (float(np.sum(e.sum(axis=0) / np.maximum(m.sum(axis=0), 1e-300))) for e, m in (
-        (known.energy, known.measure), (rival.energy[places], rival.measure[places])))
-    return ours > WORSE * theirs
-
-
-def _word(value: Any) -> str:
-    return " ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

@@ -12,9 +12,8 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, StructureError
-from optid.identify.recursive.intake import as_block, forgetting_factor
-from optid.identify.recursive.saved_state import SavedState
-from optid.identify.tracking.geometry import as_basis, orthonormal, principal_angles
+from optid.identify.recursive.state import SavedState, as_block, forgetting_factor
+from optid.identify.tracking.subspaces import as_basis, orthonormal, principal_angles
 
 METHODS = ("past", "opast")
 MISSING = ("fill", "skip", "refuse")
@@ -26,8 +25,8 @@ class SubspaceTracker(SavedState):
     """The dominant r-dimensional subspace of a stream of zero-mean vectors; `update` changes it.
 
     A sample with missing entries is used through its least-squares coordinates on the rows of W that are present: the
-    missing entries are those the subspace says, and teach nothing. Where the entries do not determine the
-    coordinates the sample is passed over and counted.
+    missing entries are those the subspace says. Where the entries do not determine the coordinates the sample is passed
+    over and counted.
 
     Attributes:
         W: (n, r) the basis as the recursion carries it.
@@ -48,7 +47,7 @@ class SubspaceTracker(SavedState):
 
         Args:
             n: dimension of the vectors.
-            r: dimension of the subspace, below n.
+            r: of the subspace, below n.
             method: "past", nearly orthonormal, or "opast", orthonormal at every sample.
             forgetting: factor on earlier samples, in (0, 1]; remembers about 1 / (1 - forgetting) samples.
             start: (n, r) a first guess, orthonormalised; the first r coordinates when not given.
@@ -79,13 +78,10 @@ class SubspaceTracker(SavedState):
         self.sums, self.counts = np.zeros(2), np.zeros(3, dtype=np.int64)
 
     def update(self, x: ArrayLike) -> Array:
-        """Follow a block (N, n) or one sample (n,).
+        """Follow a block (N, n) or one sample (n,); return the distance (N,) of every sample from the subspace before.
 
-        Returns:
-            (N,) distance of every sample from the subspace before it was used; NaN where it was not.
-
-        Raises:
-            DataError: another shape, an infinite entry, or a missing one where missing="refuse", by name and sample.
+        It is NaN where the sample was not used. Another shape, an infinite entry, or a missing one where
+        missing="refuse", is a `DataError` that names channel and sample.
         """
         from optid.identify.tracking.kernel import track  # compiled code is loaded with the first sample
 
@@ -97,12 +93,12 @@ class SubspaceTracker(SavedState):
                             "'skip'.")
         if self.missing == "skip":
             block = np.where(lost.any(axis=1, keepdims=True), np.nan, block)
-        residuals, start = np.empty(len(block)), 0
+        residuals, start, orthogonal = np.empty(len(block)), 0, self.method == "opast"
         while start < len(block):
             part = slice(start, start + RENEWED - int(self.counts[0]) % RENEWED)
             track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block[part]), self.forgetting,
-                  self.method == "opast", residuals[part])
-            if self.method == "opast" and self.counts[0] % RENEWED == 0:
+                  orthogonal, residuals[part])
+            if orthogonal and self.counts[0] % RENEWED == 0:
                 columns, triangle = np.linalg.qr(self.W)
                 self.W[:] = columns * np.sign(np.diag(triangle))
             start = part.stop
@@ -140,12 +136,9 @@ class SubspaceTracker(SavedState):
         if not memory or not values[0] > 0:
             return 0
         values = np.maximum(values, 1e-15 * values[0])
-        lengths = []
-        for k in range(self.r + 1):
-            rest = values[k:]
-            spread = np.log(rest.mean()) - np.log(rest).mean()
-            lengths.append(memory * rest.size * spread + 0.5 * k * (2 * self.n - k) * np.log(max(memory, 2.0)))
-        return int(np.argmin(lengths))
+        rests = [values[k:] for k in range(self.r + 1)]
+        return int(np.argmin([memory * rest.size * (np.log(rest.mean()) - np.log(rest).mean())
+                              + 0.5 * k * (2 * self.n - k) * np.log(max(memory, 2.0)) for k, rest in enumerate(rests)]))
 
     def angles(self, nominal: ArrayLike) -> Array:
         """Return the principal angles to a nominal subspace (n, s), ascending, in radians."""

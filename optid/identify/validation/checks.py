@@ -1,44 +1,48 @@
-"""How good a model is on a record: errors of one-step prediction and simulation, residual tests, structure."""
+"""How good models are on a record: errors of one-step prediction and simulation, residual tests, structure.
+
+Several models are compared by each predictor over the samples that all of them predict.
+"""
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning, RankError
+from optid.errors import DataError, DataWarning, OptidError, RankError, StructureError
 from optid.identify.record_checks import list_outside
 from optid.identify.validation.correlations import LEVEL, Correlation, autocorrelation, cross_correlation
 from optid.identify.validation.predictions import (
+    MEASURED,
     ONE_STEP,
     SIMULATION,
+    HorizonCurve,
     Measures,
+    common_fits,
+    fit_by_horizon,
     one_step,
     predictors,
     simulated,
     simulated_or_nan,
 )
 from optid.identify.validation.structure import Structure, structure_test
-from optid.models.functions import has_feedback, static_functions
+from optid.models.functions import StaticFunction, has_feedback, static_functions
 from optid.registry import Rendered
 
 LAGS = 25
-
 KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent signal"}
 """What the argument of a static function is, by the family of the function."""
-
 ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(Rendered):
-    """What `validate` found; `print` it.
+    """What `validate` found on the record named `data`; `print` it.
 
     Attributes:
-        data: name of the record.
         horizon: samples ahead of the prediction besides one.
         predictors: errors, by output, of every predictor: "one step", "5 steps", "measured feedback" (the simulation
             that takes the outputs in the feedback from the record; only of models with nonlinear feedback),
@@ -127,7 +131,11 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
     for word in predictors(model)[1:]:
         if found := _simulated(model, raw, word, x0, notes):
             predicted[word] = found
-    outside = _outside(model, raw, notes)
+    outside = {}
+    for function, _, share in shares_outside(model, raw):
+        outside[function.name] = share
+        found = list_outside(KINDS[function.family], function.name, share, function.nonlinearity.basis)
+        notes.extend(note for note in found if note not in notes)
     structure = record_structure(model, raw, notes)
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
@@ -173,21 +181,18 @@ def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> 
     return outputs
 
 
-def _outside(model: Any, data: Data, notes: list[str]) -> dict[str, float]:
-    shares = {}
+def shares_outside(model: Any, data: Data) -> Iterator[tuple[StaticFunction, Array, float]]:
+    """Yield the functions of a model, samples of their arguments, and the share outside the intervals of the bases.
+
+    Straight lines are known everywhere; functions of a latent signal that runs away in the record are left out.
+    """
     for function in static_functions(model):
-        if function.is_linear:  # known everywhere
-            shares[function.name] = 0.0
-            continue
-        name, basis = function.name, function.nonlinearity.basis
         try:
-            samples = function.samples(data)
-        except DataError:  # the simulation says so
+            x = np.zeros(0) if function.is_linear else function.samples(data)
+        except OptidError:  # the simulation says so
             continue
-        shares[name] = np.count_nonzero(basis.is_outside(samples)) / max(int(np.sum(~np.isnan(samples))), 1)
-        found = list_outside(KINDS[function.family], name, shares[name], basis)
-        notes.extend(note for note in found if note not in notes)
-    return shares
+        outside = np.count_nonzero(function.nonlinearity.basis.is_outside(x))
+        yield function, x, outside / max(int(np.sum(~np.isnan(x))), 1)
 
 
 def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> Structure | None:
@@ -195,13 +200,13 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
 
     Hammerstein models answer for their class, models with feedback or latent functions for their own residuals.
     """
-    notes = [] if notes is None else notes
     beyond = has_feedback(model) or bool(getattr(model, "latent", ()))
     if not beyond and not static_functions(model):
         return None
     runs = simulated_or_nan(model, data) if beyond else None
     if runs is not None and not all(np.isfinite(y).all() for y in runs):
         return None
+    notes = [] if notes is None else notes
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)
@@ -215,3 +220,85 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
             f"residual variance (p = {found.p_value:.1g}). Consider functions of latent signals (lfr.exact), a Wiener "
             "model, or nonlinear feedback.")
     return found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Rendered):
+    """What `compare_models` found; `print` it, or write a page with `optid.show.report.write_comparison`.
+
+    Attributes:
+        names: one per model.
+        data: the record, in raw units.
+        horizon: samples ahead of the prediction besides one.
+        fits: {predictor: (models, l) fits in %}, over the samples that all models predict; NaN where a model has no
+            such prediction.
+        validations: one per model, each over the samples it predicts itself.
+        curves: fit against the horizon, one per model.
+    """
+
+    names: tuple[str, ...]
+    models: tuple[Any, ...] = field(repr=False)
+    data: Data = field(repr=False)
+    horizon: int
+    fits: dict[str, Array]
+    validations: tuple[Validation, ...] = field(repr=False)
+    curves: tuple[HorizonCurve, ...] = field(repr=False)
+
+    @property
+    def simulated(self) -> tuple[tuple[Array, ...], ...]:
+        """Simulated outputs (N, l) per experiment, one tuple per model, empty where there is no simulation."""
+        return tuple(checked.simulated for checked in self.validations)
+
+    def best(self, predictor: str = SIMULATION) -> str:
+        """Return the name of the model with the largest mean fit over the outputs, by a key of `fits`.
+
+        A predictor that no model has is a `StructureError`.
+        """
+        means = np.nanmean(self.fits[predictor], axis=1) if predictor in self.fits else np.array([np.nan])
+        if np.isnan(means).all():
+            raise StructureError(f"no model has the prediction {predictor!r}; there are {', '.join(self.fits)}")
+        return self.names[int(np.nanargmax(means))]
+
+
+def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizon: int = 1, x0: Any = "fit"
+                   ) -> Comparison:
+    """Compare several models on one record, preferably one that none of them was estimated from.
+
+    Args:
+        models: {name: model}, or models, which are then named by what they are.
+        data: the record.
+        horizon: samples ahead of one more prediction.
+        x0: initial state of the simulations, as the models take it.
+
+    Raises:
+        StructureError: no model, or a horizon that is not a positive integer.
+        DataError: the record has other channels or another sampling time than a model.
+    """
+    named = dict(models) if isinstance(models, Mapping) else _named(models)
+    if not named:
+        raise StructureError("there is no model to compare")
+    raw = data.raw()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)  # they stand in the notes of the validations
+        validations = tuple(validate(model, raw, x0=x0, horizon=horizon) for model in named.values())
+        curves = tuple(fit_by_horizon(model, raw) for model in named.values())
+    nothing = tuple(np.full(e.y.shape, np.nan) for e in raw.experiments)
+    fits = {}
+    for word in (ONE_STEP, f"{horizon} steps", MEASURED, SIMULATION):
+        if any(word in checked.predicted for checked in validations):
+            # a model without feedback simulates alike, measured or not
+            other = SIMULATION if word == MEASURED else word
+            found = common_fits(raw, [checked.predicted.get(word, checked.predicted.get(other, nothing))
+                                      for checked in validations])
+            fits |= {} if np.isnan(found).all() else {word: found}
+    return Comparison(tuple(named), tuple(named.values()), raw, horizon, fits, validations, curves)
+
+
+def _named(models: Sequence[Any]) -> dict[str, Any]:
+    """Name models by their titles and orders, and number those that are still alike."""
+    words = []
+    for model in models:
+        orders = ", ".join(f"{key} {' '.join(map(str, np.ravel(value)))}" for key, value in model.orders.items())
+        words.append(f"{model.title} ({orders})" if orders else model.title)
+    return {word if words.count(word) == 1 else f"{word} #{words[: i + 1].count(word)}": model
+            for i, (word, model) in enumerate(zip(words, models))}

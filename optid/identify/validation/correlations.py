@@ -11,8 +11,7 @@ from scipy.special import chdtrc
 from optid.arrays import Array
 
 LEVEL = 0.01
-QUANTILE_99 = 2.5758293035489004
-"""Two-sided 99 % quantile of the standard normal distribution."""
+QUANTILE_99 = 2.5758293035489004  # two-sided 99 % quantile of the standard normal distribution
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +61,11 @@ def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25, *, 
         past: (N,) residuals of the other output per experiment; its own when not given.
         other: name of the other output.
     """
-    first = int(past is not None)
-    own = _standardised(residuals)
+    first, own = int(past is not None), _standardised(residuals)
     values, counts = lagged_products(own, own if past is None else _standardised(past), range(first, lags + 1))
-    late, inflation = slice(1 - first, None), 1.0 if first else 1 + 2 / max(counts[0], 1)
+    inflation = 1.0 if first else 1 + 2 / max(counts[0], 1)
     return Correlation(output, other, np.arange(first, lags + 1), values, _band(counts),
-                       _portmanteau(values[late], counts[late] * inflation))
+                       _portmanteau(values[1 - first :], counts[1 - first :] * inflation))
 
 
 def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], output: str, channel: str, lags: int = 25
@@ -114,15 +112,13 @@ def lagged_products(first: Sequence[Array], second: Sequence[Array], lags: Seque
 
     Both have one array (N,) per experiment; NaN = missing.
     """
-    sums, counts = np.zeros(len(lags)), np.zeros(len(lags))
+    sums, counts = np.zeros((2, len(lags)))
     for a, b in zip(first, second):
-        marks_a, marks_b = ((~np.isnan(signal)).astype(float) for signal in (a, b))
-        a, b = np.nan_to_num(a), np.nan_to_num(b)
+        pairs = [(np.nan_to_num(a), np.nan_to_num(b)), tuple((~np.isnan(x)).astype(float) for x in (a, b))]
         for i, lag in enumerate(lags):
-            now = slice(max(lag, 0), len(a) + min(lag, 0))
-            past = slice(max(-lag, 0), len(b) + min(-lag, 0))
+            now, past = slice(max(lag, 0), len(a) + min(lag, 0)), slice(max(-lag, 0), len(b) + min(-lag, 0))
             if now.stop > now.start:
-                sums[i] += a[now] @ b[past]
-                counts[i] += marks_a[now] @ marks_b[past]
+                for total, (x, y) in zip((sums, counts), pairs):
+                    total[i] += x[now] @ y[past]
     with np.errstate(invalid="ignore", divide="ignore"):
         return sums / counts, counts

@@ -31,25 +31,25 @@ def predictors(model: Any) -> tuple[str, ...]:
 def one_step(model: Any, data: Data, horizon: int = 1) -> list[Array]:
     """Return the predictions (N, l) of every experiment, so many steps ahead; NaN where there is none.
 
-    Raises:
-        StructureError: a horizon that is not a positive integer.
+    A horizon that is not a positive integer is a `StructureError`.
     """
     return as_list(model.predict(data, horizon))
 
 
 def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -> list[Array]:
-    """Return the simulated outputs (N, l) of every experiment.
+    """Return the outputs (N, l) of every experiment by "simulation" or "measured feedback", x0 as the model takes it.
 
-    Args:
-        model: the model.
-        data: the record.
-        word: "simulation", or "measured feedback".
-        x0: initial state, as the model takes it.
-
-    Raises:
-        DataError: a missing input, or a simulation that leaves the range of the data.
+    A missing input, or a simulation that leaves the range of the data, is a `DataError`.
     """
     return as_list((model.simulate_measured_feedback if word == MEASURED else model.simulate)(data, x0=x0))
+
+
+def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
+    """Return what `simulated` does; NaN where an input is missing or the model runs away."""
+    try:
+        return simulated(model, data, word)
+    except DataError:
+        return [np.full(e.y.shape, np.nan) for e in data.experiments]
 
 
 @dataclass(frozen=True)
@@ -66,21 +66,20 @@ class Measures:
         samples: number of samples N.
     """
 
-    fit: float
-    vaf: float
-    rmse: float
-    e_n: float
-    snr: float
-    snr_amplitude: float
-    samples: int
+    fit: float = np.nan
+    vaf: float = np.nan
+    rmse: float = np.nan
+    e_n: float = np.nan
+    snr: float = np.nan
+    snr_amplitude: float = np.nan
+    samples: int = 0
 
     @classmethod
     def of(cls, y: Array, predicted: Array) -> "Measures":
         """Compare y (N,) with predicted (N,); NaN in either leaves the sample out."""
         here = ~(np.isnan(y) | np.isnan(predicted))
         if not here.any():
-            nan = float("nan")
-            return cls(nan, nan, nan, nan, nan, nan, 0)
+            return cls()
         y, error = y[here], (y - predicted)[here]
         e_n = float(np.mean(error**2))
         snr = float(np.mean(y**2)) / e_n if e_n > 0 else float("inf")
@@ -92,22 +91,14 @@ class Measures:
 
 
 def fit_percent(y: Array, predicted: Array) -> Array:
-    """Return 100 (1 - |y - yhat| / |y - mean y|) of every output, (l,), over the samples present in both.
-
-    Args:
-        y: (N, l) measured.
-        predicted: (N, l) predicted or simulated.
-    """
+    """Return 100 (1 - |y - yhat| / |y - mean y|) of every output, (l,), over the samples (N, l) present in both."""
     return np.array([Measures.of(measured, found).fit for measured, found in zip(y.T, predicted.T)])
 
 
 def common_fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
     """Return the fits in % of several predictions of a record, (k, l), over the samples that all of them predict.
 
-    Args:
-        data: the record.
-        several: predicted outputs, one (N, l) per experiment each. One that predicts nothing does not count for the
-            others; its fit is NaN.
+    Each has one (N, l) per experiment. One that predicts nothing does not count for the others; its fit is NaN.
     """
     y = np.vstack([e.y for e in data.experiments])
     stacked = [np.vstack(list(arrays)) for arrays in several]
@@ -119,22 +110,11 @@ def common_fits(data: Data, several: Sequence[Sequence[Array]]) -> Array:
 def prediction_fit(model: Any, data: Data, word: str = ONE_STEP) -> Array:
     """Return the fit in % of one predictor on a record, (l,); NaN where there is no such simulation.
 
-    Args:
-        model: the model.
-        data: the record.
-        word: "one step", "measured feedback" or "simulation"; the last two need every sample of the inputs.
+    The word is "one step", "measured feedback" or "simulation"; the last two need every sample of the inputs.
     """
     raw = data.raw()
     found = one_step(model, raw) if word == ONE_STEP else simulated_or_nan(model, raw, word)
     return common_fits(raw, [found])[0]
-
-
-def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
-    """Return the simulated outputs (N, l) of every experiment; NaN where an input is missing or the model runs away."""
-    try:
-        return simulated(model, data, word)
-    except DataError:
-        return [np.full(e.y.shape, np.nan) for e in data.experiments]
 
 
 @dataclass(frozen=True, eq=False, repr=False)

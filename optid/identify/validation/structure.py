@@ -22,7 +22,6 @@ Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -38,6 +37,7 @@ from optid.statistics.factors import conditioning, dependent_column, root_of_gra
 from optid.structures.bilinear import minimise
 from optid.structures.rank_one import RankOne, matrices
 
+WHITE = np.ones(1)
 SIGNIFICANT = 5e-3
 UNNOTICED = 0.003
 """Share of the residual variance that another structure may save in truth while a record counts as Hammerstein: the
@@ -49,11 +49,9 @@ FUNCTIONS = "functions of the inputs explain a part of the residuals"
 
 NOISE_ORDER, KEPT = 12, 0.4
 """Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
-
 DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
 TURNS, SHARPER = 3, 0.99
 """Regressions on fine functions, one on the filters between them; share of the variance they must leave to be used."""
-
 SAMPLES = 30_000
 """The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
 
@@ -170,7 +168,8 @@ class _Hypothesis:
 
 def _test_output(design: Design, o: int) -> tuple[dict[str, FTest], list[float]]:
     """Return the tests on one output by words, and the second over first singular value by input."""
-    additive = _additive_gram(design, o)
+    additive, _, rows = _gram(design, o, lambda i, part, u, y: [design.additive(u), y[:, None]])
+    _refuse_few(rows, len(additive))
     problem = _rank_one(additive, design.blocks, 1)
     free = matrices(np.linalg.solve(problem.root, problem.target)[1:], design.blocks)
     # the residuals of the hypothesis: the free model would explain part of a slow noise and hide its colour
@@ -180,7 +179,7 @@ def _test_output(design: Design, o: int) -> tuple[dict[str, FTest], list[float]]
                              [(f, np.asarray(mu, dtype=float)) for f, mu in zip(design.families, found.mus)],
                              np.concatenate([theta, np.zeros(sum(f.size for f in design.fine))]))
     leading = [np.asarray(np.linalg.svd(theta)[2][:2], dtype=float) for theta in free]
-    responses = _responses(design, leading, _linear_coefficients(additive, design.blocks))
+    responses = _responses(design, leading, additive)
     residuals, predicted, mean, spread, size = _residuals(design, o, hypothesis, responses)
     # in units of eps: one for every term of the sum, and the condition number for theta, found from a Gram matrix
     rounding = np.finfo(float).eps * (theta.size + conditioning(problem.root)) * size
@@ -198,15 +197,20 @@ def _test_output(design: Design, o: int) -> tuple[dict[str, FTest], list[float]]
         return [np.hstack([posed, missed[i][part]]), _alternatives(carriers),
                 *(group[i][part] for group in groups.values()), (output - posed @ hypothesis.theta)[:, None]]
 
-    gram, edges, rows = _whitened(design, o, _autoregression(residuals), columns)
+    gram, edges, rows = _gram(design, o, columns, _autoregression(residuals))
     # what was cut off the responses acts on all of the output, however small the residuals are
     cut = design.cut * float(np.var(np.concatenate(predicted))) / float(np.nanvar(np.concatenate(residuals)))
     tests = _tested(gram, edges, rows, (PRODUCTS, *groups), UNNOTICED + cut)
     if PRODUCTS not in tests:
-        raise RankError(f"{rows} complete rows for {edges[2]} columns of the structure test: use a longer record.")
+        _refuse_few(rows, edges[2])
     keep = np.r_[: edges[1], edges[-1] - 1]
     tests[RANK], ratios = _rank_test(gram[np.ix_(keep, keep)], hypothesis, design.blocks, rows, UNNOTICED + cut)
     return tests, ratios
+
+
+def _refuse_few(rows: int, columns: int) -> None:
+    if rows < 2 * columns:
+        raise RankError(f"{rows} complete rows for {columns} columns of the structure test: use a longer record.")
 
 
 def _test_residuals(design: Design, o: int, simulated: Sequence[Array]) -> tuple[dict[str, FTest], list[float]]:
@@ -220,12 +224,12 @@ def _test_residuals(design: Design, o: int, simulated: Sequence[Array]) -> tuple
         one, rest = np.split(design.additive(u), [1], axis=1)
         return [one, rest, *(group[i][part] for group in groups.values()), (output - predicted[i][part])[:, None]]
 
-    gram, edges, rows = _whitened(design, o, _autoregression(residuals), columns)
+    gram, edges, rows = _gram(design, o, columns, _autoregression(residuals))
     return _tested(gram, edges, rows, (FUNCTIONS, *groups), UNNOTICED), [0.0] * design.data.m
 
 
-def _whitened(design: Design, o: int, noise: Array, columns: Callable[[int, slice, Array, Array], list[Array]]
-              ) -> tuple[Array, list[int], int]:
+def _gram(design: Design, o: int, columns: Callable[[int, slice, Array, Array], list[Array]], noise: Array = WHITE
+          ) -> tuple[Array, list[int], int]:
     """Return the Gram matrix of blocks of columns, filtered by the noise model; where they begin, and its rows."""
     past = noise.size - 1
     gram, sizes, rows = np.zeros((1, 1)), [0], 0
@@ -250,16 +254,17 @@ def _tested(gram: Array, edges: list[int], rows: int, words: Sequence[str], unno
     return tests
 
 
+def _regressed(gram: Array) -> Array:
+    """Return the coefficients of the last column on the others, without directions that hardly differ."""
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    scaled = gram / np.outer(scale, scale)
+    return np.linalg.pinv(scaled[:-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:-1, -1] * scale[-1] / scale[:-1]
+
+
 def _sharpened(design: Design, o: int, hypothesis: _Hypothesis) -> _Hypothesis:
     """Fit the fine functions and the filters in turn, beginning with the filters of a hypothesis."""
     def regressed(columns: Callable[[Array], Array]) -> Array:
-        gram: Any = 0.0
-        for _, _, u, output, valid in design.stretches(o):
-            used = np.column_stack([np.ones(len(output)), columns(u), output])[valid]
-            gram = gram + used.T @ used
-        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        scaled = gram / np.outer(scale, scale)
-        return np.linalg.pinv(scaled[:-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:-1, -1] * scale[-1] / scale[:-1]
+        return _regressed(_gram(design, o, lambda i, part, u, y: [np.ones((len(y), 1)), columns(u), y[:, None]])[0])
 
     def filtered(u: Array) -> Array:
         return np.hstack([convolved(f.values(u[:, c]) @ part[:, None], design.filters)[:, :, 0]
@@ -277,37 +282,16 @@ def _sharpened(design: Design, o: int, hypothesis: _Hypothesis) -> _Hypothesis:
     return _Hypothesis(bs, list(zip(design.fine, parts)), np.concatenate([theta[:1], coarse, theta[1:]]))
 
 
-def _additive_gram(design: Design, o: int) -> Array:
-    """Gram matrix [1 | filters of functions by input | y] of the additive regression."""
-    size = 2 + sum(p * j for p, j in design.blocks)
-    gram, rows = np.zeros((size, size)), 0
-    for _, _, u, output, valid in design.stretches(o):
-        used = np.column_stack([design.additive(u), output])[valid]
-        gram += used.T @ used
-        rows += len(used)
-    if rows < 2 * size:
-        raise RankError(f"{rows} complete rows for {size} columns of the structure test: use a longer record.")
-    return gram
-
-
-def _linear_coefficients(gram: Array, blocks: tuple[tuple[int, int], ...]) -> Array:
-    """Coefficients of the filters of every input itself, its first function, in a regression on these alone."""
-    starts = 1 + np.cumsum([0, *(p * j for p, j in blocks)])
-    chosen = np.concatenate([[0], *(start + p * np.arange(j) for start, (p, j) in zip(starts, blocks))])
-    scale = np.sqrt(np.maximum(np.diag(gram)[chosen], 1e-300))
-    inner, outer = gram[np.ix_(chosen, chosen)] / np.outer(scale, scale), gram[chosen, -1] / scale
-    return (np.linalg.lstsq(inner, outer, rcond=1e-12)[0] / scale)[1:]
-
-
-def _responses(design: Design, leading: list[Array], linear: Array) -> Array:
+def _responses(design: Design, leading: list[Array], additive: Array) -> Array:
     """Impulse responses (L, q, m) along which alternatives are looked for.
 
-    The best linear approximation; per input the two leading filters of lags times functions, which also see what is
-    even, and the input itself at its strongest lag and at the next. Of several inputs one of each, since pairs of
-    inputs make products enough.
+    The best linear approximation, a regression on the filters of the inputs themselves, their first functions; per
+    input the two leading filters of lags times functions, which also see what is even, and the input itself at its
+    strongest lag and at the next. Of several inputs one of each, since pairs of inputs make products enough.
     """
-    m, size = design.data.m, len(design.filters)
-    responses = [design.filters @ linear.reshape(m, -1).T]
+    m, size, starts = design.data.m, len(design.filters), 1 + np.cumsum([0, *(p * j for p, j in design.blocks)])
+    chosen = [0, *(start + p * k for start, (p, j) in zip(starts, design.blocks) for k in range(j)), -1]
+    responses = [design.filters @ _regressed(additive[np.ix_(chosen, chosen)])[1:].reshape(m, -1).T]
     for c, coefficients in enumerate(leading):
         lines = design.filters @ coefficients.T
         strongest = int(np.argmax(np.abs(lines[:, 0])))
@@ -411,8 +395,8 @@ def _rank_test(gram: Array, hypothesis: _Hypothesis, blocks: tuple[tuple[int, in
     f must not pass for a second nonlinearity.
     """
     size, n = 1 + sum(p * j for p, j in blocks), hypothesis.theta.size
-    filtered = np.asarray(block_diag(1.0, *(np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, hypothesis.bs))
-                                     ))
+    leading = [np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, hypothesis.bs)]
+    filtered = np.asarray(block_diag(1.0, *leading))
     unit = np.eye(len(gram))
     finer = _beside(gram, np.pad(filtered, ((0, len(gram) - size), (0, 0))), unit[:, size:n])
     finer = np.hstack([finer, _beside(gram, unit[:, :n], unit[:, n:-1], whole=True)])

@@ -11,14 +11,11 @@ from optid.arrays import Array
 from optid.identify.validation.structure_design import Design, Family, convolved, orthonormal_filters
 from optid.models.recursions import lfilter
 
-COURSES = 4
-"""Degree of the polynomials in time that a gain may follow."""
-
+COURSES = 4  # degree of the polynomials in time that a gain may follow
 LAGS, SLOW, FEW_RECORDS = 16, (0.8, 0.9, 0.95, 0.98, 0.99), 3
 """Lags and poles by which the filters are completed; experiments up to which each has decays of its own."""
 
-MOST = 6
-"""Most groups of poles, over all inputs, that may come before a second nonlinearity."""
+MOST = 6  # most groups of poles, over all inputs, that may come before a second nonlinearity
 
 
 def alternatives(design: Design, predicted: list[Array]) -> dict[str, list[Array]]:
@@ -34,9 +31,12 @@ def alternatives(design: Design, predicted: list[Array]) -> dict[str, list[Array
     after = orthonormal_filters(design.poles, 1, design.delay, reach + 1, squared=False)
     after = np.pad(after, ((0, max(reach + 1 - len(after), 0)), (0, 0)))[: reach + 1]
     before = [np.concatenate([np.zeros(reach), y]) for y in outputs]
+    ends = np.cumsum([len(y) for y in outputs])
+    times = [2 * np.arange(end - len(y), end) / ends[-1] - 1 for end, y in zip(ends, outputs)]  # since the record began
     found = {
         "functions of the output": [_curved(y) for y in outputs],
-        "a gain that changes with time": _courses(outputs),
+        "a gain that changes with time": [np.polynomial.legendre.legvander(t, COURSES)[:, 1:] * y[:, None]
+                                          for t, y in zip(times, outputs)],
         "functions of the output that are fed back": [_through(_curved(y), after) for y in before],
     }
     for c, denominator, words in _parts(design):
@@ -90,13 +90,6 @@ def _curved(x: Array) -> Array:
 def _through(values: Array, filters: Array) -> Array:
     found = convolved(values, filters)
     return found.reshape(len(found), -1)
-
-
-def _courses(outputs: list[Array]) -> list[Array]:
-    """Polynomials of the time since the record began, times the output, (rows, COURSES) per experiment."""
-    ends = np.cumsum([len(y) for y in outputs])
-    return [np.polynomial.legendre.legvander(2 * np.arange(end - len(y), end) / ends[-1] - 1, COURSES)[:, 1:]
-            * y[:, None] for end, y in zip(ends, outputs)]
 
 
 def _moments(signals: list[Array]) -> tuple[float, float]:

@@ -27,18 +27,13 @@ BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the re
 EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
 LATEST = 30  # longest delay looked for, in samples
 LEVEL = 0.01
-SPARE = 1
-"""Poles more than the order that noisy data show: what is too weak for that may still matter to a sharp test."""
-
+SPARE = 1  # poles more than the order that noisy data show: what is too weak for that may still matter to a sharp test
 FEW = 3  # functions per input with which the dynamics are looked for
 RADIUS, SLOWEST = 0.98, 20
 """Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
-
 SETTLED = 1e-3  # share of its largest value below which an impulse response has ended
-
 DEGREE, HATS, SAMPLES = 3, 5, 250
 """Powers and, at most, hats of an input that every filter sees; samples for each of these hats and each input."""
-
 FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40
 """The same for the leading filter: there f is known to a few tenths of a percent."""
 
@@ -53,10 +48,8 @@ PRESENT = 0.9
 class Family:
     """Functions of one input: powers, which follow its tails, and hats between quantiles, which follow its kinks.
 
-    Attributes:
-        centre, spread: mean and standard deviation of the samples.
-        degree: largest power.
-        nodes: (k + 2,) increasing; k hats, one for each inner node.
+    The powers up to a degree are of the input less its mean over its standard deviation; there is a hat for each inner
+    node of (k + 2,) increasing ones.
     """
 
     centre: float
@@ -66,11 +59,7 @@ class Family:
 
     @classmethod
     def of(cls, data: Data, c: int, degree: int, hats: int) -> "Family":
-        """Place the functions for input c; no more than it has levels less one.
-
-        Raises:
-            RankError: a constant input.
-        """
+        """Place the functions for input c, no more than it has levels less one; a constant input is a `RankError`."""
         samples = np.concatenate([e.u[:, c] for e in data.experiments])
         samples = samples[~np.isnan(samples)]
         levels = np.unique(samples).size
@@ -129,20 +118,12 @@ def delay_of(data: Data) -> int:
 
 
 def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
-    """Estimate the poles between inputs and outputs by a subspace method with inputs alone as instruments.
+    """Estimate the poles (n,) between inputs, delayed, and outputs by a subspace method with inputs as instruments.
 
     The inputs enter through three functions each, so that a static nonlinearity at the input is no obstacle, and noise
-    of any colour only costs accuracy. The order is that of `rank_test`.
-
-    Args:
-        data: the record.
-        delay: samples by which the inputs are delayed.
-
-    Returns:
-        (n,) complex poles well within the unit circle, in conjugate pairs; empty for a static record.
-
-    Raises:
-        RankError: the record is too short or does not excite the functions.
+    of any colour only costs accuracy. The order is that of `rank_test`. The poles are complex, well within the unit
+    circle, in conjugate pairs; there are none for a static record. One that is too short, or does not excite the
+    functions, is a `RankError`.
     """
     records, signals = _signals(data, delay)
     alpha = int(np.clip(data.n_samples // (6 * len(signals.names)), FEWEST, BLOCK_ROWS))
@@ -163,14 +144,9 @@ def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, l
                         ) -> Array:
     """Return impulse responses (T, J) that span q^-(delay + i) / A(q)^2, i = 0 ... 2n + extra, A with the given poles.
 
-    With A^2 in the denominator the span contains B / A' for poles near the given ones, up to the square of their error.
-
-    Args:
-        poles: (n,) in conjugate pairs.
-        extra: lags beyond those of A^2, for pulses and further delays.
-        delay: samples before all responses begin.
-        longest: samples after which the responses are cut at the latest.
-        squared: A^2 in the denominator, else A.
+    With A^2 in the denominator (A where it is not squared) the span contains B / A' for poles near the given ones, up
+    to the square of their error. All begin after the delay; the extra lags are for pulses and further delays. The
+    responses are cut after `longest` samples at the latest.
     """
     every = np.concatenate([poles, poles]) if squared else poles
     a = np.asarray(np.real(np.poly(every)), dtype=float) if len(poles) else np.ones(1)
@@ -212,14 +188,10 @@ class Design:
     """What the columns of all regressions are made of.
 
     Attributes:
-        data: the record.
-        u: its inputs, missing samples interpolated, one array per experiment.
-        families: functions of each input.
-        fine: more functions of each input.
-        filters: (L, J) orthonormal impulse responses.
+        u: inputs of the record, missing samples interpolated, one array per experiment.
+        families, fine: functions of each input, and more of them.
+        filters: (L, J) orthonormal impulse responses, of these poles, which begin after the delay.
         heavy: samples after a missing input until most of its effect has passed.
-        poles: those of the filters.
-        delay: samples before which the filters begin.
     """
 
     data: Data

@@ -1,11 +1,12 @@
-"""The state of an estimator that runs on, as a file."""
+"""What estimators that run on share: their samples as blocks, the forgetting factor, and their state as a file."""
 
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from optid.errors import ModelFileError, OptidError
+from optid.arrays import Array, check_finite
+from optid.errors import DataError, ModelFileError, OptidError, StructureError
 from optid.models.files import read_state, write_state
 
 VERSION = 1  # version of the file
@@ -39,10 +40,10 @@ class SavedState:
 
     @classmethod
     def load(cls, path: str | Path, functions: dict[str, Any] | None = None) -> Self:
-        """Restore a state.
+        """Restore a state from a file written by `save`.
 
         Args:
-            path: file written by `save`.
+            path: the file.
             functions: the functions of UserFunctions bases by name, which a file does not hold.
 
         Raises:
@@ -63,3 +64,28 @@ class SavedState:
                                      "needed.")
             setattr(state, name, np.ascontiguousarray(array))
         return state
+
+
+def as_block(values: Any, names: tuple[str, ...], what: str, seen: int) -> Array:
+    """Return samples, a block (N, channels), (N,) of one channel or one sample, as (N, channels), finite or NaN.
+
+    A wrong shape or an infinite sample is a `DataError`, which calls the channels `what` and counts from `seen` on.
+    """
+    samples, width = np.asarray(values, dtype=float), len(names)
+    if samples.ndim == 0 and width == 1 or samples.ndim == 1 and width > 1 and samples.size == width:
+        samples = samples.reshape(1, width)
+    elif samples.ndim == 1 and width == 1:
+        samples = samples[:, None]
+    if samples.ndim != 2 or samples.shape[1] != width:
+        raise DataError(f"{what} has shape {np.shape(values)}: it must be a block (N, {width}) or one sample of "
+                        f"{width} channel{'s' if width > 1 else ''} ({', '.join(names)}).")
+    if samples.size:
+        check_finite(samples, [f"{what}, channel {name!r}" for name in names], seen)
+    return samples
+
+
+def forgetting_factor(value: float) -> float:
+    """Return a forgetting factor, or refuse one outside (0, 1] (`StructureError`)."""
+    if not 0 < value <= 1:
+        raise StructureError(f"forgetting={value!r}: a factor above 0 and at most 1, such as 0.995.")
+    return float(value)
