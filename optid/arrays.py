@@ -117,10 +117,10 @@ def finite(values: Any, name: str) -> np.ndarray:
         array = np.array(values, dtype=float)
     except (OverflowError, TypeError, ValueError) as error:
         raise StructureError(f"{name} must be an array of real numbers ({error}).") from error
-    if not np.all(np.isfinite(array)):
-        at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
-    if array.size and np.abs(array).max() > LARGEST:
+    if not (np.abs(array) <= LARGEST).all():
+        if not np.isfinite(array).all():
+            at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
+            raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
         raise StructureError(f"{name} contains a value above {LARGEST:g}, whose square overflows.")
     array.flags.writeable = False
     return array

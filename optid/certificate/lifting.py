@@ -77,7 +77,7 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     found = certify(problem, point, cones=lifted.cones, linear=lifted.linear, max_size=max_size)
     if not found.better or swapped:
         return found.bound, None
-    return found.bound, form.named(found.better[0], program.variables)
+    return found.bound, form.named(found.better[0], program.shapes)
 
 
 def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, Point, bool]:
@@ -131,6 +131,8 @@ def places(program: Program, form: LeastSquaresStructure) -> Places:
 
 def lift(program: Program, form: LeastSquaresStructure) -> Lifted:
     """Bring the user constraints of a programme into lifted form."""
+    if not program.user_constraints:
+        return Lifted(Linear.none(len(form.problem.target)))
     where = places(program, form)
     lifted = Lifted(Linear.none(where.size))
     factors = {program.variables[name].id: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}

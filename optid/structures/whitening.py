@@ -7,6 +7,7 @@ Kronecker product still makes starts, Newton steps and proofs of optimality well
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -61,8 +62,7 @@ def symmetric_root(matrix: Array) -> Array:
 
 def block_slices(shapes: Sequence[tuple[int, int]], first: int = 0) -> list[slice]:
     """Columns of every block in a lifted vector whose first block begins at a column."""
-    edges = first + np.cumsum([0, *(p * nb for p, nb in shapes)])
-    return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
+    return [slice(start, stop) for start, stop in pairwise(accumulate((p * nb for p, nb in shapes), initial=first))]
 
 
 @dataclass(frozen=True, eq=False)
