@@ -64,6 +64,8 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
 
 
 def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> Program:
+    if gauge == "gain" and problem.layout.l > 1:
+        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
     pairs, inputs = tuple(zip(problem.keys("mu"), problem.keys("b"))), range(problem.layout.m)
 
     def statement() -> dict[str, Any]:

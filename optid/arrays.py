@@ -11,14 +11,11 @@ from optid.errors import DataError, DataWarning, OptidError, StructureError
 
 Array = NDArray[np.floating]
 
-EXACT_INTEGER = 2**53
-"""Largest magnitude up to which every integer is a float64 (IEEE 754, 53-bit significand)."""
-
+EXACT_INTEGER = 2**53  # largest magnitude up to which every integer is a float64 (IEEE 754, 53-bit significand)
 LARGEST = 1e150
 """Largest magnitude accepted: beyond it squares overflow, and no sensor reads it (it is a marker of lost samples)."""
 
-WRAP = 0.75
-"""A step between neighbours above this share of an integer type's range looks like a wrap-around."""
+WRAP = 0.75  # a step between neighbours above this share of an integer type's range looks like a wrap-around
 
 
 def as_samples(values: Any, what: str, names: Sequence[str] | None = None) -> np.ndarray:

@@ -23,19 +23,12 @@ from optid.structures.rank_one import Point, RankOne
 
 @dataclass
 class Lifted:
-    """Constraints in the two forms a certificate understands.
+    """Constraints in the two forms a certificate understands."""
 
-    Attributes:
-        linear: the rows on z.
-        cones: {block: rows C of ``C mu >= 0``}.
-        directions: {block: rows B of ``B b >= 0``}.
-        refused: name of the first constraint that has neither form, "" where all have.
-    """
-
-    linear: Linear
-    cones: dict[int, np.ndarray] = field(default_factory=dict)
-    directions: dict[int, np.ndarray] = field(default_factory=dict)
-    refused: str = ""
+    linear: Linear  # the rows on z
+    cones: dict[int, np.ndarray] = field(default_factory=dict)  # {block: rows C of ``C mu >= 0``}
+    directions: dict[int, np.ndarray] = field(default_factory=dict)  # {block: rows B of ``B b >= 0``}
+    refused: str = ""  # name of the first constraint that has neither form, "" where all have
 
     def add(self, rows: np.ndarray, right: np.ndarray, equal: bool) -> None:
         """Append rows ``rows @ z <= right`` or ``=``."""
@@ -101,17 +94,11 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
 
 @dataclass(frozen=True)
 class Places:
-    """Where the variables of a programme, and the products of bilinear ones, stand in the lifted vector z.
+    """Where the variables of a programme, and the products of bilinear ones, stand in the lifted vector z."""
 
-    Attributes:
-        size: length of z.
-        columns: {id of a variable: its first column}.
-        stand_in: {id of the expression mu bᵀ: the variable that stands for it}.
-    """
-
-    size: int
-    columns: dict[int, int]
-    stand_in: dict[int, cp.Variable]
+    size: int  # length of z
+    columns: dict[int, int]  # {id of a variable: its first column}
+    stand_in: dict[int, cp.Variable]  # {id of the expression mu bᵀ: the variable that stands for it}
 
     def rows(self, member: Constraint) -> tuple[np.ndarray, np.ndarray] | None:
         """Return (E, f) of a constraint that reads ``E z <= f`` or ``E z = f``, or None where it does not."""

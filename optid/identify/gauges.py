@@ -28,7 +28,8 @@ def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np
         return cp.sum_squares(b) == 1 if reference is None else reference @ b == float(reference @ reference)
     if gauge == "b0":
         return (b[0] if b.ndim == 1 else b[0, 0]) == 1
-    _check_one_output(b)
+    if b.ndim > 1:
+        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
     return cp.sum(b) == 1 + (cp.sum(a) if a is not None else 0)
 
 
@@ -44,16 +45,9 @@ def in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None, ch
         channel: name of the input, for the message.
 
     Raises:
-        StructureError: the quantity that the gauge sets to one is zero, or "gain" with several outputs.
+        StructureError: the quantity that the gauge sets to one is zero.
     """
-    if gauge == "gain":
-        _check_one_output(b)
     if gauge == "norm" and not np.any(b):  # an input without effect: any direction will do
         return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))
     factor = gauge_factor(gauge, np.zeros(0) if a is None else a, b, channel)
     return mu * factor, b / factor
-
-
-def _check_one_output(b: Any) -> None:
-    if b.ndim > 1:
-        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")

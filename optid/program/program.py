@@ -16,8 +16,7 @@ from optid.program.solution import Bound
 from optid.program.structure import Structure
 from optid.program.view import Values, View
 
-STATED = ("objective", "constraints", "variables", "view", "derived")
-"""What a programme says in CVXPY."""
+STATED = ("objective", "constraints", "variables", "view", "derived")  # what a programme says in CVXPY
 
 
 def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:

@@ -20,21 +20,13 @@ TOLERANCE = 1e-12  # on the tangent gradient relative to ||R^T s||
 
 @dataclass(frozen=True, eq=False)
 class LocalSolution:
-    """What a local method returns.
+    """What a local method returns."""
 
-    Attributes:
-        point: in the gauge ||b|| = 1.
-        value: objective there.
-        iterations: steps taken.
-        gradient: gradient in the tangent space over ||R^T s||, in whitened coordinates.
-        converged: whether the gradient tolerance was reached.
-    """
-
-    point: Point
-    value: float
-    iterations: int
-    gradient: float
-    converged: bool
+    point: Point  # in the gauge ||b|| = 1
+    value: float  # objective there
+    iterations: int  # steps taken
+    gradient: float  # gradient in the tangent space over ||R^T s||, in whitened coordinates
+    converged: bool  # whether the gradient tolerance was reached
 
 
 def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array], list[Array]]]:

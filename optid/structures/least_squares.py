@@ -18,20 +18,14 @@ class LeastSquaresStructure(Structure):
     """``F = ‖R z - s‖² + remainder`` with ``z = [linear variables; vec(mu_i b_iᵀ)]``.
 
     The structural constraints of its programme only fix directions that do not change F.
-
-    Attributes:
-        problem: the numbers, see `optid.program.compressed.Compressed`.
-        linear: names of the linear variables in the order of z (each flattened column by column).
-        blocks: (mu name, b name) of every rank-one block; none without products.
-        gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".
     """
 
     word: ClassVar[str] = "least-squares"
     constrained: ClassVar[bool] = True
-    problem: Any
-    linear: tuple[str, ...]
-    blocks: tuple[tuple[str, str], ...] = ()
-    gauge: str = "norm"
+    problem: Any  # the numbers, see `optid.program.compressed.Compressed`
+    linear: tuple[str, ...]  # names of the linear variables in the order of z (each flattened column by column)
+    blocks: tuple[tuple[str, str], ...] = ()  # (mu name, b name) of every rank-one block; none without products
+    gauge: str = "norm"  # what fixes the scale between mu and b: "norm", "gain" or "b0"
 
     @property
     def names(self) -> list[str]:

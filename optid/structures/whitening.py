@@ -67,19 +67,12 @@ def block_slices(shapes: Sequence[tuple[int, int]], first: int = 0) -> list[slic
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """The change of coordinates ``Theta_i' = L_mu,i^T Theta_i L_b,i`` and, for kept linear unknowns, ``w' = R_w w``.
+    """The change of coordinates ``Theta_i' = L_mu,i^T Theta_i L_b,i`` and, for kept linear unknowns, ``w' = R_w w``."""
 
-    Attributes:
-        shapes: (P_i, nb_i) of every block.
-        factors_mu: (P_i, P_i) lower triangular.
-        factors_b: (nb_i, nb_i) lower triangular.
-        factor_w: (linear, linear) upper triangular.
-    """
-
-    shapes: tuple[tuple[int, int], ...]
-    factors_mu: tuple[Array, ...]
-    factors_b: tuple[Array, ...]
-    factor_w: Array
+    shapes: tuple[tuple[int, int], ...]  # (P_i, nb_i) of every block
+    factors_mu: tuple[Array, ...]  # (P_i, P_i) lower triangular
+    factors_b: tuple[Array, ...]  # (nb_i, nb_i) lower triangular
+    factor_w: Array  # (linear, linear) upper triangular
 
     @property
     def linear(self) -> int:
