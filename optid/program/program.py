@@ -114,7 +114,9 @@ class Program:
     def __getattr__(self, name: str) -> Any:
         if name not in STATED or "_statement" not in vars(self):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        vars(self).update(vars(self).pop("_statement")())
+        stated = vars(self)["_statement"]()
+        del vars(self)["_statement"]
+        vars(self).update(stated)
         if held := vars(self).pop("_held"):
             self.assign(held)
         return vars(self)[name]
@@ -276,7 +278,8 @@ class Program:
     def assign(self, values: Values) -> None:
         """Write values into the CVXPY variables and recompute the derived ones."""
         if not self.is_stated:
-            vars(self)["_held"].update(values)
+            vars(self)["_held"].update({name: np.asarray(values[name], dtype=float).reshape(shape, order="F")
+                                        for name, shape in self.shapes.items() if name in values})
             return
         for name, value in values.items():
             variable = self.variables[name]

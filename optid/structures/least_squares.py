@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
+from itertools import accumulate, chain, pairwise
 from math import prod
 from typing import Any, ClassVar
 
@@ -50,12 +50,12 @@ class LeastSquaresStructure(Structure):
         if self.blocks:
             slope = point.tangent()
             pull, effort = slope.T @ pull, np.abs(slope.T) @ effort
-        yardstick, worst, first = max(value, program.scale), 0.0, 0
-        for name in self.names:
-            part = slice(first, first := first + np.size(values[name]))
+        yardstick, worst = max(value, program.scale), 0.0
+        edges = accumulate((np.size(values[name]) for name in self.names), initial=0)
+        for name, (first, last) in zip(self.names, pairwise(edges)):
             usual = float(np.max(np.abs(program.start.get(name, 0.0)), initial=0.0)) or None
             size = variable_size(values[name], usual)
-            worst = max(worst, relative_gradient(np.abs(pull[part]), effort[part], yardstick, size))
+            worst = max(worst, relative_gradient(np.abs(pull[first:last]), effort[first:last], yardstick, size))
         return value, worst
 
 
