@@ -64,32 +64,40 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
 
 
 def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> Program:
-    linear, inputs = problem.linear_variables(), range(problem.layout.m)  # a, offset
-    mu = [cp.Variable(problem.layout.bases[c].size, name=problem.keys("mu")[c]) for c in inputs]
-    b = [cp.Variable(problem.b_shape(c), name=problem.keys("b")[c]) for c in inputs]
-    theta = {problem.keys("Theta")[c]: cp.outer(mu[c], flat(b[c])) for c in inputs}
-    residual = problem.residual(linear, theta.values())
-    r = cp.Variable(residual.size, name="residual")
+    if gauge == "gain" and problem.layout.l > 1:
+        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
+    pairs, inputs = tuple(zip(problem.keys("mu"), problem.keys("b"))), range(problem.layout.m)
 
-    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder)
-    constraints = {"residual": (r == residual,), "gauge": tuple(scale_fixed(gauge, one, linear.get("a")) for one in b)}
+    def statement() -> dict[str, Any]:
+        linear = problem.linear_variables()  # a, offset
+        mu = [cp.Variable(problem.layout.bases[c].size, name=pairs[c][0]) for c in inputs]
+        b = [cp.Variable(problem.b_shape(c), name=pairs[c][1]) for c in inputs]
+        theta = {problem.keys("Theta")[c]: cp.outer(mu[c], flat(b[c])) for c in inputs}
+        residual = problem.residual(linear, theta.values())
+        r = cp.Variable(residual.size, name="residual")
 
-    factors = {one.name(): one for pair in zip(mu, b) for one in pair}
-    pairs = tuple((m.name(), one.name()) for m, one in zip(mu, b))
-    program = Program(
-        "hammerstein_arx.exact", objective, constraints, {**linear, **factors, "residual": r},
-        _start(problem, pairs, gauge), lambda values: None,
-        problem.view({**linear, **factors, **theta}, gauge), structural=frozenset(constraints),
-        derived={"residual": residual},
-        structure=RankOneStructure(problem.problem, tuple(linear), pairs, gauge), certify=certify_rank_one,
-        scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
-    signed = gauge == "norm" and bool(builders) and _has_signed_factors(program, {one.id for one in factors.values()})
+        objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder)
+        constraints = {"residual": (r == residual,),
+                       "gauge": tuple(scale_fixed(gauge, one, linear.get("a")) for one in b)}
 
-    def recover(values: Values) -> HammersteinTF:
+        factors = {one.name(): one for pair in zip(mu, b) for one in pair}
+        return {"objective": objective, "constraints": constraints, "derived": {"residual": residual},
+                "variables": {**linear, **factors, "residual": r},
+                "view": problem.view({**linear, **factors, **theta}, gauge)}
+
+    def recover(values: Values, signed: bool = False) -> HammersteinTF:
         return problem.model(values, [values[m] for m, _ in pairs], [values[one] for _, one in pairs], gauge=gauge,
                              flip=gauge == "norm" and not signed)
 
-    return replace(program, recover=recover, start=_signed_start(program, pairs) if signed else program.start)
+    linear = ("a", "offset") if problem.layout.na else ("offset",)
+    program = Program.deferred(
+        "hammerstein_arx.exact", statement, start=_start(problem, pairs, gauge), recover=recover,
+        structural=frozenset({"residual", "gauge"}),
+        structure=RankOneStructure(problem.problem, linear, pairs, gauge), certify=certify_rank_one,
+        scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
+    if gauge == "norm" and builders and _has_signed_factors(program, pairs):
+        return replace(program, recover=partial(recover, signed=True), start=_signed_start(program, pairs))
+    return program
 
 
 def _start(problem: EquationError, pairs: Sequence[tuple[str, str]], gauge: str) -> dict[str, np.ndarray]:
@@ -103,10 +111,11 @@ def _start(problem: EquationError, pairs: Sequence[tuple[str, str]], gauge: str)
     return start
 
 
-def _has_signed_factors(program: Program, factors: set[int]) -> bool:
+def _has_signed_factors(program: Program, pairs: Sequence[tuple[str, str]]) -> bool:
     """Whether a constraint speaks of a mu or a b itself, and thereby decides their sign, not of ``mu bᵀ`` alone."""
     stand_in = {id(theta): cp.Variable(theta.shape) for name, theta in program.view.inner.items()
                 if name.partition("[")[0] == "Theta"}
+    factors = {program.variables[name].id for pair in pairs for name in pair}
     return any(v.id in factors for group in program.user_constraints.values() for member in group
                for v in member.tree_copy(stand_in).variables())
 

@@ -11,14 +11,11 @@ from optid.errors import DataError, DataWarning, OptidError, StructureError
 
 Array = NDArray[np.floating]
 
-EXACT_INTEGER = 2**53
-"""Largest magnitude up to which every integer is a float64 (IEEE 754, 53-bit significand)."""
-
+EXACT_INTEGER = 2**53  # largest magnitude up to which every integer is a float64 (IEEE 754, 53-bit significand)
 LARGEST = 1e150
 """Largest magnitude accepted: beyond it squares overflow, and no sensor reads it (it is a marker of lost samples)."""
 
-WRAP = 0.75
-"""A step between neighbours above this share of an integer type's range looks like a wrap-around."""
+WRAP = 0.75  # a step between neighbours above this share of an integer type's range looks like a wrap-around
 
 
 def as_samples(values: Any, what: str, names: Sequence[str] | None = None) -> np.ndarray:
@@ -117,10 +114,10 @@ def finite(values: Any, name: str) -> np.ndarray:
         array = np.array(values, dtype=float)
     except (OverflowError, TypeError, ValueError) as error:
         raise StructureError(f"{name} must be an array of real numbers ({error}).") from error
-    if not np.all(np.isfinite(array)):
-        at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
-    if array.size and np.abs(array).max() > LARGEST:
+    if not (np.abs(array) <= LARGEST).all():
+        if not np.isfinite(array).all():
+            at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
+            raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
         raise StructureError(f"{name} contains a value above {LARGEST:g}, whose square overflows.")
     array.flags.writeable = False
     return array

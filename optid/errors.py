@@ -3,8 +3,7 @@
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-MOST_LISTED = 80
-"""Words that a message lists."""
+MOST_LISTED = 80  # words that a message lists
 
 
 class OptidError(Exception):

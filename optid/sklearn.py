@@ -16,8 +16,7 @@ try:
 except ImportError as error:
     raise OptidError("optid.sklearn needs scikit-learn: pip install 'optid[sklearn]'") from error
 
-LONGEST = 10_000
-"""Samples that the free run may take to come to rest at the first input."""
+LONGEST = 10_000  # samples that the free run may take to come to rest at the first input
 
 
 class HammersteinRegressor(RegressorMixin, BaseEstimator):

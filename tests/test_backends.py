@@ -72,7 +72,7 @@ def test_known_multipliers_satisfy_the_optimality_conditions():
         if entry.outcome != "solved" or named < set(program.variables) or set(entry.duals) < set(program.constraints):
             continue
         duals = {k: np.ravel(np.asarray(v, dtype=float)) for k, v in entry.duals.items()}
-        objective, residuals = judge(program, {k: np.asarray(v, dtype=float) for k, v in entry.point.items()}, duals)
+        _, objective, residuals = judge(program, {k: np.asarray(v, dtype=float) for k, v in entry.point.items()}, duals)
         assert objective == pytest.approx(entry.value, rel=1e-12, abs=1e-12), entry.name
         assert max(residuals.violation, residuals.stationarity, residuals.complementarity) < 1e-12, entry.name
         checked += 1

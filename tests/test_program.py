@@ -1,15 +1,22 @@
 """Program: named parts, further constraints, freezing, values and duals by name."""
 
+from dataclasses import replace
+
 import cvxpy as cp
 import numpy as np
 import pytest
+from problems import record
 from zoo import CASES, case, pose
 
+from optid import Polynomial, fit
+from optid.backends import Answer, BackEnd
 from optid.errors import StructureError
+from optid.program.judging import judge
 from optid.program.program import named
 from optid.program.solution import Status
 from optid.program.view import View
 from optid.solving.solve import solve
+from optid.structures.least_squares import RankOneStructure
 
 
 def bilinear():
@@ -166,3 +173,31 @@ def test_infeasible_status_of_a_frozen_programme():
     program, _ = bilinear()
     frozen = program.subject_to(lambda v: {"sum": cp.sum(v["b"]) == 3}).freeze(b=[1.0, 0.0])
     assert solve(frozen, "clarabel").status is Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("gauge", ["norm", "gain", "b0"])
+def test_a_programme_that_is_not_stated_is_judged_as_one_that_is(gauge):
+    found, twin = (fit(record(noise=0.1), "hammerstein_arx.exact", na=2, nb=2, nk=1, basis=Polynomial(3), gauge=gauge)
+                   for _ in range(2))
+    program, at, stated = found.program, found.solution.values, replace(twin.program)
+    assert found.solution.proof and stated.is_stated and not program.is_stated and program.shapes == stated.shapes
+    for point in (at, {**at, "b": 1.1 * at["b"]}, {**at, "mu": at["mu"] + 0.1}, {**at, "a": at["a"] - 0.05}):
+        (values, value, ours), (others, same, theirs) = (judge(one, point, {}) for one in (program, stated))
+        assert value == pytest.approx(same, rel=1e-12) and ours.stationarity == pytest.approx(theirs.stationarity)
+        assert (ours.violation > 1e-4, ours.worst or "gauge") == (theirs.violation > 1e-4, theirs.worst or "gauge")
+        assert list(values) == list(others)
+        assert all(values[name] == pytest.approx(others[name], abs=1e-12) for name in values)
+    program.assign(at)
+    assert program.variables["mu"].value == pytest.approx(at["mu"])  # it is there once it is stated
+
+
+@pytest.mark.parametrize(("change", "status"), [
+    (lambda v: {"b": 1.01 * v["b"]}, Status.FAILED), (lambda v: {"mu": v["mu"] + 0.1}, Status.INACCURATE),
+    (lambda v: {"b": np.ones(3)}, Status.FAILED), (lambda v: {"a": 1e200 * v["a"]}, Status.FAILED),
+    (lambda v: {"a": np.array([np.nan, 0.0])}, Status.FAILED)])
+def test_a_lie_about_a_programme_that_is_not_stated_is_found_out(change, status):
+    found = fit(record(noise=0.1), "hammerstein_arx.exact", na=2, nb=2, nk=1, basis=Polynomial(3))
+    values = {**found.solution.values, **change(found.solution.values)}
+    liar = BackEnd("liar", frozenset(), lambda program, settings: Answer(Status.OPTIMAL, "trust me", values),
+                   structures=(RankOneStructure,))
+    assert solve(found.program, liar).status is status

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from optid.models.recursions import SHORT, lfilter
+from optid.faults import kernels
+from optid.models.recursions import SHORT, lfilter, propagated
+from optid.statistics.sensitivities import _all_pole
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -22,3 +24,24 @@ def test_short_and_long_records_are_filtered_as_scipy_does(seed):
 def test_what_grows_is_not_finite():
     assert not np.isfinite(lfilter([1.0], [1.0, -3.0], np.ones(2000))[-1])
     assert lfilter([1.0, 2.0], [1.0, -3.0], np.zeros((0, 2))).shape == (0, 2)
+
+
+@pytest.mark.parametrize("n, count, d", [(1, 1, 1), (2, 7, 3), (4, 60, 2)])
+def test_states_by_a_triangular_system_are_those_of_the_kernel(n, count, d):
+    rng = np.random.default_rng(n)
+    matrix, drive = rng.standard_normal((n, n)) / n, rng.standard_normal((count, n, d))
+    found, expected = propagated(matrix, drive), np.empty((count, n))
+    for k in range(d):
+        kernels.propagate(matrix, drive[1:, :, k].copy(), drive[0, :, k].copy(), expected)
+        assert found[:, :, k] == pytest.approx(expected, abs=1e-13)
+
+
+@pytest.mark.parametrize("na, first, count", [(1, 1, 1), (2, 3, 1), (3, 5, 2), (3, 3, 50)])
+def test_a_table_with_a_past_is_filtered_on(na, first, count):
+    rng = np.random.default_rng(na)
+    a, table = np.real(np.poly(rng.uniform(-0.9, 0.9, na)))[1:], rng.standard_normal((first + count, 4))
+    expected = table.copy()
+    for k in range(first, len(table)):
+        expected[k] -= sum(weight * expected[k - lag] for lag, weight in enumerate(a, start=1))
+    _all_pole(a, table, first)
+    assert table == pytest.approx(expected, abs=1e-13)

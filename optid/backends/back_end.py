@@ -69,21 +69,13 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Minimum:
-    """Where a method that closes a duality gap stopped.
+    """Where a method that closes a duality gap stopped."""
 
-    Attributes:
-        point: of the primal problem.
-        dual: of the dual problem, feasible.
-        value: objective at the point.
-        bound: value of the dual problem at its point.
-        iterations: number of them.
-    """
-
-    point: Any
-    dual: np.ndarray
-    value: float
-    bound: float
-    iterations: int
+    point: Any  # of the primal problem
+    dual: np.ndarray  # of the dual problem, feasible
+    value: float  # objective at the point
+    bound: float  # value of the dual problem at its point
+    iterations: int  # number of them
 
     @property
     def gap(self) -> float:

@@ -14,14 +14,9 @@ from optid.program.program import Program
 from optid.program.solution import Status, tolerance
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 
-ENTER = 40
-"""Groups that may enter at a time."""
-
-SWEEPS = 25
-"""Sweeps of block descent between Newton steps."""
-
-STALLED = 30
-"""Rounds without a better gap or value after which nothing more is to be gained in floating point."""
+ENTER = 40  # groups that may enter at a time
+SWEEPS = 25  # sweeps of block descent between Newton steps
+STALLED = 30  # rounds without a better gap or value after which nothing more is to be gained in floating point
 
 
 def run(program: Program, settings: Settings) -> Answer:

@@ -18,9 +18,7 @@ from optid.program.expressions import solve_quietly
 from optid.program.program import Program
 from optid.program.solution import Status
 
-Side = tuple[np.ndarray, np.ndarray]
-"""Rows (r, n) and right-hand sides (r,)."""
-
+Side = tuple[np.ndarray, np.ndarray]  # rows (r, n) and right-hand sides (r,)
 STATUS = {
     cp.OPTIMAL: Status.OPTIMAL,
     cp.OPTIMAL_INACCURATE: Status.INACCURATE,

@@ -62,7 +62,7 @@ def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) ->
 
 def to_values(program: Program, form: RankOneStructure, point: Point) -> dict[str, np.ndarray]:
     """Name the parts of a point, in the programme's gauge."""
-    values = form.named(point, program.variables)
+    values = form.named(point, program.shapes)
     for (mu, b), direction in zip(form.blocks, point.bs):
         size = float(np.linalg.norm(direction)) or 1.0  # the sign stays: constraints may depend on it
         if form.gauge != "norm":

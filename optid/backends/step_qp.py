@@ -47,7 +47,7 @@ class Coordinates:
 
     def unpack(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return named values for x."""
-        return self.form.named(self.point(x), self.program.variables)
+        return self.form.named(self.point(x), self.program.shapes)
 
     def assign(self, x: np.ndarray) -> None:
         """Write x into the CVXPY variables."""

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["BSpline", "Bases", "Basis", "FeedbackBases", "Linear", "PiecewiseConstant", "Polynomial", "Triangular",
            "Trigonometric", "UserFunctions", "feedback_bases", "fitted_bases", "from_dict", "parse"]
 
-Bases = Basis | str | Sequence[Basis | str]
-"""One basis, or its name as for `parse`, for all inputs, or one per input."""
+Bases = Basis | str | Sequence[Basis | str]  # one basis, or its name as for `parse`, for all inputs, or one per input
 
 FeedbackBases = Basis | str | None | Sequence[Basis | str | None]
 """One basis for all outputs, or one per output; None or "none" where nothing is fed back."""

@@ -26,17 +26,12 @@ from optid.program.structure import variable_size
 from optid.structures.least_squares import LeastSquaresStructure
 from optid.structures.multipliers import least_distance
 
-CLOSED = 1e-6
-"""Relative gap up to which a convex programme counts as solved to its optimum."""
-
-FEW = 64
-"""Scalar variables up to which the curvature of a quadratic objective is formed."""
-
+CLOSED = 1e-6  # relative gap up to which a convex programme counts as solved to its optimum
+FEW = 64  # scalar variables up to which the curvature of a quadratic objective is formed
 TANGENT = "tangent"
 """Method of a bound from a tangent: it may be weak at a good point, so that it proves but does not refute."""
 
-REACH = 2.0
-"""Half-width of the box in which a bound from a tangent holds, in sizes of the variables."""
+REACH = 2.0  # half-width of the box in which a bound from a tangent holds, in sizes of the variables
 
 
 def certify_convex(program: Program, values: Values, duals: Values, objective: float) -> Bound | None:

@@ -29,32 +29,21 @@ EFFORTS = ("instant", "ascent", "sdp")
 
 @dataclass(frozen=True, eq=False)
 class Multipliers:
-    """What a bound can be recomputed from, in the whitened coordinates of ``core``.
+    """What a bound can be recomputed from, in the whitened coordinates of ``core``."""
 
-    Attributes:
-        core: coordinates; ``core.whitening.columns`` is the change of coordinates.
-        minors: (k, k) combination of minors.
-        cuts: by block, weights (r, r, nb, nb): ``cuts[j, k]`` is the matrix W >= 0 of the product of rows j and k.
-        linear: (r,) multipliers of the constraints on the lifted vector.
-    """
-
-    core: Core
-    minors: Array
+    core: Core  # coordinates; ``core.whitening.columns`` is the change of coordinates
+    minors: Array  # (k, k) combination of minors
+    # by block, weights (r, r, nb, nb): ``cuts[j, k]`` is the matrix W >= 0 of the product of rows j and k
     cuts: dict[int, Array]
-    linear: Array
+    linear: Array  # (r,) multipliers of the constraints on the lifted vector
 
 
 @dataclass(frozen=True, eq=False)
 class Certification:
-    """Outcome of an attempt to prove a point.
+    """Outcome of an attempt to prove a point."""
 
-    Attributes:
-        bound: lower bound on the global optimum.
-        better: candidates for a better point, to restart a local method from; only from the SDP.
-    """
-
-    bound: Bound
-    better: tuple[Point, ...] = ()
+    bound: Bound  # lower bound on the global optimum
+    better: tuple[Point, ...] = ()  # candidates for a better point, to restart a local method from; only from the SDP
 
 
 @dataclass(frozen=True, eq=False)

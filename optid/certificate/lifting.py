@@ -23,19 +23,12 @@ from optid.structures.rank_one import Point, RankOne
 
 @dataclass
 class Lifted:
-    """Constraints in the two forms a certificate understands.
+    """Constraints in the two forms a certificate understands."""
 
-    Attributes:
-        linear: the rows on z.
-        cones: {block: rows C of ``C mu >= 0``}.
-        directions: {block: rows B of ``B b >= 0``}.
-        refused: name of the first constraint that has neither form, "" where all have.
-    """
-
-    linear: Linear
-    cones: dict[int, np.ndarray] = field(default_factory=dict)
-    directions: dict[int, np.ndarray] = field(default_factory=dict)
-    refused: str = ""
+    linear: Linear  # the rows on z
+    cones: dict[int, np.ndarray] = field(default_factory=dict)  # {block: rows C of ``C mu >= 0``}
+    directions: dict[int, np.ndarray] = field(default_factory=dict)  # {block: rows B of ``B b >= 0``}
+    refused: str = ""  # name of the first constraint that has neither form, "" where all have
 
     def add(self, rows: np.ndarray, right: np.ndarray, equal: bool) -> None:
         """Append rows ``rows @ z <= right`` or ``=``."""
@@ -77,7 +70,7 @@ def certify_rank_one(program: Program, values: Values, duals: Values, max_size: 
     found = certify(problem, point, cones=lifted.cones, linear=lifted.linear, max_size=max_size)
     if not found.better or swapped:
         return found.bound, None
-    return found.bound, form.named(found.better[0], program.variables)
+    return found.bound, form.named(found.better[0], program.shapes)
 
 
 def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, Point, bool]:
@@ -101,17 +94,11 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
 
 @dataclass(frozen=True)
 class Places:
-    """Where the variables of a programme, and the products of bilinear ones, stand in the lifted vector z.
+    """Where the variables of a programme, and the products of bilinear ones, stand in the lifted vector z."""
 
-    Attributes:
-        size: length of z.
-        columns: {id of a variable: its first column}.
-        stand_in: {id of the expression mu bᵀ: the variable that stands for it}.
-    """
-
-    size: int
-    columns: dict[int, int]
-    stand_in: dict[int, cp.Variable]
+    size: int  # length of z
+    columns: dict[int, int]  # {id of a variable: its first column}
+    stand_in: dict[int, cp.Variable]  # {id of the expression mu bᵀ: the variable that stands for it}
 
     def rows(self, member: Constraint) -> tuple[np.ndarray, np.ndarray] | None:
         """Return (E, f) of a constraint that reads ``E z <= f`` or ``E z = f``, or None where it does not."""
@@ -131,6 +118,8 @@ def places(program: Program, form: LeastSquaresStructure) -> Places:
 
 def lift(program: Program, form: LeastSquaresStructure) -> Lifted:
     """Bring the user constraints of a programme into lifted form."""
+    if not program.user_constraints:
+        return Lifted(Linear.none(len(form.problem.target)))
     where = places(program, form)
     lifted = Lifted(Linear.none(where.size))
     factors = {program.variables[name].id: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}

@@ -70,21 +70,13 @@ def cholesky(matrix: Array) -> Any | None:
 
 @dataclass(frozen=True, eq=False)
 class Quadratic:
-    """The objective around a feasible point, with the terms of constraints linear in z already added.
+    """The objective around a feasible point, with the terms of constraints linear in z already added."""
 
-    Attributes:
-        gram: (k, k) H.
-        z: (k,) the point.
-        slope: (k,) half the gradient of objective and linear terms at z.
-        value: objective at the point.
-        linear_terms: value at the point of the linear terms, <= 0 at a feasible point.
-    """
-
-    gram: Array
-    z: Array
-    slope: Array
-    value: float
-    linear_terms: float = 0.0
+    gram: Array  # (k, k) H
+    z: Array  # (k,) the point
+    slope: Array  # (k,) half the gradient of objective and linear terms at z
+    value: float  # objective at the point
+    linear_terms: float = 0.0  # value at the point of the linear terms, <= 0 at a feasible point
 
     def bound(self, minors: Array, cuts: Array) -> float:
         """Closed-form minimum over all z of objective + linear terms + z^T (minors - cuts) z; -inf unless H + M > 0.

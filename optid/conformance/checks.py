@@ -37,21 +37,13 @@ class ConformanceError(OptidError, AssertionError):
 
 @dataclass(frozen=True)
 class Row:
-    """One back end on one case.
+    """One back end on one case."""
 
-    Attributes:
-        case: what was solved.
-        solver: name of the back end.
-        solution: the judged outcome.
-        seconds: wall time, building included.
-        complaints: what contradicts the back end's claim; empty for a conformant run.
-    """
-
-    case: Case
-    solver: str
-    solution: Solution
-    seconds: float
-    complaints: tuple[str, ...]
+    case: Case  # what was solved
+    solver: str  # name of the back end
+    solution: Solution  # the judged outcome
+    seconds: float  # wall time, building included
+    complaints: tuple[str, ...]  # what contradicts the back end's claim; empty for a conformant run
 
 
 def accepted_cases(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list[Case]:

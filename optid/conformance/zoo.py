@@ -24,24 +24,15 @@ SOLVED, INFEASIBLE, UNBOUNDED = "solved", "infeasible", "unbounded"
 
 @dataclass(frozen=True)
 class Case:
-    """One programme and what is known about it.
+    """One programme and what is known about it."""
 
-    Attributes:
-        name: name of the case and of its programme.
-        build: makes a fresh programme.
-        value: optimal value (``nan`` unless solved).
-        point: {variable: array}, the unique minimiser or parts of it.
-        duals: {constraint: flat multipliers}, where unique.
-        outcome: "solved", "infeasible" or "unbounded".
-        hard: badly scaled or degenerate: an honest "inaccurate" or "failed" is acceptable, a wrong claim is not.
-    """
-
-    name: str
-    build: Callable[[], Program]
-    value: float = float("nan")
-    point: Mapping[str, Any] = field(default_factory=dict)
-    duals: Mapping[str, Any] = field(default_factory=dict)
-    outcome: str = SOLVED
+    name: str  # name of the case and of its programme
+    build: Callable[[], Program]  # makes a fresh programme
+    value: float = float("nan")  # optimal value (``nan`` unless solved)
+    point: Mapping[str, Any] = field(default_factory=dict)  # {variable: array}, the unique minimiser or parts of it
+    duals: Mapping[str, Any] = field(default_factory=dict)  # {constraint: flat multipliers}, where unique
+    outcome: str = SOLVED  # "solved", "infeasible" or "unbounded"
+    # badly scaled or degenerate: an honest "inaccurate" or "failed" is acceptable, a wrong claim is not
     hard: bool = False
 
 

@@ -11,6 +11,7 @@ from optid.data.record import Data, Experiment
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
+from optid.models.recursions import SHORT, propagated
 from optid.models.roots import spectral_radius
 
 if TYPE_CHECKING:
@@ -74,6 +75,10 @@ class Predictor:
             into_output: (N, l, d).
             present: (N, l) whether a reading is there; all by default.
         """
+        if present is None and len(into_output) <= SHORT:
+            drive = into_state.copy()
+            drive[1:] -= self.K @ into_output[:-1]
+            return into_output + self.C @ propagated(self.F, drive)
         from optid.faults import kernels
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present

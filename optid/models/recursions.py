@@ -47,11 +47,29 @@ def lfilter(b: ArrayLike, a: ArrayLike, x: ArrayLike) -> Array:
     y = np.zeros_like(x)
     for lag, weight in enumerate(np.asarray(b, dtype=float)[: len(x)]):
         y[lag:] += weight * x[: len(x) - lag]
-    if a.size > 1 and x.size:
-        (solve,) = get_lapack_funcs(("tbtrs",), (y,))
-        with np.errstate(all="ignore"):
-            y = solve(np.repeat(a[:, None], len(x), axis=1), y, uplo="L", diag="U")[0]
-    return y
+    return all_pole(a[1:], y) if a.size > 1 and x.size else y
+
+
+def all_pole(a: Array, x: Array) -> Array:
+    """Filter the columns of x, (N,) or (N, m), from rest by 1 / (1 + a_1 q^-1 + ...): a banded triangular system."""
+    (solve,) = get_lapack_funcs(("tbtrs",), (x,))
+    band = np.repeat(np.concatenate([[1.0], a])[:, None], len(x), axis=1)
+    with np.errstate(all="ignore"):
+        return solve(band, x, uplo="L", diag="U")[0]
+
+
+def propagated(matrix: Array, drive: Array) -> Array:
+    """Return the states (N, n, d) of x(k) = matrix x(k-1) + drive(k), from rest; N is at most `SHORT`.
+
+    They solve a banded triangular system.
+    """
+    count, n, d = drive.shape
+    band = np.zeros((2 * n, count * n))
+    band[0] = 1.0
+    for i, j in np.ndindex(n, n):
+        band[n + i - j, j::n] = -matrix[i, j]
+    (solve,) = get_lapack_funcs(("tbtrs",), (band,))
+    return solve(band, drive.reshape(count * n, d), uplo="L", diag="U")[0].reshape(drive.shape)
 
 
 def autoregression(a: Array, right: Array) -> Array:

@@ -14,7 +14,7 @@ def roots_of(coefficients: Array) -> Any:
 
 def radius(coefficients: Array) -> float:
     """Largest modulus of the roots of 1 + c_1 q^-1 + ..; zero without coefficients."""
-    return float(np.max(np.abs(roots_of(coefficients)), initial=0.0))
+    return float(np.max(np.abs(roots_of(coefficients)))) if len(coefficients) else 0.0
 
 
 def spectral_radius(matrix: Array) -> float:

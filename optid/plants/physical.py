@@ -17,8 +17,7 @@ from optid.errors import StructureError, nearest
 from optid.models.equations import Equations
 from optid.plants.sampling import as_input, as_state, check_bounded, check_parameters, gaussian
 
-STAGES = {"euler": 1, "rk4": 4}
-"""Stages of the methods of integration."""
+STAGES = {"euler": 1, "rk4": 4}  # stages of the methods of integration
 
 
 @dataclass(frozen=True)

@@ -14,19 +14,14 @@ import scipy.sparse as sp
 Map = Callable[[np.ndarray], np.ndarray]
 """Of arrays, such as from the Jacobian of an argument to its part of that of an atom."""
 
-DENSE = 100_000
-"""Entries of the Jacobian up to which an expression is small."""
-
-MOST = 30_000_000
-"""Entries up to which a large expression is differentiated here where CVXPY knows no gradient."""
-
+DENSE = 100_000  # entries of the Jacobian up to which an expression is small
+MOST = 30_000_000  # entries up to which a large expression is differentiated here where CVXPY knows no gradient
 MOVES = {"index", "special_index", "reshape", "transpose", "Hstack", "Vstack", "Concatenate", "Promote", "broadcast_to",
          "diag_vec", "diag_mat", "upper_tri", "squeeze", "Stack", "nonneg_wrap", "nonpos_wrap", "symmetric_wrap",
          "psd_wrap", "nsd_wrap", "real"}
 """Atoms that only move entries about."""
 
-PROBES = 3
-"""Random points at which the size of an expression is tried."""
+PROBES = 3  # random points at which the size of an expression is tried
 
 
 def flat(expression: cp.Expression) -> cp.Expression:

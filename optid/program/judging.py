@@ -19,18 +19,26 @@ KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNu
 """Atoms whose gradient says nothing where they have a kink."""
 
 
-def judge(program: Program, values: Values, duals: Values) -> tuple[float, Residuals]:
-    """Measure a point: recomputed objective, violation, stationarity and complementarity.
+def judge(program: Program, values: Values, duals: Values) -> tuple[Values, float, Residuals]:
+    """Measure a point: its values, the objective recomputed, violation, stationarity and complementarity.
 
     Derived variables are recomputed from the others first. The duals are flat multipliers by constraint, of which some
     may be missing; see `Residuals` for where the measurements are ``nan``.
+
+    Raises:
+        ValueError: a value of another shape than its variable.
     """
+    structure = None if program.user_constraints else program.structure
     program.assign(values)
-    violation, worst = measure_violation(program)
-    known = program.structure.measure(program) if program.structure and not program.user_constraints else None
+    if program.is_stated or structure is None:
+        values, (violation, worst) = program.values(), measure_violation(program)
+    else:
+        values = structure.complete(program, values)
+        violation, worst = structure.measure_violation(values)
+    known = None if structure is None else structure.measure(program, values)
     if known is not None:
         objective, stationarity = known
-        return objective, Residuals(violation, worst, stationarity, 0.0)
+        return values, objective, Residuals(violation, worst, stationarity, 0.0)
     objective, stationarity, complementarity = float(np.asarray(program.objective.expr.value)), np.nan, np.nan
     try:
         lagrangian = Lagrangian.of(program, duals, program.constraints)
@@ -40,7 +48,7 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[float, Resid
             complementarity = lagrangian.complementarity / size
     except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
         pass
-    return objective, Residuals(violation, worst, stationarity, complementarity)
+    return values, objective, Residuals(violation, worst, stationarity, complementarity)
 
 
 def _size(variable: cp.Variable, usual: Mapping[int, float]) -> float:

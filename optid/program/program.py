@@ -16,6 +16,8 @@ from optid.program.solution import Bound
 from optid.program.structure import Structure
 from optid.program.view import Values, View
 
+STATED = ("objective", "constraints", "variables", "view", "derived")  # what a programme says in CVXPY
+
 
 def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
     """Bring what a builder returned, CVXPY constraints or `Limit` objects, into the form {name: (limit, ...)}.
@@ -89,6 +91,48 @@ class Program:
     courses: frozenset[str] = frozenset()
     settled: bool = False
 
+    @classmethod
+    def deferred(cls, name: str, statement: Callable[[], Mapping[str, Any]], *, start: Values,
+                 structure: Structure, **known: Any) -> "Program":
+        """Return a programme that is stated in CVXPY only where something asks for the statement.
+
+        Back ends and judgement that know its structure do without; constraints of the user ask for it at once.
+
+        Args:
+            name: of the formulation.
+            statement: returns objective, constraints, variables, view and derived.
+            start: values of all variables that are not derived.
+            structure: which measures a point by itself (`Structure.complete`, `Structure.measure_violation`).
+            known: the other attributes.
+        """
+        made = cls(name, *[None] * 3, start=start, structure=structure, view=None, **known)  # type: ignore[arg-type]
+        for part in STATED:
+            del vars(made)[part]
+        vars(made)["_statement"], vars(made)["_held"] = statement, {}
+        return made
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in STATED or "_statement" not in vars(self):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        stated = vars(self)["_statement"]()
+        del vars(self)["_statement"]
+        vars(self).update(stated)
+        if held := vars(self).pop("_held"):
+            self.assign(held)
+        return vars(self)[name]
+
+    @property
+    def is_stated(self) -> bool:
+        """Whether the programme stands in CVXPY; one that is `deferred` does not until something asks for it."""
+        return "_statement" not in vars(self)
+
+    @property
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the variables that are not derived."""
+        if not self.is_stated:
+            return {name: np.shape(value) for name, value in self.start.items()}
+        return {name: variable.shape for name, variable in self.variables.items() if name not in self.derived}
+
     @property
     def implied(self) -> frozenset[str]:
         """Variables that the others determine."""
@@ -118,6 +162,8 @@ class Program:
     @property
     def user_constraints(self) -> dict[str, tuple[Constraint, ...]]:
         """The constraints that are not part of the formulation itself."""
+        if not self.is_stated:
+            return {}
         return {name: group for name, group in self.constraints.items() if name not in self.structural}
 
     def nonconvex_parts(self) -> list[str]:
@@ -231,6 +277,10 @@ class Program:
 
     def assign(self, values: Values) -> None:
         """Write values into the CVXPY variables and recompute the derived ones."""
+        if not self.is_stated:
+            vars(self)["_held"].update({name: np.asarray(values[name], dtype=float).reshape(shape, order="F")
+                                        for name, shape in self.shapes.items() if name in values})
+            return
         for name, value in values.items():
             variable = self.variables[name]
             array = np.asarray(value, dtype=float).reshape(variable.shape, order="F")
@@ -259,7 +309,7 @@ class Program:
 
     def clear_duals(self) -> None:
         """Forget the multipliers of an earlier solve, so that they cannot be mistaken for new ones."""
-        for group in self.constraints.values():
+        for group in self.constraints.values() if self.is_stated else ():
             for member in group:
                 for dual in member.dual_variables:
                     dual.value = None

@@ -1,5 +1,6 @@
 """Structure: what special methods and proofs may use of a programme beyond its statement in CVXPY."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,12 +29,24 @@ class Structure:
         """What the programme is and how large, for the reason of a choice."""
         return self.word
 
-    def measure(self, program: Any) -> tuple[float, float] | None:
-        """Return objective and relative stationarity at the assigned point of a programme without user constraints.
+    def measure(self, program: Any, values: Mapping[str, Array]) -> tuple[float, float] | None:
+        """Return objective and relative stationarity at a point of a programme without user constraints.
 
         None where the numbers tell no more than the CVXPY expressions do.
         """
         return None
+
+    def complete(self, program: Any, values: Mapping[str, Array]) -> dict[str, Array]:
+        """Return values in the shapes of the variables, derived ones computed from the others.
+
+        Raises:
+            ValueError: a value of another shape.
+        """
+        raise NotImplementedError
+
+    def measure_violation(self, values: Mapping[str, Array]) -> tuple[float, str]:
+        """Return the largest relative violation of a structural constraint at a point, and its name."""
+        raise NotImplementedError
 
 
 def relative_gradient(gradient: Array, terms: Array, yardstick: float, size: float) -> float:

@@ -14,9 +14,7 @@ import numpy as np
 
 from optid.data.channels import Transform
 
-SIGNALS = ("x", "output")
-"""Named courses of the output, one row per sample."""
-
+SIGNALS = ("x", "output")  # named courses of the output, one row per sample
 HEIGHTS = (*SIGNALS, "mu", "Theta", "offset", "x0", "states", "B", "Bu", "D", "Du", "Ez", "mu feedback",
            "Theta feedback", "static")
 """Named quantities that are proportional to the unit of the outputs; A, C, K and the norm of b have no unit."""

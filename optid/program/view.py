@@ -12,8 +12,7 @@ from optid.data.channels import Transform
 from optid.errors import StructureError, nearest
 from optid.program.units import outward
 
-Values = Mapping[str, np.ndarray]
-"""Values of variables by name."""
+Values = Mapping[str, np.ndarray]  # values of variables by name
 
 
 @dataclass(eq=False, repr=False)

@@ -124,7 +124,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution
         return replace(base, status=status, reason=reason)
     if not all(np.all(np.isfinite(value)) for value in values.values()):
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
-    if missing := set(program.variables) - set(values) - set(program.derived):
+    if missing := program.shapes.keys() - values.keys():
         return replace(base, status=Status.FAILED,
                        reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
 
@@ -161,8 +161,8 @@ def _conflict(base: Solution, reason: str) -> Solution:
 def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
     """Return a solution at the answer's point, with what we measured there."""
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
-        objective, residuals = judge(program, answer.values, answer.duals)
-    return replace(base, values=program.values(), duals=dict(answer.duals), objective=objective, residuals=residuals)
+        values, objective, residuals = judge(program, answer.values, answer.duals)
+    return replace(base, values=values, duals=dict(answer.duals), objective=objective, residuals=residuals)
 
 
 def _overflowed(program: Program) -> bool:

@@ -26,13 +26,14 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.models import recursions
-from optid.models.recursions import DEAD, PRESENT, Filtered, late_njit, lfilter
+from optid.models.recursions import DEAD, PRESENT, Filtered, all_pole, late_njit, lfilter
 from optid.statistics.linearised import Linearised, Method, compressed, eliminated, linearised
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 
 if TYPE_CHECKING:
     from optid.data.record import Data
 
+SMALL = 20_000  # entries of a table that a triangular solution filters sooner than numba is imported
 CHUNK = 4096  # samples whose sensitivities are formed at a time: they stay in the processor's cache
 # values of basis functions that are kept between linearisations: as many as stay in the processor's cache
 TABLE = 1 << 18
@@ -216,8 +217,14 @@ def _through(d: Array, table: Array) -> Array:
 
 def _all_pole(a: Array, table: Array, first: int) -> None:
     """Filter the columns of a table (first + T, K) by 1 / A in place; its first rows, at least na, are filtered."""
-    if len(a):
+    if len(a) and table.size > SMALL:
         late_njit(_march)(np.ascontiguousarray(a), table, first)
+    elif len(a):
+        right, count = table[first:], len(table) - first
+        for lag, weight in enumerate(a, start=1):
+            n = min(lag, count)
+            right[:n] -= weight * table[first - lag : first - lag + n]
+        right[:] = all_pole(a, right)
 
 
 def _march(a: Array, table: Array, first: int) -> None:

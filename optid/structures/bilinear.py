@@ -5,6 +5,7 @@ Newton's method with Levenberg damping acts in one factor, the other one elimina
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -19,21 +20,13 @@ TOLERANCE = 1e-12  # on the tangent gradient relative to ||R^T s||
 
 @dataclass(frozen=True, eq=False)
 class LocalSolution:
-    """What a local method returns.
+    """What a local method returns."""
 
-    Attributes:
-        point: in the gauge ||b|| = 1.
-        value: objective there.
-        iterations: steps taken.
-        gradient: gradient in the tangent space over ||R^T s||, in whitened coordinates.
-        converged: whether the gradient tolerance was reached.
-    """
-
-    point: Point
-    value: float
-    iterations: int
-    gradient: float
-    converged: bool
+    point: Point  # in the gauge ||b|| = 1
+    value: float  # objective there
+    iterations: int  # steps taken
+    gradient: float  # gradient in the tangent space over ||R^T s||, in whitened coordinates
+    converged: bool  # whether the gradient tolerance was reached
 
 
 def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array], list[Array]]]:
@@ -44,7 +37,7 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
     factors = list(zip(estimates, core.whitening.factors_mu, core.whitening.factors_b))
     white = [np.linalg.svd(left.T @ theta @ right, full_matrices=False) for theta, left, right in factors]
     rank = [min(shape) for shape in core.shapes]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed) if count > 4 else None
 
     def pair(svd, k):
         return svd[0][:, k] * svd[1][k], svd[2][k]
@@ -54,7 +47,7 @@ def starts(core: Core, count: int = 8, seed: int = 0) -> list[tuple[list[Array],
         if k == 1:
             plain = [pair(np.linalg.svd(theta, full_matrices=False), 0) for theta in estimates]
             mus, bs = core.whitening.forward(*zip(*plain))
-        elif k < 4:
+        elif k < 4 or rng is None:
             mus, bs = zip(*(pair(svd, max(k - 1, 0) % r) for svd, r in zip(white, rank)))
         else:
             bs = [rng.standard_normal(nb) for _, nb in core.shapes]
@@ -127,12 +120,12 @@ class _Projected:
     @classmethod
     def at(cls, pieces: list[Array], target: Array, bs: list[Array]) -> "_Projected":
         units = [_unit(b) for b in bs]
-        design = np.concatenate([np.tensordot(b, piece, 1) for piece, b in zip(pieces, units)], axis=1)
+        design = _regressors(pieces, units)
         basis, triangle = np.linalg.qr(design)
-        diagonal = np.abs(np.diag(triangle))
-        regular = bool(np.min(diagonal) > 1e-13 * np.max(diagonal))  # no input without effect, no two that are one
+        diagonal = np.abs(triangle.diagonal())
+        regular = bool(diagonal.min() > 1e-13 * diagonal.max())  # no input without effect, no two that are one
         mus = _trtrs(triangle, basis.T @ target)[0] if regular else np.linalg.lstsq(design, target, rcond=1e-13)[0]
-        split = np.split(mus, np.cumsum([piece.shape[2] for piece in pieces])[:-1])
+        split = _split(mus, [piece.shape[2] for piece in pieces])
         return cls(pieces, units, split, basis, triangle, regular, design @ mus - target)
 
     @property
@@ -147,7 +140,7 @@ class _Projected:
 
     def moved(self, step: Array) -> list[Array]:
         """Return the b_i after a step in units of the mu_i; those of a mu_i that vanishes stay."""
-        parts = np.split(step, np.cumsum([b.size for b in self.bs])[:-1])
+        parts = _split(step, [b.size for b in self.bs])
         return [b + part / size if size > 0 else b for b, part, size in zip(self.bs, parts, self.sizes)]
 
     def curvature(self, root: Array, shapes: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
@@ -165,7 +158,7 @@ class _Projected:
         if self.regular:
             mixed = mixed + _trtrs(self.triangle, forces, trans=1)[0]
         hessian = across.T @ across - mixed.T @ mixed
-        weight, column = max(float(np.trace(hessian)) / len(hessian), np.finfo(float).tiny), 0
+        weight, column = max(float(hessian.trace()) / len(hessian), np.finfo(float).tiny), 0
         for b in self.bs:
             hessian[column : column + b.size, column : column + b.size] += weight * np.outer(b, b)
             column += b.size
@@ -180,10 +173,21 @@ def _unit(factor: Array) -> Array:
 
 def _half_steps(pieces: list[Array], target: Array, bs: list[Array]) -> list[Array]:
     """Least squares for all mu_i with the b_i fixed, then for all b_i with the mu_i fixed; directions alone count."""
-    design = np.concatenate([np.tensordot(_unit(b), piece, 1) for piece, b in zip(pieces, bs)], axis=1)
-    mus = np.split(_normal_equations(design, target), np.cumsum([piece.shape[2] for piece in pieces])[:-1])
+    design = _regressors(pieces, [_unit(b) for b in bs])
+    mus = _split(_normal_equations(design, target), [piece.shape[2] for piece in pieces])
     design = np.concatenate([(piece @ _unit(mu)).T for piece, mu in zip(pieces, mus)], axis=1)
-    return np.split(_normal_equations(design, target), np.cumsum([piece.shape[0] for piece in pieces])[:-1])
+    return _split(_normal_equations(design, target), [piece.shape[0] for piece in pieces])
+
+
+def _regressors(pieces: list[Array], bs: list[Array]) -> Array:
+    """Regressors (k, sum P) of all mu_i with the b_i fixed."""
+    return np.concatenate([np.dot(b, piece.reshape(len(b), -1)).reshape(piece.shape[1:])
+                           for piece, b in zip(pieces, bs)], axis=1)
+
+
+def _split(vector: Array, sizes: Sequence[int]) -> list[Array]:
+    """Cut a vector into parts of these sizes."""
+    return [vector[start:stop] for start, stop in pairwise(accumulate(sizes, initial=0))]
 
 
 def _normal_equations(design: Array, target: Array) -> Array:

@@ -18,28 +18,21 @@ from optid.arrays import Array
 from optid.errors import StructureError
 from optid.program.structure import Structure
 
-SPREAD = 1e-8
-"""Columns of a group may differ from an orthogonal set of one length by this much."""
+SPREAD = 1e-8  # columns of a group may differ from an orthogonal set of one length by this much
 
 
 @dataclass(frozen=True, eq=False)
 class GroupProblem:
     """One problem; the columns of a group are orthogonal and of one length, or zero.
 
-    Attributes:
-        design: (m, p) M.
-        target: (m,) r.
-        edges: (G + 1,) columns edges[g]:edges[g + 1] are group g.
-        weights: (G,) w, positive.
-
     Raises:
         StructureError: shapes that do not fit, weights that are not positive, columns that are not orthogonal.
     """
 
-    design: Array
-    target: Array
-    edges: np.ndarray
-    weights: Array
+    design: Array  # (m, p) M
+    target: Array  # (m,) r
+    edges: np.ndarray  # (G + 1,) columns edges[g]:edges[g + 1] are group g
+    weights: Array  # (G,) w, positive
 
     def __post_init__(self) -> None:
         m, p = self.design.shape
@@ -100,17 +93,13 @@ class GroupProblem:
 
 @dataclass(frozen=True, eq=False)
 class GroupSparseStructure(Structure):
-    """P(a) with lambda as the parameter ``lambda``; the constraint ``residual`` defines r - M a as a variable.
-
-    Attributes:
-        problem: the numbers.
-        blocks: {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row.
-    """
+    """P(a) with lambda as the parameter ``lambda``; the constraint ``residual`` defines r - M a as a variable."""
 
     word: ClassVar[str] = "group-sparse"
     penalty: ClassVar[str] = "lambda"
     residual: ClassVar[str] = "residual"
-    problem: GroupProblem
+    problem: GroupProblem  # the numbers
+    # {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row
     blocks: Mapping[str, tuple[int, ...]]
 
     @property

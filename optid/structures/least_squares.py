@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import chain
+from itertools import accumulate, chain, pairwise
+from math import prod
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,20 +18,14 @@ class LeastSquaresStructure(Structure):
     """``F = ‖R z - s‖² + remainder`` with ``z = [linear variables; vec(mu_i b_iᵀ)]``.
 
     The structural constraints of its programme only fix directions that do not change F.
-
-    Attributes:
-        problem: the numbers, see `optid.program.compressed.Compressed`.
-        linear: names of the linear variables in the order of z (each flattened column by column).
-        blocks: (mu name, b name) of every rank-one block; none without products.
-        gauge: what fixes the scale between mu and b: "norm", "gain" or "b0".
     """
 
     word: ClassVar[str] = "least-squares"
     constrained: ClassVar[bool] = True
-    problem: Any
-    linear: tuple[str, ...]
-    blocks: tuple[tuple[str, str], ...] = ()
-    gauge: str = "norm"
+    problem: Any  # the numbers, see `optid.program.compressed.Compressed`
+    linear: tuple[str, ...]  # names of the linear variables in the order of z (each flattened column by column)
+    blocks: tuple[tuple[str, str], ...] = ()  # (mu name, b name) of every rank-one block; none without products
+    gauge: str = "norm"  # what fixes the scale between mu and b: "norm", "gain" or "b0"
 
     @property
     def names(self) -> list[str]:
@@ -46,22 +41,21 @@ class LeastSquaresStructure(Structure):
         return Point(self.flat(values), tuple(np.asarray(values[mu], dtype=float) for mu, _ in self.blocks),
                      tuple(np.ravel(values[b], order="F") for _, b in self.blocks))
 
-    def measure(self, program: Any) -> tuple[float, float]:
+    def measure(self, program: Any, values: Mapping[str, Array]) -> tuple[float, float]:
         """Return objective and stationarity; the gauge has multiplier zero, since F does not depend on it."""
-        problem, usual = self.problem, program.usual_sizes
-        point = self.point({name: variable.value for name, variable in program.variables.items()})
+        problem, point = self.problem, self.point(values)
         r = problem.root @ point.lift() - problem.target
         value = float(r @ r) + problem.remainder
         pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
         if self.blocks:
             slope = point.tangent()
             pull, effort = slope.T @ pull, np.abs(slope.T) @ effort
-        variables = [program.variables[name] for name in self.names]
-        edges = np.cumsum([variable.size for variable in variables])[:-1]
         yardstick, worst = max(value, program.scale), 0.0
-        for variable, gradient, terms in zip(variables, np.split(pull, edges), np.split(effort, edges)):
-            size = variable_size(variable.value, usual.get(variable.id))
-            worst = max(worst, relative_gradient(np.abs(gradient), terms, yardstick, size))
+        edges = accumulate((np.size(values[name]) for name in self.names), initial=0)
+        for name, (first, last) in zip(self.names, pairwise(edges)):
+            usual = float(np.max(np.abs(program.start.get(name, 0.0)), initial=0.0)) or None
+            size = variable_size(values[name], usual)
+            worst = max(worst, relative_gradient(np.abs(pull[first:last]), effort[first:last], yardstick, size))
         return value, worst
 
 
@@ -77,13 +71,35 @@ class RankOneStructure(LeastSquaresStructure):
         """What the programme is and how large."""
         return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
 
-    def named(self, point: Point, variables: Mapping[str, Any]) -> dict[str, Array]:
+    def named(self, point: Point, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
         """Name the parts of a point, in the shapes of the variables."""
-        parts = np.split(point.w, np.cumsum([variables[name].size for name in self.linear])[:-1])
+        parts = np.split(point.w, np.cumsum([prod(shapes[name]) for name in self.linear])[:-1])
         found = dict(zip(self.linear, parts))
         for (mu, b), *pair in zip(self.blocks, point.mus, point.bs):
             found |= zip((mu, b), pair)
-        return {name: np.reshape(part, variables[name].shape, order="F") for name, part in found.items()}
+        return {name: np.reshape(part, shapes[name], order="F") for name, part in found.items()}
+
+    def complete(self, program: Any, values: Mapping[str, Array]) -> dict[str, Array]:
+        """Return values in the shapes of the variables, and the residual ``R z - s``."""
+        shapes = program.shapes
+        found = {name: np.array(values[name], dtype=float).reshape(shapes[name], order="F") for name in self.names}
+        return {**found, "residual": self.problem.root @ self.point(found).lift() - self.problem.target}
+
+    def measure_violation(self, values: Mapping[str, Array]) -> tuple[float, str]:
+        """Return the largest violation of the gauge, relative to its terms."""
+        a, worst = np.asarray(values.get("a", np.zeros(0))), 0.0
+        for _, name in self.blocks:
+            b = np.asarray(values[name])
+            if self.gauge == "norm":
+                left, right, terms = float(np.sum(b**2)), 1.0, 2.0
+            elif self.gauge == "b0":
+                left, right, terms = float(b.flat[0]), 1.0, 2.0
+            else:
+                left, right = float(np.sum(b)), 1.0 + float(np.sum(a))
+                terms = 1.0 + float(np.sum(np.abs(b)) + np.sum(np.abs(a)))
+            amount = abs(left - right) / terms
+            worst = worst if amount <= worst else amount  # also nan
+        return (worst, "gauge") if worst else (0.0, "")
 
 
 def rank_one_of(program: Any) -> RankOneStructure | None:

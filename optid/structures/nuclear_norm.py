@@ -25,16 +25,11 @@ class Predictor:
     """Known signals that enter through lower block Toeplitz matrices, and a constant for every block row.
 
     ``(T Phi)_i = sum_k t_k phi(i - k) + c_i``, k from 0 for the direct signals, from 1 for the others.
-
-    Attributes:
-        windows: (alpha, d, j): signal c at sample i of window w.
-        direct: (d,) whether a signal acts at once.
-        constant: whether every block row has a constant of its own.
     """
 
-    windows: Array
-    direct: np.ndarray
-    constant: bool
+    windows: Array  # (alpha, d, j): signal c at sample i of window w
+    direct: np.ndarray  # (d,) whether a signal acts at once
+    constant: bool  # whether every block row has a constant of its own
 
     @cached_property
     def places(self) -> np.ndarray:
@@ -109,23 +104,14 @@ class Predictor:
 
 @dataclass(frozen=True, eq=False)
 class NuclearProblem:
-    """The numbers of one structured problem.
+    """The numbers of one structured problem."""
 
-    Attributes:
-        y: (T, l) measured outputs of all experiments, stacked; NaN where missing: these are free.
-        starts: (j,) first sample of every window.
-        rows: number alpha of block rows.
-        left: (r, alpha l) weight on the left, or None for none.
-        right: (j, q) weight on the right, or None for none.
-        predictor: known signals, only without weights; None for none.
-    """
-
-    y: Array
-    starts: np.ndarray
-    rows: int
-    left: Array | None = None
-    right: Array | None = None
-    predictor: Predictor | None = None
+    y: Array  # (T, l) measured outputs of all experiments, stacked; NaN where missing: these are free
+    starts: np.ndarray  # (j,) first sample of every window
+    rows: int  # number alpha of block rows
+    left: Array | None = None  # (r, alpha l) weight on the left, or None for none
+    right: Array | None = None  # (j, q) weight on the right, or None for none
+    predictor: Predictor | None = None  # known signals, only without weights; None for none
 
     @property
     def l(self) -> int:  # noqa: E743 - the field's letter

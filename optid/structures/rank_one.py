@@ -25,23 +25,17 @@ from optid.structures.whitening import Whitening, block_slices, whiten
 class RankOne:
     """A least-squares problem in rank-one blocks.
 
-    Attributes:
-        root: (n, n) upper triangular R.
-        target: (n,) right-hand side s.
-        remainder: the part of the objective no parameter changes, >= 0.
-        blocks: shape (P_i, nb_i) of every Theta_i; column order as in vec_F, that is kron(b_i, mu_i).
-        linear: number of leading unknowns w outside the blocks.
-        scale: Y^T Y, the energy against which a vanishing objective is judged; by default ||s||^2 + remainder.
-
     Raises:
         StructureError: shapes that do not fit together, or a root that is not triangular.
     """
 
-    root: Array
-    target: Array
-    remainder: float
+    root: Array  # (n, n) upper triangular R
+    target: Array  # (n,) right-hand side s
+    remainder: float  # the part of the objective no parameter changes, >= 0
+    # shape (P_i, nb_i) of every Theta_i; column order as in vec_F, that is kron(b_i, mu_i)
     blocks: tuple[tuple[int, int], ...]
-    linear: int = 0
+    linear: int = 0  # number of leading unknowns w outside the blocks
+    # Y^T Y, the energy against which a vanishing objective is judged; by default ||s||^2 + remainder
     scale: float = field(default=float("nan"))
 
     def __post_init__(self):

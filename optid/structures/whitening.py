@@ -7,6 +7,7 @@ Kronecker product still makes starts, Newton steps and proofs of optimality well
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -61,25 +62,17 @@ def symmetric_root(matrix: Array) -> Array:
 
 def block_slices(shapes: Sequence[tuple[int, int]], first: int = 0) -> list[slice]:
     """Columns of every block in a lifted vector whose first block begins at a column."""
-    edges = first + np.cumsum([0, *(p * nb for p, nb in shapes)])
-    return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
+    return [slice(start, stop) for start, stop in pairwise(accumulate((p * nb for p, nb in shapes), initial=first))]
 
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """The change of coordinates ``Theta_i' = L_mu,i^T Theta_i L_b,i`` and, for kept linear unknowns, ``w' = R_w w``.
+    """The change of coordinates ``Theta_i' = L_mu,i^T Theta_i L_b,i`` and, for kept linear unknowns, ``w' = R_w w``."""
 
-    Attributes:
-        shapes: (P_i, nb_i) of every block.
-        factors_mu: (P_i, P_i) lower triangular.
-        factors_b: (nb_i, nb_i) lower triangular.
-        factor_w: (linear, linear) upper triangular.
-    """
-
-    shapes: tuple[tuple[int, int], ...]
-    factors_mu: tuple[Array, ...]
-    factors_b: tuple[Array, ...]
-    factor_w: Array
+    shapes: tuple[tuple[int, int], ...]  # (P_i, nb_i) of every block
+    factors_mu: tuple[Array, ...]  # (P_i, P_i) lower triangular
+    factors_b: tuple[Array, ...]  # (nb_i, nb_i) lower triangular
+    factor_w: Array  # (linear, linear) upper triangular
 
     @property
     def linear(self) -> int:
