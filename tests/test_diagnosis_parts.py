@@ -20,7 +20,7 @@ from optid.faults.diagnosis.answers import Remaining
 from optid.faults.diagnosis.intervals import mixture_intervals, onset_range
 from optid.faults.diagnosis.posterior import SPREADS, marginal, several, single, smallest_set
 from optid.faults.search.pair_search import pairs
-from optid.faults.signature_space import signature_space
+from optid.faults.search.sweeps import sweep
 from optid.faults.whitening import Whitened, predictor
 
 LOAD = np.array([0.3, -0.2, 0.5])
@@ -66,9 +66,10 @@ def test_more_magnitudes_are_paid_for():
 
 def test_a_healthy_window_makes_a_candidate_probable_no_oftener_than_it_may():
     """A likelihood averaged over a prior exceeds a limit in health with one over the limit as probability at most."""
-    ruler = signature_space(dictionary(small(), state_jump=False), 40).rulers[0]
+    space = sweep(dictionary(small(), state_jump=False), 40)
     windows = np.random.default_rng(3).standard_normal((4000, 40, 2))
-    ratios = np.exp(marginal(np.sum(ruler.scores(windows) ** 2, axis=2), 1)).mean(axis=1)
+    energies = np.array([space.statistic(space.correlations(r))[0, space.tested[0]] for r in windows])
+    ratios = np.exp(marginal(energies, 1)).mean(axis=1)
     for limit in (2, 5, 20, 100):
         assert np.mean(ratios >= limit) <= 1 / limit
     assert np.mean(ratios >= 2) > 0.005
@@ -86,7 +87,7 @@ def test_two_candidates_together_are_dense_least_squares(found):
     u = np.repeat(np.random.default_rng(1).uniform(-1, 1, (12, 2)), 5, axis=0)
     search = scan(found, whitened, u)
     limits = thresholds(found, 60, u=u, draws=5000)
-    best = pairs(search, limits).best
+    best = pairs(search, limits).ranked[0]
     candidates = [found[label] for label in best.labels]
     together = several(search, candidates, best.onsets, 4)
     assert together.energies.max() == pytest.approx(best.energy, rel=1e-8)
@@ -144,9 +145,9 @@ def test_an_interval_of_what_nothing_is_known_of_is_everything():
 
 def test_the_onset_interval_is_the_hull_of_the_most_probable_onsets():
     onsets, weights = np.array([10, 11, 12, 30]), np.array([0.2, 0.5, 0.26, 0.04])
-    assert tuple(onset_range(onsets, weights, 0.95, 11)) == (11, 10, 12)
-    assert tuple(onset_range(onsets, weights, 0.99, 11)) == (11, 10, 30)
-    assert tuple(onset_range(onsets, weights, 0.5, 30)) == (30, 11, 30)
+    assert onset_range(onsets, weights, 0.95, 11) == (10, 12)
+    assert onset_range(onsets, weights, 0.99, 11) == (10, 30)
+    assert onset_range(onsets, weights, 0.5, 30) == (11, 30)
 
 
 def test_intervals_hold_the_size_although_the_onset_is_searched():
@@ -199,10 +200,9 @@ def test_a_burst_in_the_rest_is_found(found):
 
 def test_the_p_value_of_an_alarm_is_its_level_at_the_threshold_and_fits_a_simulation():
     assert alarm_probability(0.0, 0.01) == pytest.approx(0.01)
-    space = signature_space(dictionary(small(), state_jump=False), 60)
-    limits = space.thresholds(0.02, 10_000, 0)
-    gains = np.concatenate([
-        (space.statistics(part) - limits).max(axis=1) for part in space.healthy(10_000, 1)])
+    faults = dictionary(small(), state_jump=False)
+    windows = np.random.default_rng(1).standard_normal((10_000, 60, 2))
+    gains = (sweep(faults, 60).largest(windows) - thresholds(faults, 60, 0.02, draws=10_000).q).max(axis=1)
     for level in (0.005, 0.02, 0.08):
         share = np.mean([alarm_probability(float(gain), 0.02) <= level for gain in gains])
         assert abs(share - level) < 0.2 * level + 3 * np.sqrt(level / 10_000)

@@ -11,8 +11,7 @@ from test_fault_scan import record
 from optid import Data
 from optid.errors import StructureError
 from optid.faults import Fault, bounded, dictionary, inject, scan, severity, whiten
-from optid.faults.search.box_kernels import boxed
-from optid.faults.search.losses import bounds_of
+from optid.faults.search.losses import boxed
 
 
 @pytest.mark.slow
@@ -23,8 +22,7 @@ def test_all_faces_find_the_optimum_of_the_box(d):
     y = 2 * rng.normal(size=(200, 8))
     low, high = -rng.uniform(0, 1, d), rng.uniform(0, 1, d)
     high[-1] = np.inf
-    sizes, values = np.empty((200, d)), np.empty(200)
-    boxed(np.einsum("tki,tkj->tij", G, G), np.einsum("tki,tk->ti", G, y), low, high, 1e-10, sizes, values)
+    sizes, values = boxed(np.einsum("tki,tkj->tij", G, G), np.einsum("tki,tk->ti", G, y), low, high)
     for one, target, nu, value in zip(G, y, sizes, values):
         expected = lsq_linear(one, target, (low, high), tol=1e-14)
         np.testing.assert_allclose(nu, expected.x, atol=1e-6)
@@ -46,16 +44,16 @@ def test_bounds_at_every_onset_are_a_quadratic_programme(real_data):
         one = bounded(result, label)
         for onset in range(0, 150, 10):
             G = result.signature(label, onset).reshape(320, -1)
-            expected = lsq_linear(G, result.whitened.r.ravel(), one.bounds, tol=1e-14)
+            expected = lsq_linear(G, result.whitened.r.ravel(), (one.low, one.high), tol=1e-14)
             np.testing.assert_allclose(one.sizes[onset], expected.x, atol=1e-5)
             energy = np.sum(result.whitened.r**2)
             assert abs(one.statistic[onset] - (energy - 2 * expected.cost)) < 1e-5
-        free = (one.sizes > one.bounds.low) & (one.sizes < one.bounds.high)
+        free = (one.sizes > one.low) & (one.sizes < one.high)
         there = ~np.isnan(one.sizes)
         slopes = np.where(there, one.multipliers, 0.0) / (1 + np.nanmax(np.abs(result.correlations)))
         assert np.abs(slopes[free & there]).max() < 1e-9
-        assert slopes[(one.sizes == one.bounds.low) & there].max(initial=0) <= 1e-12
-        assert slopes[(one.sizes == one.bounds.high) & there].min(initial=0) >= -1e-12
+        assert slopes[(one.sizes == one.low) & there].max(initial=0) <= 1e-12
+        assert slopes[(one.sizes == one.high) & there].min(initial=0) >= -1e-12
         both = ~np.isnan(one.statistic)
         assert np.all(one.statistic[both] <= result.statistic[result.index(label), both] + 1e-7)
 
@@ -64,16 +62,16 @@ def test_the_constant_of_a_stuck_actuator_is_in_the_image_of_its_function(real_d
     model, _ = standard(real_data)
     result = broken(model, Fault.stuck("actuator:u1", 100, 1.1))
     f = model.nonlinearities[0]
-    bounds = bounds_of(result, "actuator:u1 stuck")
-    np.testing.assert_allclose(bounds, [[0, f(-1.2)], [1, f(1.2)]], atol=1e-9)
-    np.testing.assert_allclose(bounds_of(result, "actuator:u1 stuck", (-0.5, 0.5)), [[0, f(-0.5)], [1, f(0.5)]])
+    for reach in (1.2, 0.5):
+        one = bounded(result, "actuator:u1 stuck", reach=None if reach == 1.2 else (-reach, reach))
+        np.testing.assert_allclose([one.low, one.high], [[0, f(-reach)], [1, f(reach)]], atol=1e-9)
     free = broken(small(), ())
-    assert np.isinf(bounds_of(free, "actuator:u1 stuck").high[1])  # a linear actuator has no interval
+    assert np.isinf(bounded(free, "actuator:u1 stuck").high[1])  # a linear actuator has no interval
     several = dictionary(with_feedback(feedback=(), E=None, output_of=()), kinds="stuck")
     u = 0.5 * np.random.default_rng(0).normal(size=(60, 2))
     data = Data(u, inject(several.model, u, seed=1), dt=0.5, outputs=["p", "q"])
     wide = scan(several, whiten(several.model, data, x0="zero"), u)
-    assert bounds_of(wide, "actuator:u2 stuck").low.size == 3
+    assert bounded(wide, "actuator:u2 stuck").low.size == 3
 
 
 @pytest.mark.parametrize("fault, hard_over, share", [

@@ -13,7 +13,6 @@ from optid import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, model_uncertainty, scan, thresholds, whiten
 from optid.faults.search.sweeps import sweep
-from optid.faults.signature_space import signature_space
 
 LOAD = np.array([0.3, -0.2, 0.5])
 KINDS = ["bias", "drift", "loss", "stuck"]
@@ -199,12 +198,6 @@ def test_states_of_the_predictor_with_feedback_and_gaps():
     white = whiten(model, Data(u, y, dt=0.5, outputs=["p", "q"]), x0=[0.1, 0.0, -0.1])
     predicted = white.states @ model.C.T + model.expanded(u) @ model.D.T + model.offset_y
     np.testing.assert_allclose((y - predicted)[white.present], white.innovations[white.present], atol=1e-9)
-
-
-def test_the_convolution_of_the_forecast_agrees():
-    found = dictionary(small(), kinds=["bias", "drift"], process={"load": LOAD})
-    windows = np.random.default_rng(0).normal(size=(5, 40, 2))
-    np.testing.assert_allclose(sweep(found, 40).largest(windows), signature_space(found, 40).statistics(windows))
 
 
 def test_a_fault_is_found_where_it_is(real_data):

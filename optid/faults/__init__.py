@@ -18,7 +18,7 @@ _HOME = {
     "isolability": ["Isolability"],
     "search.scanning": ["scan", "Scan"],
     "search.losses": ["bounded", "severity", "Severity"],
-    "search.pair_search": ["pairs", "PairSearch"],
+    "search.pair_search": ["pairs"],
     "search.calibration": ["thresholds", "Thresholds"],
     "search.empirical": ["sliding_scan", "SlidingScan", "empirical_thresholds", "EmpiricalThresholds"],
     "search.programmes": ["signature_estimate", "membership", "profile", "noise_covariance"],

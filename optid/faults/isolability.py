@@ -5,7 +5,7 @@ the search over all candidates and onsets is run on many of them. The formula fo
 optimistic, because the onset is searched, too.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,7 +13,9 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.signature_space import InputRuler, Ruler, SignatureSpace, signature_space
+from optid.faults.search.calibration import check_draws, family_thresholds
+from optid.faults.search.scanning import shorten
+from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
 
 if TYPE_CHECKING:
@@ -126,8 +128,8 @@ class Isolability:
             rival = self.rivals[i]
             sine = f"{self.sines[i, self.labels.index(rival)]:6.3f}" if rival else ""
             lines.append(
-                f"{i + 1:>3}  {_cut(label, 23):<24}{_size(self.detectable[i]):>9}{_size(self.isolable[i]):>9}"
-                f"  {_cut(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
+                f"{i + 1:>3}  {shorten(label, 23):<24}{_size(self.detectable[i]):>9}{_size(self.isolable[i]):>9}"
+                f"  {shorten(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
             )
         lines += ["", "smallest size of the fault of a row that is told from the one of a column"]
         wide = 7
@@ -189,31 +191,47 @@ def study(
         raise StructureError(f"prob={prob!r}; a probability from 0.5 to below 1 is needed.")
     if isinstance(onset, str) and onset != "unknown":
         raise StructureError(f"onset={onset!r}: use 'unknown' or the number of a sample.")
+    check_draws(false_alarm, calibration)
     known = None if isinstance(onset, str) else int(onset)
-    space = signature_space(found, window, known, u)
+    if known is not None and not 0 <= known < window:
+        raise StructureError(f"onset={known} lies outside the window of {window} samples.")
+    space = sweep(found, window, u)
+    if known is not None:
+        space = replace(space, tested=(space.blocks.sizes > 0)[:, None] & (np.arange(window) == known))
+    named = np.flatnonzero(space.blocks.sizes)
+    candidates = [found.candidates[c] for c in named]
     first, second = np.random.SeedSequence(seed).generate_state(2)
-    thresholds = space.thresholds(false_alarm, calibration, int(first))
+    windows = space.simulated(calibration, np.random.default_rng(int(first)))
+    energies = np.nan_to_num(np.vstack([space.largest(part) for part in windows])[:, named])
+    thresholds = family_thresholds(energies, false_alarm)
     rng = np.random.default_rng(int(second))
-    noise = [np.concatenate(parts) for parts in zip(
-        *([ruler.scores(part) for ruler in space.rulers] for part in space.healthy(draws, int(second) + 1)))]
-    count = len(space.rulers)
-    curves = [_curves(space, c, noise, thresholds, known, rng) for c in range(count)]
+    healthy = np.concatenate(list(space.simulated(draws, np.random.default_rng(int(second) + 1))))
+    noise = _scores(space, healthy)
+    curves = [_curves(space, place, noise, thresholds, known, rng) for place in range(named.size)]
     detected, isolated = np.array([c.detected for c in curves]), np.array([c.isolated for c in curves])
     unit = np.array([c.unit for c in curves])
     matrix = np.array([[_crossing(p, prob, draws) for p in c.preferred] for c in curves]) / unit[:, None]
     isolable = np.array([_crossing(p, prob, draws) for p in isolated])
-    whole = np.array([1.0 if ruler.candidate.kind == "loss" else np.inf for ruler in space.rulers])
     detectable = np.array([_crossing(p, prob, draws) for p in detected])
-    sizes = [_possible(d / unit, whole) for d in (detectable, isolable)]
+    # more than the whole cannot be lost
+    whole = np.array([1.0 if c.kind == "loss" else np.inf for c in candidates])
+    sizes = [np.where(d / unit > whole, np.inf, d / unit) for d in (detectable, isolable)]
+    labels = tuple(c.label for c in candidates)
     return Isolability(
-        labels=space.labels, window=window, onset=onset, prob=prob, false_alarm=false_alarm, detectable=sizes[0],
-        isolable=sizes[1], matrix=_possible(matrix.T, whole).T,
-        sines=np.array([_sines(space, ruler, known) for ruler in space.rulers]), unit=unit,
-        rivals=tuple(_rival(space, c, at) for c, at in zip(curves, isolable)),
-        bounded=np.array([ruler.candidate.bounded_deflection for ruler in space.rulers]),
-        excluded=dict(found.excluded), skipped=space.skipped, thresholds=thresholds, detected=detected,
-        isolated=isolated, draws=draws,
+        labels=labels, window=window, onset=onset, prob=prob, false_alarm=false_alarm, detectable=sizes[0],
+        isolable=sizes[1], matrix=np.where(matrix > whole[:, None], np.inf, matrix),
+        sines=np.array([_sines(space, int(c), known) for c in named]), unit=unit,
+        rivals=tuple(_rival(labels, c, at) for c, at in zip(curves, isolable)),
+        bounded=np.array([c.bounded_deflection for c in candidates]), excluded=dict(found.excluded),
+        skipped=tuple(c.label for c in found.candidates if c not in candidates), thresholds=thresholds,
+        detected=detected, isolated=isolated, draws=draws,
     )
+
+
+def _scores(space: Sweep, windows: Array) -> list[Array]:
+    """Coordinates (M, T, d) of windows along every candidate at the onsets that are searched."""
+    found = np.stack([space.correlations(window) for window in windows])
+    return [space.coordinates(found, int(c))[:, space.tested[c]] for c in np.flatnonzero(space.blocks.sizes)]
 
 
 class _Curves(NamedTuple):
@@ -235,45 +253,42 @@ class _Curves(NamedTuple):
 
 
 def _curves(
-    space: SignatureSpace, c: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
+    space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
 ) -> _Curves:
-    ruler, draws = space.rulers[c], len(noise[0])
-    low, high = (int(share * space.window) for share in MIDDLE)
+    c, draws, window = int(np.flatnonzero(space.blocks.sizes)[place]), len(noise[0]), space.window
+    low, high = (int(share * window) for share in MIDDLE)
     onsets = np.full(draws, known) if known is not None else rng.integers(low, max(high, low + 1), draws)
-    sizes, unit = _directions(space, ruler, known, draws, rng)
-    # statistic at deflection d: |z + d s|^2 = |z|^2 + 2 d z's + d^2 |s|^2
-    parts: list[list[Array]] = [[], [], []]
-    faults = np.zeros((draws, space.window, space.outputs))
+    sizes, unit = _directions(space, c, known, draws, rng)
+    faults = np.zeros((draws, window, space.found.model.l))
     for onset in np.unique(onsets):
         rows = onsets == onset
-        faults[rows] = np.einsum("kop,mp->mko", ruler.signature(int(onset)), sizes[rows])
-    for other, z in zip(space.rulers, noise):
-        s = other.scores(faults)
-        for store, value in zip(parts, (np.sum(z**2, axis=2), np.sum(z * s, axis=2), np.sum(s**2, axis=2))):
-            store.append(value)
-    count = len(space.rulers)
+        faults[rows] = np.einsum("kop,mp->mko", space.signature(c, int(onset)), sizes[rows])
+    # statistic at deflection d: |z + d s|^2 = |z|^2 + 2 d z's + d^2 |s|^2
+    parts = [[np.sum(pair, axis=2) for pair in (z**2, z * s, s**2)] for z, s in zip(noise, _scores(space, faults))]
+    count = len(noise)
     detected, isolated = np.zeros(GRID.size), np.zeros(GRID.size)
     preferred, accused = np.zeros((count, GRID.size)), np.zeros((count, GRID.size))
     for g, d in enumerate(GRID):
-        excess = np.stack([(a + 2 * d * b + d**2 * e).max(axis=1) for a, b, e in zip(*parts)], axis=1) - thresholds
+        excess = np.stack([(a + 2 * d * b + d**2 * e).max(axis=1) for a, b, e in parts], axis=1) - thresholds
         alarm, answer = excess.max(axis=1) > 0, excess.argmax(axis=1)
-        detected[g], isolated[g] = np.mean(alarm), np.mean(alarm & (answer == c))
-        preferred[:, g] = np.mean((excess[:, [c]] > 0) & (excess[:, [c]] >= excess), axis=0)
-        preferred[c, g] = detected[g]
+        detected[g], isolated[g] = np.mean(alarm), np.mean(alarm & (answer == place))
+        own = excess[:, [place]]
+        preferred[:, g] = np.mean((own > 0) & (own >= excess), axis=0)
+        preferred[place, g] = detected[g]
         accused[:, g] = [np.mean(alarm & (answer == j)) for j in range(count)]
     return _Curves(detected, isolated, preferred, accused, unit)
 
 
 def _directions(
-    space: SignatureSpace, ruler: Ruler | InputRuler, known: int | None, draws: int, rng: np.random.Generator
+    space: Sweep, c: int, known: int | None, draws: int, rng: np.random.Generator
 ) -> tuple[Array, float]:
     """Return sizes (M, d) of deflection one in mid-window, in random directions, and the deflection of a unit size."""
     onset = space.window // 2 if known is None else known
-    trace = ruler.signature(onset)
+    trace = space.signature(c, onset)
     values, axes = np.linalg.eigh(np.einsum("kop,koq->pq", trace, trace))
     if not values[-1] > 0:
         raise DataError(
-            f"{ruler.candidate.label}: untestable, the input does not excite it after sample {onset}. Use a window in "
+            f"{space.found.labels[c]}: untestable, the input does not excite it after sample {onset}. Use a window in "
             "which it moves."
         )
     d = values.size
@@ -313,32 +328,22 @@ def _crossing(probabilities: Array, prob: float, draws: int) -> float:
     return float(GRID[last] + min(max(rise, 0.0), 1.0) * (GRID[last + 1] - GRID[last]))
 
 
-def _rival(space: SignatureSpace, curves: _Curves, at: float) -> str:
+def _rival(labels: tuple[str, ...], curves: _Curves, at: float) -> str:
     """The candidate most often accused instead, at the isolable deflection or the one before it."""
     g = GRID.size - 1 if not np.isfinite(at) else max(int(np.searchsorted(GRID, at)) - 1, 0)
     wrong = curves.accused[:, g].copy()
     wrong[int(np.argmax(curves.accused[:, -1]))] = 0.0
-    return space.labels[int(np.argmax(wrong))] if wrong.max() > 0 else ""
+    return labels[int(np.argmax(wrong))] if wrong.max() > 0 else ""
 
 
-def _sines(space: SignatureSpace, ruler: Ruler | InputRuler, known: int | None) -> Array:
+def _sines(space: Sweep, c: int, known: int | None) -> Array:
     """Smallest sine (C,) between the signature in mid-window and the others at any onset."""
-    onset = space.window // 2 if known is None else known
-    trace = ruler.signature(onset)
+    trace = space.signature(c, space.window // 2 if known is None else known)
     axes = np.linalg.svd(trace.reshape(-1, trace.shape[2]), full_matrices=False)[0]
-    own = axes.T.reshape(-1, space.window, space.outputs)
-    cosines = [np.linalg.svd(other.scores(own).swapaxes(0, 1), compute_uv=False)[:, 0].max() for other in space.rulers]
+    own = axes.T.reshape(-1, *trace.shape[:2])
+    cosines = [np.linalg.svd(other.swapaxes(0, 1), compute_uv=False)[:, 0].max() for other in _scores(space, own)]
     return np.sqrt(np.maximum(0.0, 1 - np.minimum(cosines, 1.0) ** 2))
-
-
-def _possible(sizes: Array, largest: Array) -> Array:
-    """More than the whole cannot be lost."""
-    return np.where(sizes > largest, np.inf, sizes)
 
 
 def _size(value: float) -> str:
     return "never" if not np.isfinite(value) else f"{value:.3g}"
-
-
-def _cut(text: str, most: int) -> str:
-    return text if len(text) <= most else text[: most - 1] + "…"

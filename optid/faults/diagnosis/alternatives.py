@@ -10,16 +10,15 @@ possible beside all entries: a named fault has to explain the record as well as 
 of magnitudes that this takes.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.diagnosis.posterior import MODEL_ERROR, SPREADS, Explained, Explanation
+from optid.faults.diagnosis.posterior import MODEL_ERROR, SPREADS, Explanation
 from optid.faults.faults import place_of
-from optid.faults.search.scanning import Scan
 from optid.faults.signatures import Candidate, Dictionary
 
 if TYPE_CHECKING:
@@ -60,13 +59,10 @@ def extended(found: Dictionary) -> Dictionary | None:
     return replace(found, candidates=tuple(more), excluded={}, sines=sines) if more else None
 
 
-def parted(found: Explanation, scan: Scan, listed: Sequence[Candidate]) -> list[Explanation]:
+def parted(found: Explanation, listed: Sequence[Candidate]) -> list[Explanation]:
     """Return a broken actuator as a stuck one and as one that lost a share; anything else as it is.
 
-    Args:
-        found: the explanation.
-        scan: the search that it is from.
-        listed: the candidates of the dictionary: only kinds among them are offered.
+    Only kinds among the candidates that are listed are offered.
     """
     family = found.candidates[0]
     if len(found.candidates) == 1 and family.kind == "loss" and family.columns and not family.constants:
@@ -76,10 +72,10 @@ def parted(found: Explanation, scan: Scan, listed: Sequence[Candidate]) -> list[
     kinds = {c.kind: c for c in listed if c.name == family.name}
     result = []
     if "stuck" in kinds:
-        result.append(_stuck(found, scan))
+        result.append(_stuck(found))
     if "loss" in kinds and kinds["loss"].zero is None:
         lost = replace(family, kind="loss", constants=True, members=(f"{family.name} loss",))
-        result.append(found._replace(candidates=(lost,), course=_course(found, scan, found.sizes), entry=family))
+        result.append(found._replace(candidates=(lost,), entry=family))
     return result
 
 
@@ -96,7 +92,7 @@ def _all_lost(found: Explanation) -> Array:
     return free - (1 - share) ** 2 / (2 * variance) - np.log(std * np.sqrt(2 * np.pi) * before)
 
 
-def _stuck(found: Explanation, scan: Scan) -> Explanation:
+def _stuck(found: Explanation) -> Explanation:
     """The share fixed to one: the constants that belong to it, and the density of the share there."""
     share, variance = found.sizes[:, 0], np.maximum(found.covariances[:, 0, 0], EXACT)
     logs = _all_lost(found)
@@ -108,28 +104,14 @@ def _stuck(found: Explanation, scan: Scan) -> Explanation:
         "ki,kj,k->kij", slope, slope, found.covariances[:, 0, 0])
     return found._replace(
         logs=logs, sizes=sizes, covariances=covariances, energies=found.energies - (1 - share) ** 2 / variance,
-        course=_course(found, scan, sizes), entry=found.candidates[0],
+        entry=found.candidates[0],
     )
 
 
-def _course(found: Explanation, scan: Scan, sizes: Array) -> Callable[[int], Explained]:
-    rows = {int(onset): row for row, onset in enumerate(found.onsets[:, 0])}
-    family = found.entry or found.candidates[0]
-
-    def made(onset: int) -> Explained:
-        fitted = scan.signature(family, onset) @ sizes[rows[onset]]
-        return Explained(fitted, scan.whitened.r - fitted, sizes.shape[1])
-
-    return made
-
-
 def final_effect(model: "HammersteinSS", name: str, size: Array) -> dict[str, float]:
-    """Return what a constant disturbance of estimated direction changes of every output in the end.
+    """Return what a constant disturbance of estimated direction (n,) changes of every output in the end.
 
-    Args:
-        model: the healthy model.
-        name: of the fault; others than the disturbance of unknown direction have no effect to report.
-        size: (n,) along the states; NaN where it is not known.
+    Other faults than the disturbance of unknown direction, and sizes that are not known, have no effect to report.
     """
     A = np.eye(model.nx) - model.A - model.L @ model.C
     if name != UNKNOWN_DIRECTION or size.shape != (model.nx,) or np.linalg.cond(A) > INTEGRATES:

@@ -1,9 +1,9 @@
 """What a diagnosis says: a verdict, a set of answers with probabilities, estimates with intervals, and a proof."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 import numpy as np
 
@@ -15,10 +15,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from optid.faults.consistency.profiles import Profile
-    from optid.faults.diagnosis.evidence import Evidence
+    from optid.faults.search.scanning import Scan
 
 FORMAT = "optid diagnosis"
 VERSION = 1
+
+CANDIDATE = "into_state", "into_output", "columns", "members", "places", "bounded_deflection"
+"""What is saved of the candidate of an estimate, beside its name and kind."""
 
 VERDICTS = ("healthy", "faulty", "unknown", "untestable", "not isolable")
 """What a diagnosis may say: nothing is wrong, these faults, a fault that is none of these, the record cannot tell
@@ -68,38 +71,6 @@ class Estimate:
 
         return estimate_line(self)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types."""
-        c = self.candidate
-        return {
-            "label": self.label, "name": self.name, "kind": self.kind,
-            "candidate": {
-                "into_state": c.into_state.tolist(), "into_output": c.into_output.tolist(), "columns": list(c.columns),
-                "members": list(c.members), "places": list(c.places), "bounded_deflection": c.bounded_deflection,
-            },
-            "onset": self.onset, "onset_interval": list(self.onset_interval), "onset_censored": self.onset_censored,
-            "size": _listed(self.size), "size_interval": _listed(self.size_interval),
-            "covariance": _listed(self.covariance), "deflection": _listed(self.deflection),
-            "effect": {name: _listed(value) for name, value in self.effect.items()},
-        }
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> "Estimate":
-        """Build what `to_dict` described."""
-        c = content["candidate"]
-        candidate = Candidate(
-            content["name"], content["kind"], np.array(c["into_state"], dtype=float),
-            np.array(c["into_output"], dtype=float), tuple(int(i) for i in c["columns"]), tuple(c["members"]),
-            tuple(c["places"]), bool(c["bounded_deflection"]),
-        )
-        low, high = content["onset_interval"]
-        return cls(
-            str(content["label"]), str(content["name"]), str(content["kind"]), candidate, int(content["onset"]),
-            (int(low), int(high)), bool(content["onset_censored"]), _array(content["size"]),
-            _array(content["size_interval"]), _array(content["covariance"]), float(_array(content["deflection"])),
-            {str(name): float(_array(value)) for name, value in content.get("effect", {}).items()},
-        )
-
 
 @dataclass(frozen=True, eq=False)
 class Answer:
@@ -115,6 +86,10 @@ class Answer:
     posterior: float
     gain: float
 
+    def __post_init__(self) -> None:
+        if not self.faults:
+            raise ValueError("an answer has no fault.")
+
     @property
     def label(self) -> str:
         """The names of its faults."""
@@ -128,19 +103,6 @@ class Answer:
     def __str__(self) -> str:
         """List its faults."""
         return "\n".join(str(fault) for fault in self.faults)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types."""
-        return {"faults": [fault.to_dict() for fault in self.faults], "posterior": _listed(self.posterior),
-                "gain": _listed(self.gain)}
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> "Answer":
-        """Build what `to_dict` described."""
-        faults = tuple(Estimate.from_dict(fault) for fault in content["faults"])
-        if not faults:
-            raise ValueError("an answer has no fault.")
-        return cls(faults, float(_array(content["posterior"])), float(_array(content["gain"])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,19 +124,6 @@ class Certificate:
     value: float
     runner_up_margin: float = float("inf")
     parity_vector: Array | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types."""
-        parity = None if self.parity_vector is None else _listed(self.parity_vector)
-        return {"kind": self.kind, "value": _listed(self.value), "runner_up_margin": _listed(self.runner_up_margin),
-                "parity_vector": parity}
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> "Certificate":
-        """Build what `to_dict` described."""
-        parity = content["parity_vector"]
-        return cls(str(content["kind"]), float(_array(content["value"])), float(_array(content["runner_up_margin"])),
-                   None if parity is None else _array(parity))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,18 +148,26 @@ class Remaining:
     frequency: float
     share: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types."""
-        return {"energy": _listed(self.energy), "readings": self.readings, "p_value": _listed(self.p_value),
-                "test": self.test, "direction": _listed(self.direction), "frequency": _listed(self.frequency),
-                "share": _listed(self.share)}
 
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> "Remaining":
-        """Build what `to_dict` described."""
-        number = {word: float(_array(content[word])) for word in ("energy", "p_value", "frequency", "share")}
-        return cls(readings=int(content["readings"]), test=str(content["test"]),
-                   direction=_array(content["direction"]), **number)
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The record behind a diagnosis, for pictures and for the course of a fault.
+
+    Attributes:
+        r: (N, l) whitened innovations.
+        present: (N, l) whether a reading is there.
+        fitted: (N, l) what the best answer leaves in them; zero where there is none.
+        gains: (C, N) energy explained less the threshold, NaN where a candidate is not tested.
+        labels: the C candidates.
+        search: the scan; None where no candidate has a signature.
+    """
+
+    r: Array
+    present: np.ndarray
+    fitted: Array
+    gains: Array
+    labels: tuple[str, ...]
+    search: "Scan | None"
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +211,7 @@ class Diagnosis:
     outputs: tuple[str, ...] = ()
     dt: float = 1.0
     remaining: Remaining | None = None
-    evidence: "Evidence | None" = field(default=None, repr=False)
+    evidence: Evidence | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
@@ -328,30 +285,19 @@ class Diagnosis:
         return draw(self)
 
     def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types, without the record."""
-        return {
-            "verdict": self.verdict, "detected": self.detected,
-            "best": None if self.best is None else self.candidates.index(self.best),
-            "candidates": [answer.to_dict() for answer in self.candidates], "p_value": _listed(self.p_value),
-            "certificate": self.certificate.to_dict(), "untestable": dict(self.untestable), "window": self.window,
-            "false_alarm": self.false_alarm, "coverage": self.coverage, "method": self.method, "status": self.status,
-            "model": self.model, "outputs": list(self.outputs), "dt": self.dt,
-            "remaining": None if self.remaining is None else self.remaining.to_dict(),
-        }
+        """Describe it in JSON types, the record and the evidence left out."""
+        best = None if self.best is None else self.candidates.index(self.best)
+        return _described(replace(self, evidence=None)) | {"best": best}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "Diagnosis":
         """Build what `to_dict` described."""
-        candidates = tuple(Answer.from_dict(answer) for answer in content["candidates"])
-        best, remaining = content["best"], content["remaining"]
-        return cls(
-            str(content["verdict"]), bool(content["detected"]), None if best is None else candidates[int(best)],
-            candidates, float(_array(content["p_value"])), Certificate.from_dict(content["certificate"]),
-            {str(label): str(why) for label, why in content["untestable"].items()}, int(content["window"]),
-            float(content["false_alarm"]), float(content["coverage"]), str(content["method"]), str(content["status"]),
-            str(content["model"]), tuple(content["outputs"]), float(content["dt"]),
-            None if remaining is None else Remaining.from_dict(remaining),
-        )
+        found = _built(cls, {**content, "best": None})
+        if content["best"] is None:
+            return found
+        if not 0 <= int(content["best"]) < len(found.candidates):
+            raise ValueError("the best answer is not among its candidates.")
+        return replace(found, best=found.candidates[int(content["best"])])
 
     def save(self, path: str | Path) -> Path:
         """Write it to a JSON file, every digit of it.
@@ -376,24 +322,42 @@ def load_diagnosis(path: str | Path) -> Diagnosis:
     """
     from optid.models.files import read
 
-    return read(path, FORMAT, VERSION, _built)
+    return read(path, FORMAT, VERSION, Diagnosis.from_dict)
 
 
-def _built(content: Mapping[str, Any]) -> Diagnosis:
-    try:
-        return Diagnosis.from_dict(content)
-    except IndexError:
-        raise ValueError("the best answer is not among its candidates.") from None
+def _described(value: Any) -> Any:
+    """The fields of a result as JSON types; what is not finite, which JSON does not know, by its word."""
+    if is_dataclass(value):
+        if isinstance(value, Candidate):
+            return {word: _described(getattr(value, word)) for word in CANDIDATE}
+        return {part.name: _described(getattr(value, part.name)) for part in fields(value) if part.name != "evidence"}
+    if isinstance(value, Mapping):
+        return {name: _described(part) for name, part in value.items()}
+    if isinstance(value, tuple | list | np.ndarray):
+        return [_described(part) for part in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else str(float(value))
+    return value.item() if isinstance(value, np.generic) else value
 
 
-def _listed(values: Any) -> Any:
-    """Numbers as JSON types; what is not finite, which JSON does not know, by its word."""
-    array = np.asarray(values, dtype=float)
-    if array.ndim:
-        return [_listed(value) for value in array]
-    return float(array) if np.isfinite(array) else str(float(array))
-
-
-def _array(values: Any) -> Array:
-    """Undo `_listed`."""
-    return np.asarray(values, dtype=float)
+def _built(kind: Any, value: Any) -> Any:
+    """Undo `_described`: build a value of an annotated type; fields that an earlier release lacks keep defaults."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if kind in (str, int, bool):
+        return kind(value)
+    if kind is float or origin is np.ndarray:
+        return np.asarray(value, dtype=float)[()]
+    if origin is Mapping:
+        return {str(name): _built(parts[1], part) for name, part in value.items()}
+    if origin is tuple:
+        if parts[-1] is not ... and len(value) != len(parts):
+            raise ValueError(f"{len(value)} values in place of {len(parts)}.")
+        return tuple(_built(parts[0], part) for part in value)
+    if type(None) in parts:
+        return None if value is None else _built(parts[0], value)
+    if kind is Estimate:
+        value = {**value, "candidate": {"name": value["name"], "kind": value["kind"], **value["candidate"]}}
+    return kind(**{
+        part.name: _built(part.type, value[part.name]) for part in fields(kind)
+        if part.name in value or part.default is part.default_factory is MISSING
+    })

@@ -26,15 +26,13 @@ SMALL = 1e-3
 """Singular values below which an error of a trace counts for nothing."""
 
 
-def recounted(found: Explanation, scan: "Scan", uncertainty: ModelUncertainty | None) -> Explanation:
+def recounted(found: Explanation, uncertainty: ModelUncertainty | None) -> Explanation:
     """Return an explanation by one candidate with the errors of its trace counted.
 
-    Args:
-        found: the explanation, from `scan`.
-        scan: the search.
-        uncertainty: of the identified model; None, or one without uncertain parameters, changes nothing.
+    Without uncertain parameters, or without a signature of its own, it is returned as it is.
     """
-    if uncertainty is None or not uncertainty.root.shape[1] or len(found.candidates) != 1 or found.course is not None:
+    scan = found.search
+    if uncertainty is None or not uncertainty.root.shape[1] or len(found.candidates) != 1 or scan is None:
         return found
     candidate, best = found.candidates[0], found.best
     if candidate.schedule is not None:
@@ -65,16 +63,9 @@ def recounted(found: Explanation, scan: "Scan", uncertainty: ModelUncertainty | 
 
 
 def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidate, onset: int, size: Array) -> Nuisance:
-    """Return what the errors of the parameters leave of the trace of a fault, as a covariance of the window.
-
-    Args:
-        scan: the search.
-        uncertainty: of the model.
-        candidate: the fault.
-        onset: its first sample.
-        size: (d,) its magnitudes.
-    """
+    """Return what the errors of the parameters leave of the trace of a fault of size (d,), as a covariance."""
     white = scan.whitened
+
     def trace(changed: Any) -> Array:
         found = replace(scan.dictionary, model=changed)
         into_state, into_output = found.additions(moved(candidate, changed), len(white.r), onset, scan.u)
@@ -96,8 +87,5 @@ def moved(candidate: Candidate, model: Any) -> Candidate:
     if not candidate.name.startswith("actuator"):
         return candidate
     into_state, into_output = place_of(model, candidate.name)
-    if into_state.shape != candidate.into_state.shape:
-        return candidate
-    return replace(candidate, into_state=into_state, into_output=into_output)
-
-
+    same = into_state.shape == candidate.into_state.shape
+    return replace(candidate, into_state=into_state, into_output=into_output) if same else candidate

@@ -9,19 +9,15 @@ More noise of variance rho at a place adds rho H H' to the covariance of the inn
 over rho on a logarithmic scale.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from optid.arrays import Array
+from optid.data.record import Experiment
 from optid.faults.consistency.noise_changes import noise_search
 from optid.faults.consistency.waveforms import waveform_matrix
 from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explained, Explanation, marginal
-from optid.faults.signatures import Candidate
-
-if TYPE_CHECKING:
-    from optid.faults.diagnosis.looking import Seen
-    from optid.faults.signatures import Dictionary
+from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.whitening import Whitened
 
 LONGEST = 3000
 """Readings of a record above which these candidates are not tested."""
@@ -39,33 +35,33 @@ ONSETS = 12
 """Onsets of an added noise that are tried over the record, and again around the best of them."""
 
 
-def without_signature(found: "Dictionary") -> tuple[list[Candidate], list[Candidate]]:
+def without_signature(found: Dictionary) -> tuple[list[Candidate], list[Candidate]]:
     """Return the frozen sensors and the noises of a dictionary."""
     frozen = [c for c in found.candidates if c.kind == "frozen"]
     return frozen if found.model.l > 1 else [], [c for c in found.candidates if c.kind == "noise"]
 
 
-def courses(seen: "Seen", found: "Dictionary") -> list[Explanation]:
-    """Return the frozen sensors and the noises that may explain a record.
+def courses(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
+    """Return the frozen sensors and the noises of a dictionary that may explain a record.
 
     Args:
-        seen: the record.
         found: the candidates.
+        white: the window.
+        part: the record behind it.
     """
-    if seen.whitened.r.size > LONGEST:
+    if white.r.size > LONGEST:
         return []
     frozen, noises = without_signature(found)
-    explanations = [_frozen(seen, found, candidate) for candidate in frozen]
+    explanations = [_frozen(found, candidate, white, part) for candidate in frozen]
     if noises:
-        explanations += _noises(seen, found, noises)
+        explanations += _noises(found, noises, white)
     return [explanation for explanation in explanations if explanation is not None]
 
 
-def _frozen(seen: "Seen", found: "Dictionary", candidate: Candidate) -> Explanation | None:
-    white = seen.whitened
+def _frozen(found: Dictionary, candidate: Candidate, white: Whitened, part: Experiment) -> Explanation | None:
     o = int(np.flatnonzero(candidate.into_output[:, 0])[0])
     count, r = len(white.r), white.r.ravel()
-    readings, there = seen.part.y[:, o], white.present[:, o].astype(bool)
+    readings, there = part.y[:, o], white.present[:, o].astype(bool)
     noise = found.model.noise
     assert noise is not None
     still = _still(readings, there, STILL * float(np.sqrt(max(noise.R[o, o], 1e-300))))
@@ -75,12 +71,10 @@ def _frozen(seen: "Seen", found: "Dictionary", candidate: Candidate) -> Explanat
     axes, triangle = np.linalg.qr(waveform_matrix(found, candidate, white)[:, shown])
     seen_there = np.abs(np.diag(triangle)) > 1e-10 * np.abs(np.diag(triangle)).max()
     along = np.where(seen_there, axes.T @ r, 0.0)
-    energies, dimensions = np.zeros(count), np.zeros(count, dtype=int)
     order = np.searchsorted(-shown, -np.arange(count), side="right")  # columns that an onset at k has
-    energies[:] = np.concatenate([[0.0], np.cumsum(along**2)])[order]
-    dimensions[:] = np.concatenate([[0], np.cumsum(seen_there)])[order]
-    logs = np.where(still, [float(marginal(energies[[k]], int(dimensions[k]))[0]) for k in range(count)], -np.inf)
-    logs = logs - np.log(count)
+    energies = np.concatenate([[0.0], np.cumsum(along**2)])[order]
+    dimensions = np.concatenate([[0], np.cumsum(seen_there)])[order]
+    logs = np.where(still, marginal(energies, dimensions), -np.inf) - np.log(count)
     kept = np.flatnonzero(logs > logs.max() - NEGLIGIBLE)
     values = [readings[int(k) :][there[int(k) :]] for k in kept]
     sizes = np.array([[float(np.mean(v))] for v in values])
@@ -91,7 +85,7 @@ def _frozen(seen: "Seen", found: "Dictionary", candidate: Candidate) -> Explanat
         fitted = (axes[:, :columns] @ along[:columns]).reshape(white.r.shape)
         return Explained(fitted, white.r - fitted, int(dimensions[onset]))
 
-    return Explanation((candidate,), kept[:, None], logs[kept], sizes, covariances, energies[kept], rest)
+    return Explanation((candidate,), kept[:, None], logs[kept], sizes, covariances, energies[kept], course=rest)
 
 
 def _still(readings: Array, there: np.ndarray, limit: float) -> np.ndarray:
@@ -103,11 +97,11 @@ def _still(readings: Array, there: np.ndarray, limit: float) -> np.ndarray:
     return (counts >= SHORTEST) & (np.sqrt(np.maximum(spread, 0.0)) <= limit)
 
 
-def _noises(seen: "Seen", found: "Dictionary", noises: list[Candidate]) -> list[Explanation]:
+def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list[Explanation]:
     """Added noise at every place, over a grid of onsets."""
     from scipy.special import logsumexp
 
-    white, count = seen.whitened, len(seen.whitened.r)
+    count = len(white.r)
     last = int(np.flatnonzero(white.present.any(axis=1))[-1])  # later readings are taken out or missing
     onsets = np.unique(np.linspace(0, max(last + 1 - 2 * SHORTEST, 0), ONSETS).astype(int))
     rows: dict[str, list[tuple[float, ...]]] = {}
@@ -158,6 +152,6 @@ def _noises(seen: "Seen", found: "Dictionary", noises: list[Candidate]) -> list[
 
         explanations.append(Explanation(
             (candidate,), every[kept][:, None], logs[kept], means[kept][:, None], spreads[kept][:, None, None],
-            2 * highest[kept], rest,
+            2 * highest[kept], course=rest,
         ))
     return explanations

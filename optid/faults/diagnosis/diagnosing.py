@@ -1,12 +1,13 @@
 """Diagnosis of a record: is something wrong, what is it, since when, how large, and how sure is all that?"""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import check_integer, check_probability
-from optid.errors import StructureError, nearest
+from optid.errors import StructureError
+from optid.faults.diagnosis.judgement import judge
+from optid.faults.diagnosis.record_search import Question
 from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of
 from optid.faults.nuisance import uncertain_start
 from optid.faults.search.calibration import Thresholds
@@ -15,47 +16,8 @@ from optid.faults.signatures import Dictionary, dictionary
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-METHODS = "exact", "sparse", "sparse+polish", "set"
-
 KINDS = "bias", "loss", "spike"
 """Kinds of faults that are thought possible where no dictionary is given."""
-
-
-@dataclass(frozen=True, eq=False)
-class Question:
-    """What is asked of a record.
-
-    Attributes:
-        false_alarm: probability of an alarm of a healthy plant.
-        max_faults: faults that may be in one record.
-        method: one of `METHODS`.
-        coverage: of the set and of the intervals.
-        robust: whether outliers are bounded.
-        thresholds: from `thresholds`, or None.
-        seed: of their simulation.
-        solver: for the methods that need one.
-    """
-
-    false_alarm: float
-    max_faults: int
-    method: str
-    coverage: float
-    robust: bool
-    thresholds: Thresholds | None
-    seed: int | None
-    solver: Any
-
-    def __post_init__(self) -> None:
-        for word, value in (("false_alarm", self.false_alarm), ("coverage", self.coverage)):
-            check_probability(value, word)
-        if self.method not in METHODS:
-            raise StructureError(f"method={self.method!r}. {nearest(str(self.method), METHODS)}")
-        check_integer(self.max_faults, "max_faults")
-        if self.method == "exact" and self.max_faults > 2:
-            raise StructureError(
-                f"max_faults={self.max_faults}: the exact search covers one or two faults; the number of triples is "
-                "out of reach. Use method='sparse+polish'."
-            )
 
 
 def diagnose(
@@ -98,26 +60,21 @@ def diagnose(
             unit, a healthy record with other noise, too few samples.
         StructureError: no noise covariances, impossible arguments, "use" without the covariance of the model.
     """
-    from optid.faults.diagnosis.judgement import Job
-
     asked = Question(false_alarm, max_faults, method, coverage, robust, thresholds, seed, solver)
-    plant = plant_of(model)
-    record = record_of(plant.model, data)
-    found = _dictionary(plant.model, faults)
-    steady, decoupled = steady_predictor(plant.model, healthy, rescale), None
+    plant, origin = plant_of(model)
+    record, found = record_of(plant, data), _dictionary(plant, faults)
+    steady, decoupled = steady_predictor(plant, healthy, rescale), None
     if found.predictor.silent:
-        plant, decoupled = plant._replace(model=found.model), found.predictor
-    uncertainty, remark = uncertainty_of(plant, model_uncertainty, decoupled)
-    if decoupled is not None:
-        steady = decoupled if uncertainty is None else uncertainty.predictor
-    if steady is None and uncertainty is not None:
-        steady = uncertainty.predictor  # whose covariance counts the degrees of freedom that the fit took
-    if steady is not None:
+        plant, decoupled = found.model, found.predictor
+    uncertainty, remark = uncertainty_of(plant, origin, model_uncertainty, decoupled)
+    if steady is None or decoupled is not None:  # the covariance of the former counts what the fit took
+        steady = found.predictor if uncertainty is None else uncertainty.predictor
+    if steady is not found.predictor:
         found = replace(found, predictor=steady)
     if uncertainty is None:
-        uncertainty = uncertain_start(plant.model, found.predictor)
+        uncertainty = uncertain_start(plant, found.predictor)
     noise = {"uncertainty": replace(uncertainty, predictor=found.predictor), "scale": found.predictor}
-    results = [Job(record, k, found, asked, noise, remark).run() for k in range(record.n_experiments)]
+    results = [judge(record, k, found, asked, noise, remark) for k in range(record.n_experiments)]
     return results[0] if len(results) == 1 else tuple(results)
 
 

@@ -5,30 +5,14 @@ helped. Here the size is a mixture of the estimates at all onsets, each with the
 interval is cut from the tails of the mixture. Measured in `benchmarks/faults/intervals.py`.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.answers import Estimate
-from optid.faults.diagnosis.posterior import Explanation
+from optid.faults.diagnosis.posterior import Explanation, smallest_set
 
 HALVINGS = 60
 """Steps of the search for a quantile of a mixture."""
-
-
-class Range(NamedTuple):
-    """The interval of an onset.
-
-    Attributes:
-        onset: the most probable.
-        low: first sample.
-        high: last sample.
-    """
-
-    onset: int
-    low: int
-    high: int
 
 
 def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tuple[Estimate, ...]:
@@ -45,16 +29,17 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
     for number, candidate in enumerate(found.candidates):
         part = slice(first, first + candidate.dimension)
         first = part.stop
-        when = onset_range(found.onsets[:, number], weights, coverage, int(found.onsets[best, number]))
+        onset = int(found.onsets[best, number])
+        low, high = onset_range(found.onsets[:, number], weights, coverage, onset)
         sizes, covariances = found.sizes[:, part], found.covariances[:, part, part]
         intervals = mixture_intervals(weights, sizes, np.sqrt(np.einsum("kii->ki", covariances)), coverage)
         mean = weights @ sizes
         spread = np.einsum("k,ki,kj->ij", weights, sizes - mean, sizes - mean)
         nu, own = sizes[best], covariances[best]
-        censored, at_edge = when.onset < edge, when.onset < edge or when.onset > window - edge
+        censored, at_edge = onset < edge, not edge <= onset <= window - edge
         result.append(Estimate(
-            label=candidate.label, name=candidate.name, kind=candidate.kind, candidate=candidate, onset=when.onset,
-            onset_interval=(0 if censored else when.low, when.high), onset_censored=censored,
+            label=candidate.label, name=candidate.name, kind=candidate.kind, candidate=candidate, onset=onset,
+            onset_interval=(0 if censored else low, high), onset_censored=censored,
             size=np.full(nu.shape, np.nan) if at_edge else nu, size_interval=intervals,
             covariance=np.einsum("k,kij->ij", weights, covariances) + spread,
             deflection=float(np.sqrt(max(nu @ np.linalg.pinv(own, hermitian=True) @ nu, 0.0))),
@@ -62,25 +47,19 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
     return tuple(sorted(result, key=lambda fault: fault.onset))
 
 
-def onset_range(onsets: np.ndarray, weights: Array, coverage: float, best: int) -> Range:
-    """Return the hull of the most probable onsets.
+def onset_range(onsets: np.ndarray, weights: Array, coverage: float, best: int) -> tuple[int, int]:
+    """Return the hull of the most probable onsets (K,) of these weights that hold the coverage, with the best one.
 
-    Args:
-        onsets: (K,) samples, repeated where other faults have several onsets.
-        weights: (K,) their probabilities.
-        coverage: probability that the hull holds at least.
-        best: the onset that is reported.
+    Onsets may be repeated, where other faults have several.
     """
     samples, which = np.unique(onsets, return_inverse=True)
     mass = np.bincount(which.ravel(), weights)
-    order = np.argsort(-mass, kind="stable")
-    enough = int(np.searchsorted(np.cumsum(mass[order]), coverage * (1 - 1e-12))) + 1
-    chosen = np.append(samples[order[:enough]], best)
-    return Range(best, int(chosen.min()), int(chosen.max()))
+    chosen = np.append(samples[smallest_set(mass, coverage)], best)
+    return int(chosen.min()), int(chosen.max())
 
 
 def mixture_intervals(weights: Array, means: Array, stds: Array, coverage: float) -> Array:
-    """Return the central intervals (d, 2) of mixtures of normal laws.
+    """Return the central intervals (d, 2) of mixtures of K normal laws, by bisection.
 
     Args:
         weights: (K,) of the components.

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from optid.arrays import Array
 from optid.errors import StructureError
-from optid.faults.diagnosis.answers import Diagnosis
-from optid.faults.diagnosis.evidence import Evidence
+from optid.faults.diagnosis.answers import Diagnosis, Evidence
 from optid.faults.diagnosis.words import headline
 from optid.show.panels import BLUE, GREEN, GRID, INK, MUTED, ORANGE, plain, shorten, styled, thinned
 

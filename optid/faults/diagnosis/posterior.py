@@ -53,7 +53,8 @@ class Explanation(NamedTuple):
         sizes: (K, d) magnitudes of all candidates by least squares, one after the other.
         covariances: (K, d, d) for the onsets of the row.
         energies: (K,) energy explained, or twice the gain in log-likelihood.
-        course: of candidates without a signature, what they make of the window for an onset.
+        search: that the signatures are from; None for candidates without one.
+        course: in place of signatures, what the candidates make of the window for an onset.
         error: of the trace, which an identified model knows only so well.
         entry: the candidate of the search behind candidates that are special cases of it.
     """
@@ -64,9 +65,21 @@ class Explanation(NamedTuple):
     sizes: Array
     covariances: Array
     energies: Array
+    search: "Scan | None" = None
     course: Callable[[int], Explained] | None = None
     error: Nuisance | None = None
     entry: Candidate | None = None
+
+    def made(self) -> Explained:
+        """Return what the most probable row makes of the window."""
+        onsets, sizes = self.onsets[self.best], self.sizes[self.best]
+        if self.course is not None:
+            return self.course(int(onsets[0]))
+        assert self.search is not None
+        own = self.candidates if self.entry is None else (self.entry,)
+        traces = [self.search.signature(candidate, int(onset)) for candidate, onset in zip(own, onsets)]
+        fitted = np.concatenate(traces, axis=2) @ sizes
+        return Explained(fitted, self.search.whitened.r - fitted, sizes.size)
 
     @property
     def log_evidence(self) -> float:
@@ -86,27 +99,22 @@ class Explanation(NamedTuple):
         return int(np.argmax(self.logs))
 
 
-def marginal(energies: Array, dimension: int) -> Array:
-    """Return the logarithm of the likelihood beside that of health, magnitudes integrated out.
+def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
+    """Return the logarithm of the likelihood beside that of health, so many magnitudes integrated out.
 
     Args:
         energies: energy explained, any shape.
-        dimension: number of magnitudes.
+        dimension: number of magnitudes, one or as many as energies.
     """
     from scipy.special import logsumexp
 
     g = np.array(SPREADS)
-    terms = np.multiply.outer(energies, g / (1 + g) / 2) - dimension / 2 * np.log1p(g)
+    terms = np.multiply.outer(energies, g / (1 + g) / 2) - np.multiply.outer(dimension, np.log1p(g)) / 2
     return np.asarray(logsumexp(terms, axis=-1) - np.log(g.size))
 
 
 def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
-    """Return one candidate at all its onsets; None where it is tested at none.
-
-    Args:
-        scan: the search.
-        candidate: of its dictionary.
-    """
+    """Return one candidate of a search at all its onsets; None where it is tested at none."""
     row = scan.statistic[scan.index(candidate)]
     tested = np.flatnonzero(~np.isnan(row))
     if not tested.size:
@@ -118,19 +126,12 @@ def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
     sizes, covariances = np.array([m.nu for m in found]), np.array([m.covariance for m in found])
     return Explanation(
         (candidate,), kept[:, None], logs + bounded_shares((candidate,), sizes, covariances), sizes, covariances,
-        row[kept],
+        row[kept], scan,
     )
 
 
 def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
-    """Return several candidates over the onsets around those given.
-
-    Args:
-        scan: the search.
-        candidates: of its dictionary.
-        onsets: where they explain most together.
-        reach: onsets on both sides of each that are summed.
-    """
+    """Return several candidates of a search over the onsets within reach of those at which they explain most."""
     ranges = []
     for candidate, onset in zip(candidates, onsets):
         row = scan.statistic[scan.index(candidate)]
@@ -167,7 +168,7 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
     kept = logs > logs.max() - NEGLIGIBLE
     where = np.stack([there[row] for there, row in zip(ranges, rows)], axis=1)
     return Explanation(
-        tuple(candidates), where[kept], logs[kept], sizes[kept], covariances[kept], energies[kept]
+        tuple(candidates), where[kept], logs[kept], sizes[kept], covariances[kept], energies[kept], scan
     )
 
 
@@ -197,16 +198,6 @@ def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: A
             change += np.log((1 - MODEL_ERROR) * inside / before + MODEL_ERROR)
         first += candidate.dimension
     return change
-
-
-def probabilities(logs: Array) -> Array:
-    """Return the probability of each explanation.
-
-    Args:
-        logs: logarithms of the marginal likelihood times the prior of each.
-    """
-    weights = np.exp(logs - logs.max())
-    return np.asarray(weights / weights.sum())
 
 
 def smallest_set(posterior: Array, coverage: float) -> np.ndarray:

@@ -1,37 +1,23 @@
-"""What a diagnosis is made of before any search: the record, the scale of the noise, readings that stand still."""
+"""A diagnosis before any search: the record, the scale of the noise, readings that stand still."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array
 from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty
 from optid.faults.screening import FlatLine, check_channels, flat_lines
-from optid.faults.whitening import Predictor, Whitened, health, predictor, whiten
+from optid.faults.whitening import Predictor, health, predictor, whiten
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 
-class Plant(NamedTuple):
-    """The healthy model and the data it comes from, where these are known.
-
-    Attributes:
-        model: the model.
-        data: the record it was identified from, or None.
-    """
-
-    model: "HammersteinSS"
-    data: Data | None
-
-
-def plant_of(model: Any) -> Plant:
-    """Return the model, and the record where a fit was given.
+def plant_of(model: Any) -> "tuple[HammersteinSS, Data | None]":
+    """Return the model, and the record it was identified from where a fit was given.
 
     Raises:
         StructureError: no state-space model.
@@ -43,7 +29,7 @@ def plant_of(model: Any) -> Plant:
             f"A diagnosis needs a state-space model with noise covariances; this is a {kind}. Fit one, for example "
             "with optid.fit(data, 'hammerstein_ss.asivid', nx=...)."
         )
-    return Plant(fitted, data if isinstance(data, Data) else None)
+    return fitted, data if isinstance(data, Data) else None
 
 
 def record_of(model: "HammersteinSS", data: Any) -> Data:
@@ -59,7 +45,8 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
     if isinstance(data, Data):
         record = data
     elif isinstance(data, tuple | list) and len(data) == 2:
-        _check_readings(data[1])
+        if data[1] is None:
+            raise DataError("The outputs are missing: give data, or the pair (u, y).")
         record = Data(data[0], data[1], model.dt, list(model.inputs), list(model.outputs))
     else:
         from optid.data.readers import read
@@ -67,29 +54,19 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
         record = read(data, inputs=list(model.inputs), outputs=list(model.outputs), dt=model.dt)
     raw = in_units_of(model, record)
     for number, part in enumerate(raw.experiments, start=1):
-        where = f"experiment {number}: " * (raw.n_experiments > 1)
         missing = np.argwhere(np.isnan(part.u))
         if missing.size:
             k, c = missing[0]
             raise DataError(
-                f"{where}input {raw.inputs[c]!r} is missing at sample {k}: what the actuators did must be known. Fill "
-                "it, or cut the record there."
+                f"experiment {number}: " * (raw.n_experiments > 1)
+                + f"input {raw.inputs[c]!r} is missing at sample {k}: what the actuators did must be known. Fill it, "
+                "or cut the record there."
             )
     return raw
 
 
-def _check_readings(y: Any) -> None:
-    if y is None:
-        raise DataError("The outputs are missing: give data, or the pair (u, y).")
-
-
 def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Predictor | None:
     """Return the predictor with the scale of the noise that a healthy record shows; None for that of the model.
-
-    Args:
-        model: with noise covariances.
-        healthy: a healthy record, or None.
-        rescale: take the scale from it.
 
     Raises:
         DataError: innovations that are not white or of another size, swapped channels, a unit that jumps.
@@ -106,13 +83,14 @@ def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Pre
 
 
 def uncertainty_of(
-    plant: Plant, wanted: Any, decoupled: Predictor | None = None
+    model: "HammersteinSS", data: Data | None, wanted: Any, decoupled: Predictor | None = None
 ) -> tuple[ModelUncertainty | None, str]:
-    """Return the uncertainty of the model that counts, and what is to be said of it.
+    """Return the uncertainty of the model to use, and a remark for the report.
 
     Args:
-        plant: the model, and the record behind it.
-        wanted: None (counted where a fit was given), "use", "ignore", or a `ModelUncertainty`.
+        model: the model.
+        data: the record it was identified from, where it is known.
+        wanted: None (counted where the record is known), "use", "ignore", or a `ModelUncertainty`.
         decoupled: the predictor that does not feel declared disturbances.
 
     Raises:
@@ -127,37 +105,30 @@ def uncertainty_of(
         return wanted, ""
     if wanted not in (None, "use", "ignore"):
         raise StructureError(f"model_uncertainty={wanted!r}: 'use', 'ignore' or a ModelUncertainty is needed.")
-    if wanted == "ignore" or (wanted is None and plant.data is None):
-        return None, ""
-    if plant.data is None:
+    if wanted == "use" and data is None:
         raise StructureError(
             "model_uncertainty='use' needs the covariance of the model: pass the fit in place of the model, or "
             "optid.faults.model_uncertainty(model, data) with the record it was identified from. 'ignore' takes the "
             "model as exact."
         )
-    found = model_uncertainty(plant.model, plant.data, decoupled=decoupled)
+    if wanted == "ignore" or data is None:
+        return None, ""
+    found = model_uncertainty(model, data, decoupled=decoupled)
     return found, "The uncertainty of the identified model counts as noise."
 
 
 @dataclass(frozen=True, eq=False)
 class Flattened:
-    """A record without the readings that stand still.
-
-    Attributes:
-        part: the record.
-        lines: what stands still.
-    """
+    """A record (`part`) without the readings that stand still (`lines`)."""
 
     part: Experiment
     lines: tuple[FlatLine, ...]
 
 
 def without_flat_lines(record: Data, number: int) -> Flattened:
-    """Take out readings that are identical to the bit from the second on; the first may be the last true one.
+    """Take readings of experiment `number` (from 0) out that are identical to the bit from the second on.
 
-    Args:
-        record: the record.
-        number: of the experiment, from 0.
+    The first of them may be the last true one.
     """
     part = record.experiments[number]
     lines = tuple(line for line in flat_lines(record) if line.experiment == number)
@@ -168,31 +139,3 @@ def without_flat_lines(record: Data, number: int) -> Flattened:
         o = record.outputs.index(line.name.partition(":")[2])
         y[line.first + 1 : line.first + line.count, o] = np.nan
     return Flattened(replace(part, y=y), lines)
-
-
-def one_record(record: Data, part: Experiment) -> Data:
-    """Return one experiment as a record of its own; the channels keep their names."""
-    return Data(part.u, part.y, record.dt, record.inputs, record.outputs, start=part.start)
-
-
-def without(part: Experiment, readings: Sequence[tuple[int, int]]) -> Experiment:
-    """Return an experiment without some readings (sample, output)."""
-    y: Array = np.array(part.y)
-    for k, o in readings:
-        y[k, o] = np.nan
-    return replace(part, y=y)
-
-
-def enough(whitened: Whitened, nx: int) -> None:
-    """Refuse a record that is too short for a diagnosis.
-
-    Raises:
-        DataError: fewer samples with a reading than the model has memory.
-    """
-    least = 2 * nx + 2
-    seen = int(whitened.present.any(axis=1).sum())
-    if seen < least:
-        raise DataError(
-            f"The record has {seen} samples with a reading (those that stand still to the bit do not count): {least} "
-            f"are needed for {nx} states."
-        )

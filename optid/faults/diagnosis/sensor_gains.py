@@ -116,7 +116,7 @@ def _explanation(found: Dictionary, candidate: Candidate, white: Whitened, part:
 
     return Explanation(
         (candidate,), grid.onsets[kept][:, None], logs[kept], mean[kept][:, None], variance[kept][:, None, None],
-        2 * most[kept], rest,
+        2 * most[kept], course=rest,
     )
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.search.sweeps import inverse_roots
-from optid.faults.signatures import response
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
@@ -44,10 +43,6 @@ class Atoms:
         """Number of magnitudes."""
         return self.axes.shape[2]
 
-    def only(self, chosen: np.ndarray) -> "Atoms":
-        """Return the atoms at some of the onsets, given by a mask or by their places."""
-        return Atoms(self.label, self.onsets[chosen], self.axes[chosen], self.back[chosen], self.threshold)
-
 
 def atoms_of(found: "Scan", limits: "Thresholds", onsets: np.ndarray | None = None) -> tuple[Atoms, ...]:
     """Return the atoms of every candidate that is tested somewhere.
@@ -75,29 +70,10 @@ def atoms_of(found: "Scan", limits: "Thresholds", onsets: np.ndarray | None = No
         if not threshold > 0:
             raise StructureError(
                 f"{candidate.label} has no threshold: calibrate with the input u of the window, too.")
-        bank = signatures(found, candidate.label, where)
-        flat = bank.reshape(where.size, found.whitened.r.size, -1)
+        traces = np.stack([found.signature(candidate, int(onset)) for onset in where])
+        flat = traces.reshape(where.size, found.whitened.r.size, -1)
         products = np.einsum("tkp,tkq->tpq", flat, flat)
         largest = np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float)
         back = np.swapaxes(inverse_roots(products, largest), 1, 2)
         made.append(Atoms(candidate.label, where, flat @ back, back, float(threshold)))
     return tuple(made)
-
-
-def signatures(found: "Scan", label: str, onsets: np.ndarray) -> Array:
-    """Return the signatures (T, N, l, d) of a candidate at some onsets.
-
-    Args:
-        found: the search of the window.
-        label: of the candidate.
-        onsets: (T,).
-    """
-    candidate, white = found.dictionary[label], found.whitened
-    if not (candidate.additive and white.nuisance is None and white.present.all()):
-        return np.stack([found.signature(candidate, int(onset)) for onset in onsets])
-    count = len(white.r)  # a later onset shifts the trace
-    trace = response(white.predictor, candidate, count)
-    bank = np.zeros((onsets.size, *trace.shape))
-    for t, onset in enumerate(onsets):
-        bank[t, onset:] = trace[: count - onset]
-    return bank

@@ -1,6 +1,5 @@
 """Thresholds of the search for a fault, such that a healthy window alarms with the probability asked for."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,8 +7,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_probability
 from optid.errors import DataError, StructureError
-from optid.faults.search.sweeps import Sweep, sweep
-from optid.faults.signature_space import family_thresholds
+from optid.faults.search.sweeps import sweep
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
@@ -17,10 +15,7 @@ from optid.models.experiments import samples_of
 EXCEEDING = 50
 """Simulated windows that must exceed the thresholds for these to be trusted."""
 
-BATCH = 2_000_000
-"""Numbers of a batch of windows."""
-
-COURSES = 100
+STRETCHES = 100
 """Stretches of a longer input that are drawn."""
 
 
@@ -86,56 +81,53 @@ def thresholds(
         DataError: too few draws for so rare an alarm, an input that is too short or has a missing sample.
         StructureError: a probability outside (0, 1), a window that is too short, no candidate with a signature.
     """
+    check_draws(false_alarm, draws)
+    count = len(window.r) if isinstance(window, Whitened) else int(window)
+    q = family_thresholds(simulated(found, window, u=u, draws=draws, seed=seed), false_alarm)
+    return Thresholds(found.labels, q, false_alarm, count, draws, seed)
+
+
+def check_draws(false_alarm: float, draws: int) -> None:
+    """Refuse a probability outside (0, 1), and too few simulated windows for it."""
     check_probability(false_alarm, "false_alarm")
     if false_alarm * draws < EXCEEDING:
         raise DataError(
             f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "
             f"{int(np.ceil(EXCEEDING / false_alarm))} draws, or a higher probability."
         )
-    count = len(window.r) if isinstance(window, Whitened) else int(window)
-    largest = simulated(found, window, u=u, draws=draws, seed=seed)
-    tested = ~np.isnan(largest).all(axis=0)
-    q = np.full(len(found.candidates), np.nan)
-    q[tested] = family_thresholds(np.nan_to_num(largest[:, tested]), false_alarm)
-    return Thresholds(found.labels, q, false_alarm, count, draws, seed)
+
+
+def family_thresholds(statistics: Array, false_alarm: float) -> Array:
+    """Return the quantiles (C,) at one level such that a share `false_alarm` of the rows exceeds any of them.
+
+    Args:
+        statistics: (M, C) of healthy windows; NaN for a candidate that is not tested, whose threshold is NaN, too.
+        false_alarm: that share.
+    """
+    q, tested = np.full(statistics.shape[1], np.nan), ~np.isnan(statistics).all(axis=0)
+    values, count = np.nan_to_num(statistics[:, tested]), len(statistics)
+    # a row's rank is how rare its rarest statistic is; the rows with the best ranks are the alarms
+    above = count - np.argsort(np.argsort(values, axis=0, kind="stable"), axis=0, kind="stable")
+    level = np.sort(above.min(axis=1))[max(int(np.floor(false_alarm * count)) - 1, 0)] / count
+    q[tested] = np.quantile(values, 1 - level, axis=0)
+    return q
 
 
 def simulated(
     found: Dictionary, window: int | Whitened, *, u: ArrayLike | None = None, draws: int = 20_000, seed: int | None = 0
 ) -> Array:
-    """Return the largest energies (M, C) that candidates explain of simulated healthy windows; NaN: not tested.
-
-    The arguments are those of `thresholds`.
-    """
+    """Return the largest energies (M, C) of simulated healthy windows, NaN: not tested; arguments of `thresholds`."""
     count = len(window.r) if isinstance(window, Whitened) else int(window)
-    rng = np.random.default_rng(seed)
-    return np.vstack([
-        prepared.largest(rng.standard_normal((size, count, found.model.l)))
-        for prepared, share in _searches(found, window, count, u, draws, rng) for size in _batches(share, prepared)
-    ])
-
-
-def _searches(
-    found: Dictionary, window: int | Whitened, count: int, u: ArrayLike | None, draws: int, rng: np.random.Generator
-) -> Iterator[tuple[Sweep, int]]:
-    """Yield prepared searches and how many windows each is calibrated on."""
-    how = {} if isinstance(window, int) else {
-        "steady": window.predictor, "present": window.present, "nuisance": window.nuisance,
-        "states": window.states}
-    inputs = None if u is None else samples_of(u, "u", found.model.m)
+    rng, inputs = np.random.default_rng(seed), None if u is None else samples_of(u, "u", found.model.m)
     if inputs is None or len(inputs) == count:
-        yield sweep(found, count, u=inputs, **how), draws
-        return
-    if len(inputs) < count:
+        starts: np.ndarray = np.zeros(1, dtype=int)
+    elif len(inputs) < count:
         raise DataError(f"u has {len(inputs)} samples; the window has {count}, as many are needed at least.")
-    stretches = min(COURSES, draws)
-    starts = rng.integers(0, len(inputs) - count + 1, stretches)
-    for i, start in enumerate(starts):
-        share = draws * (i + 1) // stretches - draws * i // stretches
-        yield sweep(found, count, u=inputs[start : start + count], **how), share
-
-
-def _batches(draws: int, prepared: Sweep) -> Iterator[int]:
-    size = max(1, BATCH // (prepared.window * prepared.found.model.l))
-    for start in range(0, draws, size):
-        yield min(size, draws - start)
+    else:
+        starts = rng.integers(0, len(inputs) - count + 1, min(STRETCHES, draws))
+    shares = np.diff(draws * np.arange(starts.size + 1) // starts.size)
+    found_in: list[Array] = []
+    for start, share in zip(starts, shares):
+        prepared = sweep(found, window, None if inputs is None else inputs[start : start + count])
+        found_in += [prepared.largest(windows) for windows in prepared.simulated(int(share), rng)]
+    return np.vstack(found_in)

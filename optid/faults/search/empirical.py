@@ -9,7 +9,7 @@ few independent windows each, and with many candidates one of them is soon excee
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -98,20 +98,24 @@ def sliding_scan(
     if inputs is not None and len(inputs) != count:
         raise DataError(f"u has {len(inputs)} samples; the record has {count}.")
     starts = np.arange(0, count - window + 1, hop)
+    complete: np.ndarray = np.asarray(whitened.present.all(axis=1))
     moving = inputs is not None and any(c.columns for c in found.candidates)
-    incomplete = np.concatenate([[0], np.cumsum(~whitened.present.all(axis=1))])
-    single = np.full(starts.size, True) if moving else incomplete[starts + window] > incomplete[starts]
+    whole = [not moving and bool(complete[k : k + window].all()) for k in starts]
     statistic = np.empty((starts.size, len(found.candidates)))
-    if not single.all():
-        shared = sweep(found, window, steady=whitened.predictor)
+    if any(whole):  # windows that one search serves
         views = np.lib.stride_tricks.sliding_window_view(whitened.r, window, axis=0).swapaxes(1, 2)
-        statistic[~single] = shared.largest(views[starts[~single]])
-    for i in np.flatnonzero(single):
-        part = slice(starts[i], starts[i] + window)
-        own = sweep(found, window, steady=whitened.predictor, present=whitened.present[part],
-                    u=inputs[part] if inputs is not None else None)
-        statistic[i] = own.largest(whitened.r[None, part])[0]
+        first = _part(whitened, int(starts[whole.index(True)]), window)
+        statistic[whole] = sweep(found, first).largest(views[starts[whole]])
+    for i in np.flatnonzero(~np.array(whole)):
+        own, k = _part(whitened, int(starts[i]), window), starts[i]
+        statistic[i] = sweep(found, own, None if inputs is None else inputs[k : k + window]).largest(own.r[None])[0]
     return SlidingScan(found.labels, window, count, starts + window, statistic)
+
+
+def _part(whitened: Whitened, start: int, window: int) -> Whitened:
+    part = slice(start, start + window)
+    r, innovations, present = (values[part] for values in (whitened.r, whitened.innovations, whitened.present))
+    return replace(whitened, r=r, innovations=innovations, present=present, states=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +201,9 @@ def empirical_thresholds(
         usual = np.nanmax(simulated(found, window, u=longest, draws=draws, seed=seed) / white.q, axis=1)
         factor = max(factor, float(np.quantile(ratios, 1 - level) / np.quantile(usual, 1 - level)))
     above = [one.excess(white) > factor for one in scans]
-    excursions = sum(_apart(one.stops[alarms], window) for one, alarms in zip(scans, above))
+    # an alarm that begins within a window of the one before is the same
+    excursions = sum(int(np.sum(np.diff(one.stops[alarms], prepend=-window) > window))
+                     for one, alarms in zip(scans, above))
     if level == false_alarm and excursions < SURE:
         warnings.warn(
             f"The thresholds rest on {excursions} excursions of the healthy record: its rate of false alarms is kept, "
@@ -209,8 +215,3 @@ def empirical_thresholds(
         share=float(np.mean(np.concatenate(above))), excursions=excursions, windows=ratios.size,
         independent=independent, extrapolated=level != false_alarm,
     )
-
-
-def _apart(stops: np.ndarray, window: int) -> int:
-    """Count alarms; one that begins within a window of the alarm before is the same."""
-    return 0 if not stops.size else 1 + int(np.sum(np.diff(stops) > window))

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.arrays import Array, check_integer
-from optid.errors import DataError, StructureError
+from optid.errors import StructureError
+from optid.faults.search.scanning import check_window
 from optid.faults.search.sweeps import inverse_roots
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
@@ -33,7 +34,6 @@ class StateJumps:
         energies: (most + 1,) energy that is left with the best 0, 1, ..., most jumps.
         best: for each number of jumps, the onsets.
         penalty: energy that a jump must explain.
-        count: samples of the window.
     """
 
     onsets: tuple[int, ...]
@@ -41,7 +41,6 @@ class StateJumps:
     energies: Array
     best: tuple[tuple[int, ...], ...] = field(repr=False)
     penalty: float
-    count: int
 
     @property
     def gain(self) -> float:
@@ -82,23 +81,21 @@ def state_jumps(
         StructureError: an uncertain model (its nuisance ties all segments together), several experiments, a window
             that is too long, impossible numbers.
     """
-    if not isinstance(whitened, Whitened):
-        raise StructureError("state_jumps takes the whitened innovations of one experiment: take them one by one.")
-    count, l = whitened.r.shape  # noqa: E741
-    if l != found.model.l:
-        raise DataError(f"The window has {l} outputs; the dictionary is of {found.model.l}.")
+    check_window(found, whitened, "state_jumps")
+    count = len(whitened.r)
     if whitened.nuisance is not None:
         raise StructureError("An uncertain model ties all segments together: whiten without it for this search.")
     check_integer(most, "most", 0)
     if count > LONGEST:
         raise StructureError(f"{count} samples are too many for all segments ({LONGEST}): use a shorter window.")
-    if not np.isfinite(whitened.r).all():
-        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
-        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
     price = _price(found, whitened, penalty)
     energies, best = _segmented(segment_costs(found, whitened), np.sum(whitened.r**2, axis=1), int(most))
     chosen = best[int(np.argmin(energies + price * np.arange(energies.size)))]
-    return StateJumps(chosen, _sizes(found, whitened, chosen), energies, best, price, count)
+    sizes = np.zeros((0, found.model.nx))
+    if chosen:  # by least squares, all together
+        flat = np.concatenate([_response(found, whitened, k).reshape(whitened.r.size, -1) for k in chosen], axis=1)
+        sizes = np.linalg.lstsq(flat, whitened.r.ravel(), rcond=1e-10)[0].reshape(len(chosen), -1)
+    return StateJumps(chosen, np.asarray(sizes, dtype=float), energies, best, price)
 
 
 def segment_costs(found: Dictionary, whitened: Whitened) -> Array:
@@ -107,13 +104,14 @@ def segment_costs(found: Dictionary, whitened: Whitened) -> Array:
     costs = np.full((count, count + 1), np.inf)
     energy = np.concatenate([[0.0], np.cumsum(np.sum(whitened.r**2, axis=1))])
     complete = bool(whitened.present.all())
-    trace = _response(found, whitened, 0)
-    roots = _roots(trace) if complete else None
+    trace, roots = _response(found, whitened, 0), np.empty(0)
     for i in range(count):
         own = trace[: count - i] if complete else _response(found, whitened, i)[i:]
+        if i == 0 or not complete:  # without gaps a later onset shifts the trace
+            products = np.cumsum(np.einsum("kop,koq->kpq", own, own), axis=0)
+            roots = inverse_roots(products, np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float))
         along = np.cumsum(np.einsum("kop,ko->kp", own, whitened.r[i:]), axis=0)
-        whole = _roots(own) if roots is None else roots[: count - i]
-        explained = np.sum(np.einsum("kqp,kp->kq", whole, along) ** 2, axis=1)
+        explained = np.sum(np.einsum("kqp,kp->kq", roots[: count - i], along) ** 2, axis=1)
         costs[i, i + 1 :] = np.maximum(energy[i + 1 :] - energy[i] - explained, 0.0)
     return costs
 
@@ -127,17 +125,12 @@ def _response(found: Dictionary, whitened: Whitened, onset: int) -> Array:
     return whitened.seen(whitened.predictor.respond(into_state, into_output, whitened.present))
 
 
-def _roots(trace: Array) -> Array:
-    products = np.cumsum(np.einsum("kop,koq->kpq", trace, trace), axis=0)
-    return inverse_roots(products, np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float))
-
-
 def _segmented(costs: Array, squares: Array, most: int) -> tuple[Array, tuple[tuple[int, ...], ...]]:
+    """Energies left by up to `most` jumps, and the best onsets of each number, by dynamic programming."""
     count = len(costs)
     value = np.concatenate([[0.0], np.cumsum(squares)])  # up to j without a jump
     before: list[np.ndarray] = []
-    energies = [float(value[-1])]
-    best: list[tuple[int, ...]] = [()]
+    energies, best = [float(value[-1])], [tuple[int, ...]()]
     for _ in range(most):
         table = value[:count, None] + costs
         before.append(table.argmin(axis=0))
@@ -145,21 +138,11 @@ def _segmented(costs: Array, squares: Array, most: int) -> tuple[Array, tuple[tu
         if not np.isfinite(value[-1]):
             break
         energies.append(float(value[-1]))
-        ends, at = [], count
+        ends = [count]
         for chosen in reversed(before):
-            at = int(chosen[at])
-            ends.append(at)
-        best.append(tuple(reversed(ends)))
+            ends.append(int(chosen[ends[-1]]))
+        best.append(tuple(reversed(ends[1:])))
     return np.array(energies), tuple(best)
-
-
-def _sizes(found: Dictionary, whitened: Whitened, onsets: tuple[int, ...]) -> Array:
-    """The jumps by least squares, all together."""
-    if not onsets:
-        return np.zeros((0, found.model.nx))
-    flat = np.concatenate([_response(found, whitened, k).reshape(whitened.r.size, -1) for k in onsets], axis=1)
-    solved = np.linalg.lstsq(flat, whitened.r.ravel(), rcond=1e-10)[0]
-    return np.asarray(solved, dtype=float).reshape(len(onsets), -1)
 
 
 def _price(found: Dictionary, whitened: Whitened, penalty: "float | Thresholds | None") -> float:

@@ -6,7 +6,8 @@ the best ones at a given onset are a quadratic programme with a box, solved exac
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,18 +24,6 @@ ROUNDING = 1e-10
 """Share of a product that is rounding."""
 
 
-class Bounds(NamedTuple):
-    """What the magnitudes of a fault can be.
-
-    Attributes:
-        low: (d,).
-        high: (d,).
-    """
-
-    low: Array
-    high: Array
-
-
 @dataclass(frozen=True, eq=False)
 class Bounded:
     """The best possible magnitudes of a candidate at every onset; `bounded` makes it.
@@ -44,7 +33,8 @@ class Bounded:
         statistic: (N,) energy that they explain, NaN where the candidate is not tested. Below that of the scan where a
             bound holds them.
         sizes: (N, d) magnitudes within the bounds.
-        bounds: what they can be.
+        low: (d,) bounds; -inf where there is none.
+        high: (d,) bounds; inf where there is none.
         multipliers: (N, d) derivative of half the energy along each magnitude: zero between the bounds, negative at the
             lower one, positive at the upper one (the certificate of each onset).
     """
@@ -52,7 +42,8 @@ class Bounded:
     label: str
     statistic: Array
     sizes: Array
-    bounds: Bounds
+    low: Array
+    high: Array
     multipliers: Array
 
     @property
@@ -97,54 +88,22 @@ class Severity:
         )
 
 
-def bounds_of(scan: Scan, candidate: Candidate | str, reach: ArrayLike | None = None) -> Bounds:
-    """Return what the magnitudes of a loss or of a stuck actuator can be.
-
-    Args:
-        scan: the search.
-        candidate: a loss or a stuck actuator.
-        reach: (lowest, highest) input of the actuator; by default the interval on which f is known, and no bound where
-            f has none.
-
-    Raises:
-        StructureError: another kind of fault, a reach that is not one.
-    """
-    c = scan.dictionary.candidates[scan.index(candidate)]
-    if not c.columns:
-        raise StructureError(f"{c.label}: only a loss and a stuck actuator have a share lost.")
-    low, high = [0.0], [1.0]
-    for column in c.columns if c.kind == "stuck" else ():
-        function = scan.dictionary.model.nonlinearities[column]
-        ends = function.basis.interval if reach is None else tuple(np.asarray(reach, dtype=float).ravel())
-        if ends is None:
-            low.append(-np.inf)
-            high.append(np.inf)
-            continue
-        if len(ends) != 2 or not np.all(np.isfinite(ends)) or not ends[0] < ends[1]:
-            raise StructureError(f"reach={reach!r}: the lowest and the highest input are needed.")
-        image = function(np.linspace(*ends, 513))
-        low.append(float(np.min(image)))
-        high.append(float(np.max(image)))
-    return Bounds(np.array(low), np.array(high))
-
-
 def bounded(scan: Scan, candidate: Candidate | str, *, reach: ArrayLike | None = None) -> Bounded:
     """Return the best magnitudes between their bounds at every onset.
 
     Args:
         scan: the search; made with the inputs u.
         candidate: a loss or a stuck actuator.
-        reach: (lowest, highest) input of the actuator, see `bounds_of`.
+        reach: (lowest, highest) input of the actuator; by default the interval on which f is known, and no bound where
+            f has none.
 
     Raises:
         StructureError: another kind of fault, one that is tested nowhere (no input, or one that does not move), more
-            than six functions of an input.
+            than six magnitudes, a reach that is not one.
     """
-    from optid.faults.search.box_kernels import boxed
-
     c = scan.index(candidate)
-    limits, d = bounds_of(scan, candidate, reach), int(scan.sweep.blocks.sizes[c])
-    tested = ~np.isnan(scan.statistic[c])
+    low, high = _bounds(scan.dictionary.model, scan.dictionary.candidates[c], reach)
+    tested, d = ~np.isnan(scan.statistic[c]), int(scan.sweep.blocks.sizes[c])
     if not tested.any():
         raise StructureError(
             f"{scan.labels[c]} is not tested in this window: "
@@ -152,14 +111,63 @@ def bounded(scan: Scan, candidate: Candidate | str, *, reach: ArrayLike | None =
         )
     if d > FACES:
         raise StructureError(f"{scan.labels[c]}: {d} magnitudes; bounds are kept for {FACES} at most.")
-    products = products_of(scan, c)
-    correlations = np.ascontiguousarray(scan.correlations[:, scan.sweep.columns(c)])
-    sizes, values = np.empty((len(products), d)), np.empty(len(products))
-    boxed(products, correlations, limits.low, limits.high, ROUNDING, sizes, values)
+    roots = scan.sweep.roots_of(c)  # rows are orthogonal: axes over the roots of the eigenvalues
+    squares = np.sum(roots**2, axis=2)
+    weights = np.where(squares > 0, 1 / np.where(squares > 0, squares, 1.0) ** 2, 0.0)
+    products = np.einsum("kq,kqi,kqj->kij", weights, roots, roots)
+    correlations = scan.correlations[:, scan.sweep.columns(c)]
+    sizes, values = boxed(products, correlations, low, high)
     values[~tested], sizes[~tested] = np.nan, np.nan
-    return Bounded(
-        scan.labels[c], values, sizes, limits, correlations - np.einsum("kij,kj->ki", products, sizes)
-    )
+    multipliers = correlations - np.einsum("kij,kj->ki", products, sizes)
+    return Bounded(scan.labels[c], values, sizes, low, high, multipliers)
+
+
+def _bounds(model: Any, c: Candidate, reach: ArrayLike | None) -> tuple[Array, Array]:
+    """What the magnitudes of a loss or of a stuck actuator can be at least and at most."""
+    if not c.columns:
+        raise StructureError(f"{c.label}: only a loss and a stuck actuator have a share lost.")
+    ends = [(0.0, 1.0)]
+    for column in c.columns if c.kind == "stuck" else ():
+        function = model.nonlinearities[column]
+        within = function.basis.interval if reach is None else tuple(np.asarray(reach, dtype=float).ravel())
+        if within is None:
+            ends.append((-np.inf, np.inf))
+            continue
+        if len(within) != 2 or not np.all(np.isfinite(within)) or not within[0] < within[1]:
+            raise StructureError(f"reach={reach!r}: the lowest and the highest input are needed.")
+        image = function(np.linspace(within[0], within[1], 513))
+        ends.append((float(np.min(image)), float(np.max(image))))
+    low, high = np.array(ends).T
+    return low, high
+
+
+def boxed(products: Array, correlations: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Maximise 2 b'nu - nu'G nu over low <= nu <= high (d,) for many G (T, d, d) and b (T, d).
+
+    Every face of the box is tried: on the right one its stationary point is the maximum, on the others it is no more.
+    The maximisers (T, d) and maxima (T,) are NaN where no face has a finite stationary point.
+    """
+    count, d = correlations.shape
+    best, values = np.full((count, d), np.nan), np.full(count, np.nan)
+    scale = np.sqrt(np.maximum(np.einsum("tii->ti", products), 1e-300))
+    for face in product((None, low, high), repeat=d):
+        if any(end is not None and not np.isfinite(end[j]) for j, end in enumerate(face)):
+            continue
+        free = np.array([end is None for end in face])
+        nu = np.tile([0.0 if end is None else end[j] for j, end in enumerate(face)], (count, 1))
+        possible = np.ones(count, dtype=bool)
+        if free.any():
+            left = (correlations - np.einsum("tij,tj->ti", products, nu))[:, free] / scale[:, free]
+            scaled = products[:, free][:, :, free] / scale[:, free, None] / scale[:, None, free]
+            eigenvalues, axes = np.linalg.eigh(scaled)
+            possible = eigenvalues[:, 0] > ROUNDING
+            inverse = 1 / np.where(possible[:, None], eigenvalues, 1.0)
+            nu[:, free] = np.einsum("tij,tj,tkj,tk->ti", axes, inverse, axes, left) / scale[:, free]
+            possible &= np.all((low <= nu) & (nu <= high), axis=1)
+        value = 2 * np.sum(correlations * nu, axis=1) - np.einsum("ti,tij,tj->t", nu, products, nu)
+        better = possible & ~(value <= values)
+        best[better], values[better] = nu[better], value[better]
+    return best, values
 
 
 def severity(
@@ -168,26 +176,17 @@ def severity(
     """Return the share lost, with an interval that counts the search of the onset.
 
     The interval holds the shares at which twice the logarithm of the likelihood, profiled over the onset and over the
-    constants added, is within the quantile of chi square of its maximum.
-
-    Args:
-        scan: the search; made with the inputs u.
-        candidate: a loss or a stuck actuator.
-        coverage: nominal probability of the interval.
-        reach: (lowest, highest) input of the actuator, see `bounds_of`.
-
-    Raises:
-        StructureError: as `bounded`, or a coverage outside (0, 1).
+    constants added, is within the quantile of chi square of its maximum. `coverage` is its nominal probability; the
+    other arguments and the errors are those of `bounded`.
     """
     from scipy.special import chdtri
 
     check_probability(coverage, "coverage")
-    best, c = bounded(scan, candidate, reach=reach), scan.index(candidate)
+    best, free = bounded(scan, candidate, reach=reach), scan.statistic[scan.index(candidate)]
     onset, width = best.peak, float(chdtri(1, 1 - coverage))
     low, high = best.sizes[onset, 0], best.sizes[onset, 0]
-    free = scan.statistic[c]
     for k in np.flatnonzero(free > np.nanmax(free) - width):
-        nu, covariance = scan.estimate(scan.dictionary.candidates[c], int(k))
+        nu, covariance = scan.estimate(candidate, int(k))
         reach_k = np.sqrt(covariance[0, 0] * (width - (np.nanmax(free) - free[k])))
         low, high = min(low, nu[0] - reach_k), max(high, nu[0] + reach_k)
     interval = float(np.clip(low, 0, 1)), float(np.clip(high, 0, 1))
@@ -195,12 +194,3 @@ def severity(
         best.label, onset, float(best.sizes[onset, 0]), interval, tuple(float(v) for v in best.sizes[onset, 1:]),
         coverage, bool(interval[1] >= 1 and interval[0] > 0), float(best.statistic[onset]),
     )
-
-
-def products_of(scan: Scan, c: int) -> Array:
-    """Return the products (N, d, d) of the signatures of a candidate, without directions that are not seen."""
-    d, place = int(scan.sweep.blocks.sizes[c]), int(scan.sweep.blocks.places[c])
-    roots = scan.sweep.roots[:, place : place + d * d].reshape(-1, d, d)
-    squares = np.sum(roots**2, axis=2)  # rows are orthogonal: axes over the roots of the eigenvalues
-    weights = np.where(squares > 0, 1 / np.where(squares > 0, squares, 1.0) ** 2, 0.0)
-    return np.ascontiguousarray(np.einsum("kq,kqi,kqj->kij", weights, roots, roots))

@@ -12,14 +12,11 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def joint_energy(first, second, cosines, floor, work):
-    """Energy that two subspaces explain together; -1 where nothing of the smaller one is left beside the other.
+    """Return the energy that two subspaces explain together; -1 where nothing of the smaller one is left beside it.
 
-    Args:
-        first: (a,) coordinates of the window along the axes of the larger subspace.
-        second: (b,) along those of the smaller one.
-        cosines: (a, b) products of the axes.
-        floor: share of a direction beside the other subspace below which it is taken as part of it.
-        work: (b, b + 1) overwritten.
+    `first` (a,) and `second` (b,) are coordinates of the window along the axes of the larger and of the smaller one,
+    `cosines` (a, b) the products of the axes, `floor` the share of a direction beside the other subspace below which it
+    is part of it; `work` (b, b + 1) is overwritten.
     """
     a, b = cosines.shape
     energy = 0.0
@@ -60,28 +57,24 @@ def joint_energy(first, second, cosines, floor, work):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(tables, products, states, along, blocks, roots, tested, z, q, same, floor, best, energies, onsets, alike):
-    """Best pair of onsets for every pair of candidates.
+def search(tables, products, states, along, blocks, roots, tested, z, q, same, floor, best, onsets, alike):
+    """Find the best pair of onsets for every pair of candidates; return how many pairs cannot be told apart.
 
     Args:
         tables: `optid.faults.search.sweeps.Tables`.
         products: (N, D, D) of columns with the same onset.
         states: (N, n, D) of a unit state with the columns.
-        along: (N, Q, D) what an uncertain model takes off the products: along' along.
+        along: (N, Q, D) what an uncertain model takes off the products.
         blocks: `optid.faults.search.sweeps.Blocks`.
-        roots: (N, R) inverse roots of the products, see `optid.faults.search.sweeps.Sweep`.
+        roots: (N, R) inverse roots of the products.
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.
         q: (C,) thresholds.
         same: whether both faults may be of one candidate.
         floor: see `joint_energy`.
         best: (C, C) written above the diagonal and on it: largest energy less both thresholds, -inf where none.
-        energies: (C, C) written: energy explained.
         onsets: (C, C, 2) written: onsets of the first and of the second candidate.
-        alike: (K, 4) written: candidate, onset, candidate, onset of pairs of which only one is seen.
-
-    Returns:
-        number of pairs that cannot be told apart; the first K of them are written.
+        alike: (K, 4) written: candidate, onset, candidate, onset of the first K pairs of which only one is seen.
     """
     of, F, e = tables.of, tables.F, tables.e
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
@@ -99,7 +92,9 @@ def search(tables, products, states, along, blocks, roots, tested, z, q, same, f
             any_here = any_here or tested[c, theta]
         if not any_here:
             continue
-        x[:] = 0.0
+        for a in range(n):
+            for i in range(columns):
+                x[a, i] = 0.0
         for k in range(theta, count):
             t = of[k]
             age = k - theta
@@ -159,7 +154,7 @@ def search(tables, products, states, along, blocks, roots, tested, z, q, same, f
                     gain = energy - q[c] - q[other]
                     low, high = min(c, other), max(c, other)
                     if gain > best[low, high]:
-                        best[low, high], energies[low, high] = gain, energy
+                        best[low, high] = gain
                         onsets[low, high, 0], onsets[low, high, 1] = (theta, k) if c <= other else (k, theta)
             if k + 1 < count:
                 for i in range(columns):

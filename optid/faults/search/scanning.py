@@ -1,5 +1,6 @@
 """The exact search for one fault (GLR): every candidate at every onset, the best magnitude by least squares."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -14,6 +15,10 @@ from optid.faults.whitening import Whitened
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
+
+
+ALIKE = 2e-6
+"""One less the squared cosine of two signatures below which no window can tell them apart."""
 
 
 class Magnitude(NamedTuple):
@@ -77,10 +82,10 @@ class Scan:
         Raises:
             StructureError: a candidate that is tested nowhere.
         """
-        row = self.statistic[self.index(candidate)]
-        if np.isnan(row).all():
-            raise StructureError(f"{self._label(candidate)} is tested at no onset of this window: it has no peak.")
-        return int(np.nanargmax(row))
+        c = self.index(candidate)
+        if np.isnan(self.statistic[c]).all():
+            raise StructureError(f"{self.labels[c]} is tested at no onset of this window: it has no peak.")
+        return int(np.nanargmax(self.statistic[c]))
 
     def estimate(self, candidate: Candidate | str, onset: int) -> Magnitude:
         """Return the magnitudes of a candidate at an onset.
@@ -89,8 +94,9 @@ class Scan:
             StructureError: an onset at which it is not tested.
         """
         c = self.index(candidate)
-        self._check(c, onset)
-        root = self.sweep.root(c, onset)
+        if not 0 <= onset < self.statistic.shape[1] or np.isnan(self.statistic[c, onset]):
+            raise StructureError(f"{self.labels[c]} is not tested at onset {onset} of this window.")
+        root = self.sweep.roots_of(c)[onset]
         inverse = root.T @ root
         return Magnitude(inverse @ self.correlations[onset, self.sweep.columns(c)], inverse)
 
@@ -108,6 +114,16 @@ class Scan:
             raise StructureError(f"onset={onset} lies outside the window of {count} samples.")
         return self.sweep.signature(c, onset)
 
+    def together(self, labels: Sequence[Candidate | str], onsets: Sequence[int]) -> Magnitude:
+        """Return the magnitudes of several candidates, one after the other, and their covariance."""
+        traces = [self.signature(label, onset) for label, onset in zip(labels, onsets)]
+        flat = np.concatenate(traces, axis=2).reshape(self.whitened.r.size, -1)
+        sizes = np.linalg.norm(flat, axis=0)
+        sizes[sizes == 0] = 1.0
+        inverse = np.linalg.pinv((flat / sizes).T @ (flat / sizes), rcond=ALIKE, hermitian=True)
+        inverse /= np.outer(sizes, sizes)
+        return Magnitude(inverse @ (flat.T @ self.whitened.r.ravel()), inverse)
+
     def gains(self, thresholds: "Thresholds") -> Array:
         """Return the statistics less their thresholds, (C, N): the fault at the largest is the exact optimum.
 
@@ -116,24 +132,18 @@ class Scan:
         """
         return self.statistic - thresholds.of(self.labels)[:, None]
 
-    def _label(self, candidate: Candidate | str) -> str:
-        return self.labels[self.index(candidate)]
-
-    def _check(self, c: int, onset: int) -> None:
-        if not 0 <= onset < self.statistic.shape[1] or np.isnan(self.statistic[c, onset]):
-            raise StructureError(f"{self.labels[c]} is not tested at onset {onset} of this window.")
-
     def __str__(self) -> str:
         """Print the peak of every candidate."""
         lines = [f"window of {len(self.whitened.r)} samples, energy {self.energy:.1f}",
                  f"  {'candidate':<40}{'energy':>9}{'onset':>7}  magnitude"]
-        for c, label in enumerate(self.labels):
-            if np.isnan(self.statistic[c]).all():
-                lines.append(f"  {_cut(label, 39):<40}{'not tested':>16}")
+        for candidate, row in zip(self.dictionary.candidates, self.statistic):
+            label = shorten(candidate.label, 39)
+            if np.isnan(row).all():
+                lines.append(f"  {label:<40}{'not tested':>16}")
                 continue
-            onset = self.peak(self.dictionary.candidates[c])
-            sizes = " ".join(f"{v:.3g}" for v in self.estimate(self.dictionary.candidates[c], onset).nu)
-            lines.append(f"  {_cut(label, 39):<40}{self.statistic[c, onset]:>9.1f}{onset:>7}  {_cut(sizes, 20)}")
+            onset = self.peak(candidate)
+            sizes = " ".join(f"{v:.3g}" for v in self.estimate(candidate, onset).nu)
+            lines.append(f"  {label:<40}{row[onset]:>9.1f}{onset:>7}  {shorten(sizes, 20)}")
         return "\n".join(lines)
 
 
@@ -153,9 +163,25 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         StructureError: several experiments at once, onsets outside the window, a window that is too short, no candidate
             with a signature.
     """
+    check_window(found, whitened, "scan")
+    prepared = sweep(found, whitened, u)
+    correlations = prepared.correlations(whitened.r)
+    statistic = prepared.statistic(correlations)
+    if onsets is not None:
+        count = len(whitened.r)
+        chosen = np.atleast_1d(np.arange(count)[onsets] if isinstance(onsets, slice) else np.asarray(onsets))
+        if not (np.issubdtype(chosen.dtype, np.integer) and chosen.size and 0 <= chosen.min() <= chosen.max() < count):
+            raise StructureError(f"onsets: whole numbers from 0 to {count - 1} are needed, one at least.")
+        statistic[:, np.setdiff1d(np.arange(count), chosen)] = np.nan
+    inputs = None if u is None else np.asarray(u, dtype=float).reshape(len(whitened.r), -1)
+    return Scan(found, whitened, inputs, statistic, prepared, correlations)
+
+
+def check_window(found: Dictionary, whitened: Whitened, search: str) -> None:
+    """Refuse several experiments, other outputs than the model's, and innovations that are not finite."""
     if not isinstance(whitened, Whitened):
         raise StructureError(
-            "scan takes the whitened innovations of one experiment, as optid.faults.whiten returns them: scan the "
+            f"{search} takes the whitened innovations of one experiment, as optid.faults.whiten returns them: take the "
             "experiments of a record one by one."
         )
     if whitened.r.shape[1] != found.model.l:
@@ -163,26 +189,8 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
     if not np.isfinite(whitened.r).all():
         k, o = np.argwhere(~np.isfinite(whitened.r))[0]
         raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
-    prepared = sweep(
-        found, len(whitened.r), steady=whitened.predictor, present=whitened.present, u=u, nuisance=whitened.nuisance,
-        states=whitened.states,
-    )
-    correlations = prepared.correlations(whitened.r)
-    statistic = prepared.statistic(correlations)
-    if onsets is not None:
-        others = np.ones(len(whitened.r), dtype=bool)
-        others[_onsets(onsets, len(whitened.r))] = False
-        statistic[:, others] = np.nan
-    inputs = None if u is None else np.asarray(u, dtype=float).reshape(len(whitened.r), -1)
-    return Scan(found, whitened, inputs, statistic, prepared, correlations)
 
 
-def _onsets(onsets: Any, count: int) -> np.ndarray:
-    chosen = np.atleast_1d(np.arange(count)[onsets] if isinstance(onsets, slice) else np.asarray(onsets))
-    if not np.issubdtype(chosen.dtype, np.integer) or not chosen.size or chosen.min() < 0 or chosen.max() >= count:
-        raise StructureError(f"onsets: whole numbers from 0 to {count - 1} are needed, one at least.")
-    return chosen
-
-
-def _cut(text: str, most: int) -> str:
+def shorten(text: str, most: int) -> str:
+    """Cut a long text for a table."""
     return text if len(text) <= most else text[: most - 1] + "…"

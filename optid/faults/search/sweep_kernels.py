@@ -11,13 +11,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def correlate(tables, r, found):
-    """Correlations of a window with all columns at all onsets, by one backward sweep.
-
-    Args:
-        tables: `optid.faults.search.sweeps.Tables`.
-        r: (N, l) window.
-        found: (N, D) written.
-    """
+    """Write the correlations (N, D) of a window (N, l) with all columns at all onsets, by one backward sweep."""
     of, F, C, W, h, e = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
     count, l = r.shape  # noqa: E741
@@ -154,54 +148,29 @@ def grams(tables, group, slots, products, states):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def explained(correlations, first, sizes, roots, places, statistic):
-    """Energies that the candidates explain at all onsets.
-
-    Args:
-        correlations: (N, D).
-        first: (C,) first column of a candidate.
-        sizes: (C,) its number of columns; 0 where it is not tested.
-        roots: (N, R) inverse roots of the products, row by row and candidate after candidate.
-        places: (C,) where those of a candidate begin.
-        statistic: (C, N) written where a candidate is tested.
-    """
-    for c in range(first.size):
-        d, begin, place = sizes[c], first[c], places[c]
-        if d == 1:
-            for k in range(correlations.shape[0]):
-                z = roots[k, place] * correlations[k, begin]
-                statistic[c, k] = z * z
-        elif d > 1:
-            for k in range(correlations.shape[0]):
-                total = 0.0
-                for q in range(d):
-                    z = 0.0
-                    for p in range(d):
-                        z += roots[k, place + q * d + p] * correlations[k, begin + p]
-                    total += z * z
-                statistic[c, k] = total
+def explained(correlations, blocks, roots, statistic):
+    """Write the energies (C, N) that the candidates explain at all onsets, from correlations (N, D) and their roots."""
+    for c in range(blocks.first.size):
+        d, begin, place = blocks.sizes[c], blocks.first[c], blocks.places[c]
+        for k in range(correlations.shape[0] if d > 0 else 0):
+            total = 0.0
+            for q in range(d):
+                z = 0.0
+                for p in range(d):
+                    z += roots[k, place + q * d + p] * correlations[k, begin + p]
+                total += z * z
+            statistic[c, k] = total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def many(tables, windows, first, sizes, roots, places, tested, largest):
-    """Largest energy over the onsets for every window and candidate.
-
-    Args:
-        tables: `optid.faults.search.sweeps.Tables`.
-        windows: (M, N, l).
-        first: as `explained`.
-        sizes: as `explained`.
-        roots: as `explained`.
-        places: as `explained`.
-        tested: (C, N) which onsets count.
-        largest: (M, C) written; NaN for a candidate that is not tested.
-    """
-    count, columns = windows.shape[1], tables.h.shape[2]
-    correlations, statistic = np.empty((count, columns)), np.zeros((first.size, count))
+def many(tables, windows, blocks, roots, tested, largest):
+    """Write the largest energy over the onsets of windows (M, N, l), (M, C); NaN where `tested` (C, N) has none."""
+    count, candidates = windows.shape[1], blocks.first.size
+    correlations, statistic = np.empty((count, tables.h.shape[2])), np.zeros((candidates, count))
     for m in range(windows.shape[0]):
         correlate(tables, windows[m], correlations)
-        explained(correlations, first, sizes, roots, places, statistic)
-        for c in range(first.size):
+        explained(correlations, blocks, roots, statistic)
+        for c in range(candidates):
             best = np.nan
             for k in range(count):
                 if tested[c, k] and not statistic[c, k] <= best:
@@ -211,15 +180,7 @@ def many(tables, windows, first, sizes, roots, places, tested, largest):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def course(tables, first, order, onset, signature):
-    """The whitened signature of neighbouring columns with an onset.
-
-    Args:
-        tables: `optid.faults.search.sweeps.Tables`.
-        first: first of the d columns.
-        order: 0 for columns that last, 1 for drifts, 2 for jumps.
-        onset: first sample.
-        signature: (N, l, d) written from the onset on.
-    """
+    """Write the whitened signature (N, l, d) of the columns from `first`; order 0: they last, 1: drifts, 2: jumps."""
     count, l, d = signature.shape  # noqa: E741
     n = tables.F.shape[1]
     x, later, now = np.zeros((n, d)), np.zeros((n, d)), np.zeros(l)

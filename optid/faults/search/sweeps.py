@@ -10,6 +10,7 @@ An uncertain model (`optid.faults.nuisance`) multiplies window and signatures by
 so that correlations are those of the plain signatures with S r, and products lose a term of low rank.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -20,7 +21,7 @@ from optid.arrays import Array, compact
 from optid.errors import DataError, StructureError
 from optid.faults.scheduled import change
 from optid.faults.signatures import Candidate, Dictionary
-from optid.faults.whitening import Predictor
+from optid.faults.whitening import Predictor, Whitened
 from optid.models.experiments import samples_of
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 
 SHARE = 1e-9
 """Directions of a signature with less than this share of the energy of the largest one explain nothing."""
+
+BATCH = 2_000_000
+"""Numbers of a batch of simulated windows."""
 
 ORDERS = {"drift": 1, "jump": 2, "spike": 2}
 """Where the columns of a kind stand: those that last, drifts, jumps."""
@@ -81,7 +85,6 @@ class Sweep:
 
     Attributes:
         found: the dictionary.
-        predictor: whose innovations the windows are.
         window: samples N.
         present: (N, l) whether a reading is there; None where all are.
         nuisance: what uncertain parameters leave in the windows.
@@ -90,10 +93,10 @@ class Sweep:
         roots: (N, R) inverse roots of the products, row by row and candidate after candidate; zero rows for directions
             that nothing is seen of.
         tested: (C, N) whether the candidate is looked for at the onset.
+        along: V (N, q, D): an uncertain model takes V' V off the products of the columns; q is zero without one.
     """
 
     found: Dictionary
-    predictor: Predictor
     window: int
     present: Array | None
     nuisance: "Nuisance | None"
@@ -101,11 +104,12 @@ class Sweep:
     blocks: Blocks
     roots: Array
     tested: np.ndarray
+    along: Array
 
-    def root(self, c: int, onset: int) -> Array:
-        """Return R (d, d) of a candidate: R' R is the inverse of the products of its columns."""
+    def roots_of(self, c: int) -> Array:
+        """Return R (N, d, d) of a candidate: R' R is the inverse of the products of its columns."""
         d, place = int(self.blocks.sizes[c]), int(self.blocks.places[c])
-        return self.roots[onset, place : place + d * d].reshape(d, d)
+        return self.roots[:, place : place + d * d].reshape(-1, d, d)
 
     def columns(self, c: int) -> slice:
         """Return the columns of a candidate among the correlations."""
@@ -129,13 +133,16 @@ class Sweep:
         correlate(self.tables, compact(seen), result)
         return result
 
+    def coordinates(self, correlations: Array, c: int) -> Array:
+        """Return the coordinates (..., N, d) of windows along the orthonormal axes of a candidate at every onset."""
+        return np.einsum("kqp,...kp->...kq", self.roots_of(c), correlations[..., self.columns(c)])
+
     def statistic(self, correlations: Array) -> Array:
         """Return the energies (C, N) explained, NaN where a candidate is not tested."""
         from optid.faults.search.sweep_kernels import explained
 
         result = np.full(self.tested.shape, np.nan)
-        blocks = self.blocks
-        explained(correlations, blocks.first, blocks.sizes, self.roots, blocks.places, result)
+        explained(correlations, self.blocks, self.roots, result)
         result[~self.tested] = np.nan
         return result
 
@@ -146,72 +153,65 @@ class Sweep:
         shown = windows if self.present is None else np.where(self.present, windows, 0.0)
         if self.nuisance is not None:
             shown = np.moveaxis(self.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
-        result, blocks = np.empty((len(windows), len(self.tested))), self.blocks
-        many(self.tables, compact(shown), blocks.first, blocks.sizes, self.roots,
-             blocks.places, self.tested, result)
+        result = np.empty((len(windows), len(self.tested)))
+        many(self.tables, compact(shown), self.blocks, self.roots, self.tested, result)
         return result
 
-
-    def along(self) -> Array:
-        """Return V (N, q, D): an uncertain model takes V' V off the products of the columns; q is zero without one."""
-        columns = self.blocks.group.size
-        if self.nuisance is None:
-            return np.zeros((self.window, 0, columns))
-        return _along(self.tables, self.nuisance, columns)
+    def simulated(self, draws: int, rng: np.random.Generator) -> Iterator[Array]:
+        """Yield `draws` windows (M, N, l) of a healthy plant in batches."""
+        size = max(1, BATCH // (self.window * self.found.model.l))
+        for start in range(0, draws, size):
+            yield rng.standard_normal((min(size, draws - start), self.window, self.found.model.l))
 
 
 _KEPT: "WeakKeyDictionary[Dictionary, dict[Any, Sweep]]" = WeakKeyDictionary()
 _MOST = 4
 
 
-def sweep(
-    found: Dictionary, window: int, *, steady: Predictor | None = None, present: Array | None = None, u: Any = None,
-    nuisance: "Nuisance | None" = None, states: Array | None = None,
-) -> Sweep:
+def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
     """Prepare the search for one fault.
 
     What depends on the model alone is kept with the dictionary for the next window of the same length.
 
     Args:
         found: the dictionary.
-        window: samples N.
-        steady: the predictor behind the windows; that of the dictionary by default.
-        present: (N, l) whether a reading is there.
-        u: (N, m) inputs, for losses and stuck actuators, which are not tested without it.
-        nuisance: of an uncertain model.
-        states: (N, n) of the predictor, for scheduled changes, which are not tested without them and the inputs.
+        window: samples N, or a window with its predictor, missing readings, uncertain model and states.
+        u: (N, m) inputs, for losses and stuck actuators, which are not tested without it; scheduled changes need the
+            states of the window, too.
 
     Raises:
         DataError: inputs of another length, or missing.
         StructureError: a window that is too short, or no candidate with a signature.
     """
-    steady = found.predictor if steady is None else steady
-    if present is not None and bool(np.all(present)):
-        present = None
+    white = window if isinstance(window, Whitened) else None
+    count = int(window) if white is None else len(white.r)  # type: ignore[arg-type]
+    steady = found.predictor if white is None else white.predictor
     least = 2 * found.model.nx + 2
-    if window < least:
-        raise StructureError(f"window={window}: at least {least} samples are needed for {found.model.nx} states.")
-    inputs = None if u is None else _inputs(found, u, window)
+    if count < least:
+        raise StructureError(f"window={count}: at least {least} samples are needed for {found.model.nx} states.")
+    inputs = None if u is None else _inputs(found, u, count)
+    states = None if white is None or inputs is None else white.states
     able = tuple(
-        c.additive or (bool(c.columns) and inputs is not None)
-        or (c.schedule is not None and inputs is not None and states is not None) for c in found.candidates
+        c.additive or bool(c.columns) and inputs is not None or c.schedule is not None and states is not None
+        for c in found.candidates
     )
-    if states is not None and len(states) != window and any(c.schedule for c in found.candidates):
-        raise DataError(f"The states have {len(states)} samples; the window has {window}: cut them like the rest.")
+    if states is not None and len(states) != count and any(c.schedule for c in found.candidates):
+        raise DataError(f"The states have {len(states)} samples; the window has {count}: cut them like the rest.")
     if not any(able):
         raise StructureError(
             "No candidate has a signature to look for: add the kind 'bias', 'drift' or a state jump, or pass the input "
             "u for losses and stuck actuators."
         )
-    plain = present is None and nuisance is None and all(c.additive for c, a in zip(found.candidates, able) if a)
-    if not plain:
-        return _prepared(found, window, steady, present, inputs, nuisance, states, able)
-    key = (window, able, *(part.tobytes() for part in (steady.A, steady.C, steady.K, steady.L, steady.root)))
+    present = None if white is None or white.present.all() else white.present
+    nuisance = None if white is None else white.nuisance
+    if present is not None or nuisance is not None or any(a and not c.additive for c, a in zip(found.candidates, able)):
+        return _prepared(found, count, steady, present, inputs, nuisance, states, able)
+    key = (count, able, *(part.tobytes() for part in (steady.A, steady.C, steady.K, steady.L, steady.root)))
     kept = _KEPT.setdefault(found, {})
     if key not in kept:
         if len(kept) >= _MOST:
             kept.pop(next(iter(kept)))
-        kept[key] = _prepared(found, window, steady, None, None, None, None, able)
+        kept[key] = _prepared(found, count, steady, None, None, None, None, able)
     return kept[key]
 
 
@@ -232,7 +232,7 @@ def _prepared(
     found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None,
     nuisance: "Nuisance | None", states: Array | None, able: tuple[bool, ...],
 ) -> Sweep:
-    from optid.faults.search.sweep_kernels import grams
+    from optid.faults.search.sweep_kernels import correlate, grams
 
     blocks, tables = _tables(found, window, steady, present, u, able)
     if any(a and c.schedule for a, c in zip(able, found.candidates)):
@@ -243,36 +243,28 @@ def _prepared(
         slots[begin : begin + d, begin : begin + d] = place + np.arange(d * d).reshape(d, d)
     products = np.zeros((window, size))
     grams(tables, blocks.group, slots, products, np.empty((0, tables.F.shape[1], columns)))
-    along = None if nuisance is None else _along(tables, nuisance, columns)
+    along = np.zeros((window, 0 if nuisance is None else nuisance.s.size, columns))
+    if nuisance is not None:
+        one = np.empty((window, columns))
+        for i, (axis, s) in enumerate(zip(nuisance.U.T, nuisance.s)):
+            correlate(tables, compact(axis.reshape(window, -1)), one)
+            along[:, i] = np.sqrt(1 - 1 / (1 + s**2)) * one
     roots, tested = np.zeros((window, size)), np.zeros((len(able), window), dtype=bool)
     for c, (d, place, begin) in enumerate(zip(blocks.sizes, blocks.places, blocks.first)):
         if d:
             own = products[:, place : place + d * d].reshape(window, d, d)
             largest = own[:, 0, 0] if d == 1 else np.asarray(np.linalg.eigvalsh(own)[:, -1], dtype=float)
-            if along is not None:
-                part = along[:, :, begin : begin + d]
-                own = own - np.einsum("kqi,kqj->kij", part, part, optimize=True)
-            root = inverse_roots(own, largest)
+            part = along[:, :, begin : begin + d]
+            root = inverse_roots(own - np.einsum("kqi,kqj->kij", part, part, optimize=True), largest)
             roots[:, place : place + d * d] = root.reshape(window, -1)
             tested[c] = np.any(root, axis=(1, 2))
             tested[c, window - (-(-int(d) // found.model.l)) + 1 :] = False
-    return Sweep(found, steady, window, present, nuisance, tables, blocks, roots, tested)
+    return Sweep(found, window, present, nuisance, tables, blocks, roots, tested, along)
 
 
-def _along(tables: Tables, nuisance: "Nuisance", columns: int) -> Array:
-    from optid.faults.search.sweep_kernels import correlate
-
-    window = tables.of.size
-    result, one = np.empty((window, nuisance.s.size, columns)), np.empty((window, columns))
-    for i, (axis, s) in enumerate(zip(nuisance.U.T, nuisance.s)):
-        correlate(tables, compact(axis.reshape(window, -1)), one)
-        result[:, i] = np.sqrt(1 - 1 / (1 + s**2)) * one
-    return result
-
-
-def inverse_roots(products: Array, largest: Array) -> Array:
-    """Return R (T, d, d) with R' R the inverse of the products, zero in directions below `SHARE` of the largest."""
-    floor = SHARE * np.maximum(largest, 1e-300)
+def inverse_roots(products: Array, largest: Array, share: float = SHARE) -> Array:
+    """Return R (T, d, d) with R' R the inverse of the products, zero in directions below that share of the largest."""
+    floor = share * np.maximum(largest, 1e-300)
     if products.shape[1] == 1:
         there = products > floor[:, None, None]
         return np.where(there, 1 / np.sqrt(np.where(there, products, 1.0)), 0.0)
@@ -292,7 +284,7 @@ def _tables(
         patterns, which = np.unique(present, axis=0, return_inverse=True)
         of = np.asarray(which, dtype=np.int64).ravel()
     gains = np.where(patterns[:, None, :], -steady.K, steady.L)
-    whitening = np.stack([_whitening(steady, pattern) for pattern in patterns])
+    whitening = np.stack([steady.whitened(np.eye(l)[None], pattern[None])[0] for pattern in patterns])
     order = sorted((i for i, a in enumerate(able) if a), key=lambda i: ORDERS.get(found.candidates[i].kind, 0))
     chosen = [found.candidates[i] for i in order]
     drifts = [i for i in order if found.candidates[i].kind == "drift"]
@@ -341,11 +333,6 @@ def _with_schedules(
         h[:, :, column] = added[:, :, 0] @ steady.C.T
         e[:, own, column] = np.einsum("kij,kj->ki", F[:, own, own], added[:, :, 0])
     return tables._replace(F=F, C=np.tile(tables.C, 1 + len(chosen)), h=h, e=e)
-
-
-def _whitening(steady: Predictor, pattern: np.ndarray) -> Array:
-    """The whitening (l, l) of a sample of which only some readings are there."""
-    return np.ascontiguousarray(steady.whitened(np.eye(pattern.size)[None], pattern[None])[0])
 
 
 def _into(found: Dictionary, candidate: Candidate, window: int, u: Array | None) -> tuple[Array, Array]:

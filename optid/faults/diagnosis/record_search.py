@@ -1,24 +1,22 @@
 """The search of one experiment: innovations, statistics, thresholds, and what the record cannot tell."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, check_integer, check_probability
 from optid.data.record import Data, Experiment
-from optid.errors import DataError, StructureError
+from optid.errors import DataError, StructureError, nearest
 from optid.faults.consistency.excitation import untestable
 from optid.faults.consistency.leftover import alarm_probability, left_over
 from optid.faults.diagnosis.alternatives import extended
 from optid.faults.diagnosis.courses import courses, without_signature
-from optid.faults.diagnosis.outliers import cleaned
+from optid.faults.diagnosis.outliers import cleaned, with_spikes
 from optid.faults.diagnosis.posterior import Explanation
-from optid.faults.diagnosis.records import enough, one_record
 from optid.faults.diagnosis.sensor_gains import sensor_gains
-from optid.faults.nuisance import ModelUncertainty
 from optid.faults.search.calibration import EXCEEDING, Thresholds, thresholds
 from optid.faults.search.scanning import Scan, scan
 from optid.faults.signatures import Candidate, Dictionary
@@ -26,7 +24,8 @@ from optid.faults.whitening import Whitened, whiten
 
 if TYPE_CHECKING:
     from optid.faults.diagnosis.answers import Remaining
-    from optid.faults.diagnosis.diagnosing import Question
+
+METHODS = "exact", "sparse", "sparse+polish", "set"
 
 UNKNOWN_SHARE = 0.1
 """Share of the false alarms that goes to departures from health that no candidate describes."""
@@ -42,12 +41,42 @@ DRAWS, MOST_DRAWS = 20_000, 500_000
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """One experiment as the search sees it.
+class Question:
+    """What is asked of a record; the attributes are arguments of `optid.faults.diagnose`."""
+
+    false_alarm: float
+    max_faults: int
+    method: str
+    coverage: float
+    robust: bool
+    thresholds: Thresholds | None
+    seed: int | None
+    solver: Any
+
+    def __post_init__(self) -> None:
+        for word, value in (("false_alarm", self.false_alarm), ("coverage", self.coverage)):
+            check_probability(value, word)
+        if self.method not in METHODS:
+            raise StructureError(f"method={self.method!r}. {nearest(str(self.method), METHODS)}")
+        check_integer(self.max_faults, "max_faults")
+        if self.method == "exact" and self.max_faults > 2:
+            raise StructureError(
+                f"max_faults={self.max_faults}: the exact search covers one or two faults; the number of triples is "
+                "out of reach. Use method='sparse+polish'."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class RecordSearch:
+    """One experiment, searched; `search_record` makes it.
 
     Attributes:
+        record: that the experiment belongs to.
+        given: the experiment, without readings that stand still.
         dictionary: the candidates.
-        part: the record, without readings that were taken out.
+        asked: what is asked.
+        noise: arguments of `whiten`: uncertainty and scale.
+        part: the experiment without readings that were taken out.
         whitened: its innovations, bounded where outliers are.
         search: of the innovations; None where no candidate has a signature.
         limits: thresholds of the search; None without a search.
@@ -55,10 +84,13 @@ class Seen:
         lost: {label: why} of candidates that are not testable.
         healthy: what is left of the record if nothing is wrong.
         outliers: (sample, output) of readings that were taken out.
-        uncertainty: of the identified model; None where it is exact.
     """
 
+    record: Data
+    given: Experiment
     dictionary: Dictionary
+    asked: Question
+    noise: Mapping[str, Any]
     part: Experiment
     whitened: Whitened
     search: Scan | None
@@ -67,32 +99,20 @@ class Seen:
     lost: dict[str, str]
     healthy: "Remaining"
     outliers: tuple[tuple[int, int], ...]
-    uncertainty: ModelUncertainty | None = None
 
     @property
     def tested(self) -> list[Candidate]:
         """The candidates that may be the answer."""
-        if self.search is None:
-            return []
         return [c for c, gains in zip(self.dictionary.candidates, self.gains) if not np.isnan(gains).all()]
 
-    @property
-    def nx(self) -> int:
-        """Number of states of the model."""
-        return self.dictionary.model.nx
-
-    def p_value(self, asked: "Question", unknown: bool) -> float:
-        """Return the probability of so strong a departure from health; an alarm is at or below the false-alarm rate.
-
-        Args:
-            asked: with the false-alarm rate.
-            unknown: whether departures that no candidate describes count.
-        """
+    @cached_property
+    def p_value(self) -> float:
+        """Probability of so strong a departure from health; an alarm is at or below the false-alarm rate."""
         values = [1.0]
         if self.limits is not None and not np.isnan(self.gains).all():
             rate = self.limits.false_alarm
-            values.append(alarm_probability(float(np.nanmax(self.gains)), rate) * asked.false_alarm / rate)
-        if unknown:
+            values.append(alarm_probability(float(np.nanmax(self.gains)), rate) * self.asked.false_alarm / rate)
+        if self.dictionary.unknown:
             values.append(self.healthy.p_value / UNKNOWN_SHARE)
         if self.courses:
             # a likelihood averaged over what may be exceeds 1 / p in healthy records with probability p at most
@@ -107,57 +127,61 @@ class Seen:
         return None if more is None else scan(more, self.whitened, self.part.u)
 
     @cached_property
+    def courses(self) -> list[Explanation]:
+        """Sensors that may be frozen and noises that may have grown."""
+        return courses(self.dictionary, self.whitened, self.part)
+
+    @cached_property
     def gains_of_sensors(self) -> list[Explanation]:
         """Sensors that may have lost a share of their reading."""
         return sensor_gains(self.dictionary, self.whitened, self.part)
 
-    @cached_property
-    def courses(self) -> list[Explanation]:
-        """Sensors that may be frozen and noises that may have grown."""
-        return courses(self, self.dictionary)
+    def widened(self) -> "RecordSearch":
+        """Return the search with the outliers of all sensors among the candidates."""
+        asked = replace(self.asked, thresholds=None)
+        return search_record(self.record, self.given, with_spikes(self.dictionary), asked, self.noise)
 
 
-def look(
-    record: Data, part: Experiment, found: Dictionary, asked: "Question", noise: Mapping[str, Any]
-) -> Seen:
-    """Search one experiment.
-
-    Args:
-        record: that it belongs to.
-        part: the experiment, without readings that stand still.
-        found: the candidates.
-        asked: what is asked.
-        noise: arguments of `whiten`: uncertainty and scale.
+def search_record(
+    record: Data, part: Experiment, found: Dictionary, asked: Question, noise: Mapping[str, Any]
+) -> RecordSearch:
+    """Search one experiment; the arguments are attributes of `RecordSearch`.
 
     Raises:
         DataError: too few samples.
         StructureError: thresholds of another length or dictionary.
     """
 
-    def whitened_of(experiment: Experiment) -> Whitened:
-        white = whiten(found.model, one_record(record, experiment), **noise)
-        enough(white, found.model.nx)
+    def whitened_of(one: Experiment) -> Whitened:
+        alone = Data(one.u, one.y, record.dt, record.inputs, record.outputs, start=one.start)
+        white, least = whiten(found.model, alone, **noise), 2 * found.model.nx + 2
+        seen = int(white.present.any(axis=1).sum())
+        if seen < least:
+            raise DataError(
+                f"The record has {seen} samples with a reading (those that stand still to the bit do not count): "
+                f"{least} are needed for {found.model.nx} states."
+            )
         return white
 
-    white = whitened_of(part)
-    outliers: tuple[tuple[int, int], ...] = ()
-    search = limits = None
-    gains, lost = np.full((len(found.candidates), len(white.r)), np.nan), {}
+    given, outliers = part, ()
+    search, limits, lost = None, None, {}
     if any(c.additive or c.columns or c.schedule is not None for c in found.candidates):
         if asked.robust:
             search, part, outliers = cleaned(found, part, whitened_of)
         else:
-            search = scan(found, white, part.u)
+            search = scan(found, whitened_of(part), part.u)
         white = search.whitened
-        limits = _limits(found, white, part.u, asked)
-        lost = untestable(search)
+        limits, lost = _limits(found, white, part.u, asked), untestable(search)
         gains = search.gains(limits)
         gains[[label in lost for label in found.labels]] = np.nan
+    else:
+        white = whitened_of(part)
+        gains = np.full((len(found.candidates), len(white.r)), np.nan)
     healthy = left_over(white, white.r, found.model.nx)
-    return Seen(found, part, white, search, limits, gains, lost, healthy, outliers, noise.get("uncertainty"))
+    return RecordSearch(record, given, found, asked, noise, part, white, search, limits, gains, lost, healthy, outliers)
 
 
-def _limits(found: Dictionary, white: Whitened, u: Array, asked: "Question") -> Thresholds:
+def _limits(found: Dictionary, white: Whitened, u: Array, asked: Question) -> Thresholds:
     given, count = asked.thresholds, len(white.r)
     if given is not None:
         if given.window != count:

@@ -1,0 +1,259 @@
+"""What may have happened: explanations by one or several candidates, ranked by probability, and what they leave."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.errors import SolverFailed, StructureError
+from optid.faults.consistency.leftover import UNFIT, further_fault, left_over
+from optid.faults.diagnosis.alternatives import UNLISTED, parted
+from optid.faults.diagnosis.answers import Certificate, Remaining
+from optid.faults.diagnosis.counting import recounted
+from optid.faults.diagnosis.posterior import Explanation, several, single, smallest_set
+from optid.faults.diagnosis.record_search import RecordSearch
+from optid.faults.search.pair_search import pairs
+from optid.faults.search.programmes import solved
+from optid.faults.search.scanning import scan
+from optid.faults.search.subsets import SubsetSearch, polish
+
+if TYPE_CHECKING:
+    from optid.faults.search.sparse import SparseResult
+
+REACH = {1: 40, 2: 10, 3: 5, 4: 3}
+"""Onsets on both sides of the best ones over which so many faults are summed; two for more faults."""
+
+FAR = 30.0
+"""Choices of candidates whose gain is smaller than the best by this are left out."""
+
+ATOMS = 8_000
+"""Candidates times onsets beyond which two faults are searched on a grid of onsets."""
+
+NEAR, NEAR_OF_MANY = 10, 4
+"""Onsets on both sides of those of the programme that are searched exactly, for up to two faults and for more."""
+
+STRETCH = 100
+"""Samples of the stretch for which the noise is bounded: the proof for a part is one for the record."""
+
+BEFORE = 25
+"""Samples of it before the onset that explains most."""
+
+NOTHING = Certificate("none", float("nan"))
+
+
+class Fit(NamedTuple):
+    """An explanation and how well it fits.
+
+    Attributes:
+        explanation: candidates over their onsets.
+        probability: posterior.
+        gain: energy explained at the best onsets, less the thresholds.
+        fitted: (N, l) what it leaves in the innovations.
+        remaining: what it does not explain.
+    """
+
+    explanation: Explanation
+    probability: float
+    gain: float
+    fitted: Array
+    remaining: Remaining
+
+
+class Ranking(NamedTuple):
+    """What may have happened.
+
+    Attributes:
+        fits: the smallest set with the probability asked for, the most probable first.
+        odds: twice the logarithm of the odds of the first against the next explanation, in the set or not.
+        certificate: its proof.
+        note: a remark for the report.
+    """
+
+    fits: tuple[Fit, ...] = ()
+    odds: float = float("inf")
+    certificate: Certificate = NOTHING
+    note: str = ""
+
+    @property
+    def explains(self) -> bool:
+        """Whether what one of them leaves may be the noise of a healthy plant."""
+        return any(fit.remaining.p_value > UNFIT for fit in self.fits)
+
+
+def find(seen: RecordSearch) -> tuple[RecordSearch, Ranking, bool]:
+    """Return what the method asked for finds, with the search it rests on, and whether the record is not healthy."""
+    alarm, unproved = seen.p_value <= seen.asked.false_alarm, ""
+    if seen.asked.method == "set":
+        ranking, proved = _by_bounds(seen)
+        if proved and not ranking.explains:  # no single fault: what is proved is that something is wrong
+            seen, other = _explained(seen)
+            return seen, ranking._replace(fits=other.fits, note=f"{ranking.note} {other.note}".strip()), True
+        if proved or not alarm:
+            return seen, ranking, proved
+        unproved = f"{ranking.note} The answer is that of the exact search."
+    if not alarm:
+        return seen, Ranking(), False
+    if seen.asked.method.startswith("sparse"):
+        return seen, _by_programme(seen), True
+    seen, ranking = _explained(seen)
+    return seen, ranking._replace(note=f"{unproved} {ranking.note}".strip()), True
+
+
+def _explained(seen: RecordSearch) -> tuple[RecordSearch, Ranking]:
+    """What may have happened: by the candidates, with outliers beside them, by two faults."""
+    most = seen.asked.max_faults
+    ranking = _exact(seen, most)
+    if ranking.explains or seen.search is None or not seen.dictionary.unknown:
+        return seen, ranking
+    wide = seen.widened()
+    for count in dict.fromkeys((most, 2)):
+        wider = _exact(wide, count)
+        if wider.explains:
+            several_searched = "No single fault explains the record: two were searched. " * (count > most)
+            return wide, wider._replace(note=f"{several_searched}{wider.note}".strip())
+    return seen, ranking
+
+
+def _exact(seen: RecordSearch, count: int) -> Ranking:
+    """The set of explanations by so many faults at most."""
+    explanations, exhaustive, search = singles(seen), True, seen.search
+    if count > 1 and seen.tested:
+        assert search is not None and seen.limits is not None
+        stride = -(-int(np.sum(~np.isnan(seen.gains))) // ATOMS)
+        exhaustive = stride == 1
+        if not exhaustive:
+            search = scan(search.dictionary, seen.whitened, search.u, onsets=slice(None, None, stride))
+        explanations += _several(seen, pairs(search, seen.limits), stride)
+    ranking = ranked(seen, explanations)
+    note = "" if exhaustive else "Two faults were searched on a grid of onsets."
+    if not ranking.fits:
+        return ranking._replace(note=note)
+    on_grid = any(c.kind == "noise" for c in ranking.fits[0].explanation.candidates)  # whose onsets are sampled
+    kind = "exhaustive" if exhaustive and not on_grid else "grid"
+    return ranking._replace(certificate=Certificate(kind, ranking.fits[0].gain, ranking.odds), note=note)
+
+
+def singles(seen: RecordSearch) -> list[Explanation]:
+    """Return every candidate that is tested, and what is thought possible beside them, over their onsets."""
+    lost = {label.removesuffix(" loss") for label in seen.lost}
+    able = [(seen.search, c, 0.0) for c in seen.tested]
+    if seen.beside is not None:
+        beside = seen.beside.dictionary.candidates
+        able += [(seen.beside, c, float(np.log(UNLISTED))) for c in beside if c.name not in lost]
+    result: list[Explanation] = []
+    for search, candidate, prior in able:
+        found = None if search is None else single(search, candidate)
+        if found is not None:
+            counted = recounted(found._replace(logs=found.logs + prior), seen.noise.get("uncertainty"))
+            result += parted(counted, seen.dictionary.candidates)
+    return result + seen.gains_of_sensors + seen.courses
+
+
+def _several(seen: RecordSearch, found: SubsetSearch, reach: int = 1) -> list[Explanation]:
+    """Choices of several candidates whose gain comes near that of the best, over the onsets around them."""
+    near = [s for s in found.ranked if len(s.labels) > 1 and not set(seen.lost) & set(s.labels)]
+    return [_around(seen, s.labels, s.onsets, reach) for s in near if s.gain > near[0].gain - FAR]
+
+
+def _around(seen: RecordSearch, labels: Sequence[str], onsets: Sequence[int], reach: int = 1) -> Explanation:
+    assert seen.search is not None
+    candidates = [seen.dictionary[label] for label in labels]
+    alone = single(seen.search, candidates[0]) if len(candidates) == 1 else None
+    return alone or several(seen.search, candidates, onsets, max(REACH.get(len(labels), 2), reach))
+
+
+def ranked(seen: RecordSearch, explanations: Sequence[Explanation]) -> Ranking:
+    """Return the smallest set of explanations that holds the probability asked for."""
+    if not explanations:
+        return Ranking()
+    named: dict[tuple[str, ...], list[Explanation]] = {}
+    for found in explanations:
+        named.setdefault(tuple(c.label for c in found.candidates), []).append(found)
+    best = [max(group, key=lambda e: e.log_evidence) for group in named.values()]
+    # a further fault beside one is as rare as a false alarm
+    rare = np.array([np.log(seen.asked.false_alarm) * (len(e.candidates) - 1) for e in best])
+    logs = rare + [np.logaddexp.reduce([e.log_evidence for e in group]) for group in named.values()]
+    posterior = np.exp(logs - np.logaddexp.reduce(logs))
+    largest = np.sort(logs[np.isfinite(logs)])
+    odds = float(2 * (largest[-1] - largest[-2])) if largest.size > 1 else np.inf
+    chosen = [i for i in smallest_set(posterior, seen.asked.coverage) if posterior[i] > 0]
+    return Ranking(tuple(_fit(seen, best[i], float(posterior[i])) for i in chosen), odds)
+
+
+def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Fit:
+    made = explanation.made()
+    rest = made.rest if explanation.error is None else explanation.error(made.rest)
+    further, penalty, search, limits = 1.0, 0.0, seen.search, seen.limits
+    if search is not None and limits is not None:
+        gains = search.sweep.statistic(search.sweep.correlations(rest)) - limits.q[:, None]
+        gains[np.isnan(seen.gains)] = np.nan
+        further = further_fault(gains, limits.false_alarm)
+        if explanation.search is search:
+            entries = [explanation.entry] if explanation.entry is not None else explanation.candidates
+            penalty = float(np.nansum([limits.q[search.index(c)] for c in entries]))
+        elif explanation.search is not None:
+            penalty = float(np.nanmax(limits.q))
+    left = left_over(seen.whitened, rest, seen.dictionary.model.nx + made.magnitudes, further)
+    return Fit(explanation, probability, float(explanation.energies[explanation.best] - penalty), made.fitted, left)
+
+
+def _by_programme(seen: RecordSearch) -> Ranking:
+    """Let the group-sparse programme choose onsets, and candidates too where nothing is polished.
+
+    Raises:
+        StructureError: no candidate with a signature, too many subsets.
+    """
+    asked, search, limits = seen.asked, seen.search, seen.limits
+    if search is None or limits is None:
+        raise StructureError(
+            f"method={asked.method!r} needs a candidate with a signature: add the kind 'bias', or use method='exact'."
+        )
+    try:
+        result: SparseResult = solved("fault.signature", search, limits, solver=asked.solver)
+    except SolverFailed:
+        return Ranking(note="The solver found no point.")
+    if asked.method == "sparse+polish":
+        reach = NEAR if asked.max_faults < 3 else NEAR_OF_MANY
+        found = polish(search, limits, result, max_faults=asked.max_faults, reach=reach)
+        ranking = ranked(seen, singles(seen) + _several(seen, found))
+    else:  # the strongest group of every cluster, estimated again without the penalty
+        active = [g for g in result.active if g.label not in seen.lost]
+        groups = [[g for g in active if first <= g.onset <= last] for first, last in result.clusters]
+        strongest = [max(here, key=lambda g: g.deflection) for here in groups if here]
+        strongest = sorted(strongest, key=lambda g: -g.deflection)[: asked.max_faults]
+        labels, onsets = [g.label for g in strongest], [g.onset for g in strongest]
+        ranking = ranked(seen, [_around(seen, labels, onsets)] if strongest else [])
+    if not result.certified:
+        note = f"Not certified ({result.status}; relative gap {result.gap:.1e}): no answer is called the best."
+        return ranking._replace(certificate=Certificate("none", result.gap, ranking.odds), note=note)
+    return ranking._replace(certificate=Certificate("duality gap", result.gap, ranking.odds))
+
+
+def _by_bounds(seen: RecordSearch) -> tuple[Ranking, bool]:
+    """Name what bounds of the noise do not exclude, and say whether they prove that the plant is not healthy."""
+    count = len(seen.whitened.r)
+    gains = np.nan_to_num(seen.gains, nan=-np.inf)
+    peak = int(np.argmax(gains.max(axis=0))) if gains.size else 0
+    start = int(np.clip(peak - BEFORE, 0, max(count - STRETCH, 0)))
+    stop = min(start + STRETCH, count)
+    record, part = seen.record, seen.part
+    stretch = Data(part.u, part.y, record.dt, record.inputs, record.outputs, start=part.start).window(start, stop)
+    found = solved("fault.membership", seen.dictionary.model, stretch, faults=seen.dictionary, candidates=False,
+                   solver=seen.asked.solver)
+    where = f"samples {start} to {stop - 1}"
+    if not found.impossible:
+        factor = f"{found.factor:.2f}" if np.isfinite(found.factor) else "unknown"
+        note = f"No proof: within bounds of 3 standard deviations times {factor} a healthy plant is possible ({where})."
+        return Ranking(certificate=Certificate("none", found.factor), note=note), False
+    possible = set(found.consistent) | set(found.untested)
+    ranking = ranked(seen, [e for e in singles(seen) if e.candidates[0].label in possible])
+    vector = np.zeros(seen.whitened.r.shape)
+    if found.parity_vector is not None:
+        vector[start:stop] = found.parity_vector
+    factor = found.proof.factor if found.proof else found.factor
+    excluded = [label for label in seen.dictionary.labels if label not in possible]
+    note = f"Proved on {where}; excluded by proof: {', '.join(excluded)}." if excluded else f"Proved on {where}."
+    proof = Certificate("infeasible healthy", factor, ranking.odds, vector)
+    return ranking._replace(certificate=proof, note=note), True
