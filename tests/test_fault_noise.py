@@ -78,8 +78,6 @@ def test_noise_is_named_and_measured(found, fault, label):
     match = noise_covariance(found, w)
     assert match.best == label and match.certified and match.gap < 1e-6
     assert abs(np.log(np.sqrt(match.rho[match.labels.index(label)]) / true)) < 0.6
-    probabilities = test.probabilities
-    assert sum(probabilities.values()) == pytest.approx(1) and max(probabilities, key=probabilities.get) == label
     for text in (str(test), str(match)):
         assert max(map(len, text.splitlines())) <= 80
 
