@@ -15,8 +15,7 @@ from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults import Fault, hard_over_test, inject
 from optid.faults.rank.hard_over import HardOver, WindowVerdict
-from optid.faults.rank.order_power import MARGIN, coefficients, least_order
-from optid.faults.rank.zero_tests import ZeroTest, zero_test
+from optid.faults.rank.window_tests import MARGIN, ZeroTest, coefficients, least_order, zero_test
 from optid.identify.order.ranks import rank_test
 from optid.plants import two_mode_plant
 from optid.statistics.hankel import hankel_statistics
