@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array, compact
-from optid.data.record import Data, Experiment
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
@@ -82,6 +82,33 @@ class Predictor:
         A, C, K, L, x, y = map(compact, parts)
         kernels.respond(A, C, K, L, shown, x, y, response)
         return response
+
+    def run(self, model: "HammersteinSS", x0: Array, f: Array, fed: Array, y: Array,
+            added: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
+        """Return states (T + 1, n) and whitened innovations (T, l) of complete samples of the model.
+
+        Args:
+            model: with the functions of inputs and outputs.
+            x0: (n,) state before the first sample.
+            f: (T, r) functions of the inputs.
+            fed: (T, s) functions of the outputs.
+            y: (T, l) readings.
+            added: what is added to the next state (T, n) and to the output (T, l).
+        """
+        from optid.faults.kernels import add_product, predict
+
+        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
+        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
+                                       (model.D, f, direct)):
+            if matrix.any():
+                add_product(np.ascontiguousarray(matrix), signal, target)
+        if added is not None:
+            drive += added[0]
+            direct += added[1]
+        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
+        x[0] = x0
+        predict(*map(np.ascontiguousarray, (model.A, model.C, self.K, self.root)), drive, y, direct, x, r)
+        return x, r
 
     def whitened(self, innovations: Array, present: Array | None = None) -> Array:
         """Return innovations (N, l) or (N, l, d) in units of their covariance, zero where a reading is missing.
@@ -188,41 +215,26 @@ def whiten(
         StructureError: no noise covariances.
     """
     steady = scale or (predictor(model) if uncertainty is None else uncertainty.predictor)
-    gained = replace(model, K=steady.K)
-    raw = in_units_of(model, data)
-    parts = raw.experiments
-    states = gained.initial_state(raw, "predict") if isinstance(x0, str) and x0 == "fit" else x0
-    predicted = gained.predict(raw, x0=states)
+    gained, raw, fitted = replace(model, K=steady.K), in_units_of(model, data), isinstance(x0, str) and x0 == "fit"
+    given = gained.initial_state(raw, "predict") if fitted else x0
+    predicted = gained.predict(raw, x0=given)
     predictions = predicted if isinstance(predicted, tuple) else (predicted,)
+    starts = [np.zeros(model.nx)] * len(predictions) if isinstance(given, str) else (
+        [given] if len(predictions) == 1 else given)
     found = []
-    for number, (part, prediction) in enumerate(zip(parts, predictions)):
-        present = ~np.isnan(part.y)
-        innovations = part.y - prediction
+    for part, prediction, start in zip(raw.experiments, predictions, starts):
+        present, start = ~np.isnan(part.y), np.asarray(start, dtype=float)
+        innovations, y = part.y - prediction, np.where(present, part.y, prediction)
         r = steady.whitened(np.where(present, innovations, 0.0), present)
-        start = states if len(parts) == 1 or isinstance(states, str) else states[number]
-        start = np.zeros(model.nx) if isinstance(start, str) else np.asarray(start, dtype=float)
-        white = Whitened(r, innovations, present, steady, model.outputs,
-                         states=_states(gained, part, prediction, start))
+        fed = np.array([g(y[:, o]) for g, o in zip(model.feedback, model.output_of)]).reshape(-1, len(y)).T
+        states = None if np.isnan(part.u).any() else steady.run(
+            model, start, np.ascontiguousarray(model.expanded(part.u)), np.ascontiguousarray(fed), y)[0][:-1]
+        white = Whitened(r, innovations, present, steady, model.outputs, states=states)
         if uncertainty is not None:
-            nuisance = uncertainty.nuisance(part, start, present, free_start=isinstance(x0, str) and x0 == "fit")
+            nuisance = uncertainty.nuisance(part, start, present, free_start=fitted)
             white = replace(white, r=nuisance(r), nuisance=nuisance)
         found.append(white)
     return found[0] if len(found) == 1 else tuple(found)
-
-
-def _states(model: "HammersteinSS", part: Experiment, prediction: Array, start: Array) -> Array | None:
-    """States (N, n) of the predictor; None where a missing input leaves them unknown."""
-    if np.isnan(part.u).any():
-        return None
-    from optid.faults.kernels import propagate
-
-    y = np.where(np.isnan(part.y), prediction, part.y)
-    drive = model.expanded(part.u) @ model.B.T + model.offset_x + y @ model.L.T + (y - prediction) @ model.K.T
-    for g, o, column in zip(model.feedback, model.output_of, model.E.T):
-        drive += np.outer(g(y[:, o]), column)
-    states = np.empty((len(y), model.nx))
-    propagate(np.ascontiguousarray(model.A), np.ascontiguousarray(drive), start, states)
-    return states
 
 
 @dataclass(frozen=True, eq=False)

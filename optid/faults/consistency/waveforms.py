@@ -262,7 +262,8 @@ def check_window(found: Dictionary, whitened: Whitened, onset: int, what: str, l
     if onset != int(onset) or not 0 <= onset < count:
         raise StructureError(f"onset={onset!r} lies outside the window of {count} samples.")
     if whitened.r.size > longest:
-        raise StructureError(f"{whitened.r.size} readings are too many for this test ({longest}): use a shorter window.")
+        raise StructureError(
+            f"{whitened.r.size} readings are too many for this test ({longest}): use a shorter window.")
     if not np.isfinite(whitened.r).all():
         k, o = np.argwhere(~np.isfinite(whitened.r))[0]
         raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")

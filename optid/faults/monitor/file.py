@@ -44,7 +44,7 @@ def save(monitor: "Monitor", path: str | Path) -> Path:
         "readings": monitor.checks.memory, "certain": plant.certain, "silent": found.predictor.silent,
         "directions": [vars(one) | {"deviation": np.ravel(one.deviation).tolist()} for one in plant.directions],
     }
-    arrays = {f"{word}_{name}": getattr(part, name) for word, (part, names) in _parts(monitor).items() for name in names}
+    arrays = {f"{word}_{name}": getattr(part, name) for word, (part, own) in _parts(monitor).items() for name in own}
     arrays |= {f"predictor_{name}": getattr(found.predictor, name) for name in PREDICTOR} | {"sines": found.sines}
     arrays |= {f"{place}_{i}": getattr(c, place) for i, c in enumerate(found.candidates) for place in PLACES}
     return write_state(path, "monitor", VERSION, head, arrays)

@@ -14,8 +14,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
+from optid.faults.kernels import add_product
 from optid.faults.monitor.columns import SPARE, Columns, Matrices, Window
-from optid.faults.monitor.search_kernel import DRIFT, JUMP, add_product, predict
+from optid.faults.monitor.search_kernel import DRIFT, JUMP
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
@@ -104,20 +105,7 @@ class RunningFilter:
             fed: (T, s) functions of the outputs.
             y: (T, l) readings.
         """
-        model, steady = self.model, self.steady
-        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
-        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
-                                       (model.D, f, direct)):
-            if matrix.any():
-                add_product(np.ascontiguousarray(matrix), signal, target)
-        if self.held.any():
-            into_state, into_output = self.additions(f)
-            drive += into_state
-            direct += into_output
-        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
-        x[0] = self.x
-        predict(*map(np.ascontiguousarray, (model.A, model.C, steady.K, steady.root)), drive, y, direct, x, r)
-        return x, r
+        return self.steady.run(self.model, self.x, f, fed, y, self.additions(f) if self.held.any() else None)
 
     def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
         """Take in one sample; return the whitened innovation (l,) and the matrices of the search.

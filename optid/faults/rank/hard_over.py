@@ -202,17 +202,9 @@ class _Healthy(NamedTuple):
 
 
 def hard_over_test(
-    data: Data,
-    healthy: Data,
-    *,
-    model: "HammersteinSS | None" = None,
-    order: int | None = None,
-    window: int | None = None,
-    hop: int | None = None,
-    block_rows: int = BLOCK_ROWS,
-    instruments: str = "inputs",
-    level: float = LEVEL,
-    white_sensors: bool = True,
+    data: Data, healthy: Data, *, model: "HammersteinSS | None" = None, order: int | None = None,
+    window: int | None = None, hop: int | None = None, block_rows: int = BLOCK_ROWS, instruments: str = "inputs",
+    level: float = LEVEL, white_sensors: bool = True,
 ) -> HardOver:
     """Test a record for dead sensors and actuators, window by window.
 

@@ -74,16 +74,8 @@ class ZeroTest:
 
 
 def zero_test(
-    statistics: HankelStatistics,
-    tested: Positions,
-    others: Positions,
-    outputs: Positions,
-    *,
-    rows: int,
-    level: float,
-    name: str = "",
-    scale: Array | None = None,
-    coefficients: Array | None = None,
+    statistics: HankelStatistics, tested: Positions, others: Positions, outputs: Positions, *, rows: int, level: float,
+    name: str = "", scale: Array | None = None, coefficients: Array | None = None,
 ) -> tuple[ZeroTest, Array]:
     """Test whether the coefficients of some rows are zero.
 
