@@ -69,10 +69,11 @@ def observed(found, u, y):
     return np.linalg.solve(lower, (np.nan_to_num(y.ravel()) + back @ start)[there]), onto
 
 
-def dense(found, window, u, y, nuisance=None):
+def dense(found, window, u, y, nuisance=None, share=1e-9):
     """{label: (statistic, onset)} by generalised least squares over every onset of the window that ends with a record.
 
-    The nuisance, a candidate and its onset, is taken out; readings may be missing.
+    The nuisance, a candidate and its onset, is taken out; readings may be missing. Directions with less than a share
+    of the energy of the largest count as dependent.
     """
     (r, onto), count, best = observed(found, u, y), len(y), {}
 
@@ -87,7 +88,7 @@ def dense(found, window, u, y, nuisance=None):
         here = (0.0, -1)
         for onset in range(max(1 if c.columns else 0, count - window), count + 1 - (-(-c.dimension // found.model.l))):
             axes, sizes, _ = np.linalg.svd(out @ seen(c, onset), full_matrices=False)
-            energy = float(np.sum((axes[:, sizes**2 > 1e-9 * sizes[0] ** 2].T @ (out @ r)) ** 2))
+            energy = float(np.sum((axes[:, sizes**2 > share * sizes[0] ** 2].T @ (out @ r)) ** 2))
             here = max(here, (energy, onset), key=lambda one: one[0])
         best[c.label] = here
     return best
@@ -389,5 +390,6 @@ def test_random_plants_against_dense_least_squares(system):
     window = max(2 * model.nx + 2, 20)
     monitor = watch(model, found, window=window, x0="zero")
     monitor.run(u, y)
-    for label, (energy, _) in dense(found, window, u, y).items():
-        assert monitor.statistics[label] == pytest.approx(energy, rel=1e-6, abs=1e-9), label
+    most, least = (dense(found, window, u, y, share=share) for share in (1e-12, 1e-6))
+    for label, value in monitor.statistics.items():  # the two differ only where a direction is nearly dependent
+        assert least[label][0] * (1 - 1e-6) - 1e-9 <= value <= most[label][0] * (1 + 1e-6) + 1e-9, label
