@@ -100,39 +100,23 @@ def agrees(monitor, best, accuracy=1e-9):
         assert monitor.onsets[label] == onset, label
 
 
-@pytest.mark.slow
+LATER = (71, 90, 109, 110, 111, 130)
+"""After one missing reading the products come from the tables, are summed, and are tables again."""
+
+
 @pytest.mark.parametrize("feedback", [False, True])
-@pytest.mark.parametrize("count", [3, 25, 90])
-def test_statistics_are_those_of_dense_least_squares(count, feedback):
+@pytest.mark.parametrize("count, lost", [(3, ""), (25, ""), (90, ""), (70, "some"), *((k, "one") for k in LATER)])
+def test_statistics_are_those_of_dense_least_squares(count, lost, feedback):
     model = plant(feedback)
     found, u = everything(model), levels(count, 3)
     y = inject(model, u, Fault.step("sensor:y1", count // 2, 0.2), seed=4)
+    if lost == "some":
+        y[np.random.default_rng(0).random(y.shape) < 0.15] = y[33:36] = np.nan
+    elif lost:
+        y[70, 1] = np.nan
     monitor = watch(model, found, x0="zero")
     assert {e.kind for e in monitor.run(u, y)} <= {"untestable"}  # nothing can reach this threshold
     agrees(monitor, dense(found, 40, u, y))
-
-
-def test_statistics_with_missing_readings_are_those_of_dense_least_squares():
-    model, count = plant(True), 70
-    found, u = everything(model), levels(count, 5)
-    y = inject(model, u, seed=6)
-    y[np.random.default_rng(0).random(y.shape) < 0.15] = np.nan
-    y[33:36] = np.nan
-    monitor = watch(model, found, x0="zero")
-    monitor.run(u, y)
-    agrees(monitor, dense(found, 40, u, y))
-
-
-@pytest.mark.slow
-def test_one_missing_reading_inside_a_window_that_was_complete_before():
-    model = plant()
-    found, u = everything(model), levels(130, 5)
-    y = inject(model, u, seed=6)
-    y[70, 1] = np.nan
-    for count in (71, 90, 109, 110, 111, 130):  # the products come from the tables, are summed, and are tables again
-        monitor = watch(model, found, x0="zero")
-        monitor.run(u[:count], y[:count])
-        agrees(monitor, dense(found, 40, u[:count], y[:count]))
 
 
 def test_statistics_are_those_of_the_search_of_a_record():

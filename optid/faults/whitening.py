@@ -78,9 +78,8 @@ class Predictor:
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
         response = np.empty(into_output.shape)
-        parts = (self.A, self.C, self.K, self.L, into_state, into_output)
-        A, C, K, L, x, y = map(compact, parts)
-        kernels.respond(A, C, K, L, shown, x, y, response)
+        kernels.respond(*map(compact, (self.A, self.C, self.K, self.L)), shown, compact(into_state),
+                        compact(into_output), response)
         return response
 
     def run(self, model: "HammersteinSS", x0: Array, f: Array, fed: Array, y: Array,
@@ -141,29 +140,21 @@ def predictor(model: "HammersteinSS") -> Predictor:
             "The model has no noise covariances, and without them nothing says how large a deviation is: estimate "
             "them with optid.noise.with_noise(model, data)."
         )
-    noise = model.noise
-    steady, failure = _gain(model, noise.R)
-    if steady is None:
-        steady, _ = _gain(model, noise.R + ADDED * noise.innovation)
-        if steady is None:
-            raise StructureError(failure)
-        warnings.warn(
-            "The noise of the model has no power at some frequency, so that its predictor would never forget: "
-            f"measurement noise of {100 * ADDED:g} % of the innovations is added.", DataWarning, stacklevel=2,
-        )
-    return Predictor(model.A, model.C, model.L, steady.K, steady.innovation, _root(steady.innovation))
-
-
-def _gain(model: "HammersteinSS", R: Array) -> tuple[Any, str]:
-    """The steady gain for a measurement noise; None, and why, without one whose predictor forgets."""
-    assert model.noise is not None
-    try:
-        steady = kalman_gain(model.A, model.C, model.noise.Q, R, model.noise.S)
-    except StructureError as error:
-        return None, str(error)
-    if spectral_radius(model.A - steady.K @ model.C) > FORGETS:
-        return None, "The Riccati equation has no stabilising solution: a mode stays on the unit circle."
-    return steady, ""
+    noise, failure = model.noise, ""
+    for added in (0.0, ADDED):
+        try:
+            steady = kalman_gain(model.A, model.C, noise.Q, noise.R + added * noise.innovation, noise.S)
+        except StructureError as error:
+            failure = failure or str(error)
+            continue
+        if spectral_radius(model.A - steady.K @ model.C) <= FORGETS:
+            if added:
+                warnings.warn(
+                    "The noise of the model has no power at some frequency, so that its predictor would never forget: "
+                    f"measurement noise of {100 * ADDED:g} % of the innovations is added.", DataWarning, stacklevel=2)
+            return Predictor(model.A, model.C, model.L, steady.K, steady.innovation, _root(steady.innovation))
+        failure = failure or "The Riccati equation has no stabilising solution: a mode stays on the unit circle."
+    raise StructureError(failure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,17 +338,11 @@ def health(whitened: Any, lags: int = LAGS) -> Health:
                 total += signal[lag:].T @ signal[:-lag]
                 pairs += int(np.sum(there[lag:] & there[:-lag]))
         statistic += float(np.sum(total**2)) / max(pairs, 1)
-    return Health(
-        dict(zip(parts[0].outputs, np.sqrt(_each(parts)).tolist())), float(chdtrc(outputs**2 * lags, statistic)), lags,
-        count, covariance,
-    )
-
-
-def _each(parts: list[Whitened]) -> Array:
-    """Mean square of the innovation of every output over its predicted variance."""
     squares = np.nansum([np.nansum(part.innovations**2, axis=0) for part in parts], axis=0)
-    counts = np.sum([part.present.sum(axis=0) for part in parts], axis=0)
-    return np.asarray(squares / np.maximum(counts, 1) / np.diag(parts[0].predictor.covariance))
+    readings = np.maximum(np.sum([part.present.sum(axis=0) for part in parts], axis=0), 1)
+    sizes = np.sqrt(squares / readings / np.diag(parts[0].predictor.covariance)).tolist()
+    p_value = float(chdtrc(outputs**2 * lags, statistic))
+    return Health(dict(zip(parts[0].outputs, sizes)), p_value, lags, count, covariance)
 
 
 def _root(covariance: Array) -> Array:
