@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from optid.bases import UserFunctions
+from optid.data.record import Data
+from optid.faults import inject
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
 from optid.models.kalman import kalman_gain
 
@@ -32,3 +34,15 @@ def levels(count, seed, m=2, hold=5):
     """Inputs uniform on [-1.2, 1.2], every level held."""
     drawn = np.random.default_rng(seed).uniform(-1.2, 1.2, (-(-count // hold), m))
     return np.repeat(drawn, hold, axis=0)[:count]
+
+
+LOAD = np.array([0.3, -0.2, 0.5])
+"""A direction in the state of the plant of three states."""
+
+
+def record(model, seed, faults=(), missing=0.0, count=50):
+    """Inputs and readings of a plant with faults, some readings missing."""
+    u = levels(count, seed)
+    y = inject(model, u, faults, seed=seed, process={"load": LOAD})
+    y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
+    return Data(u, y)

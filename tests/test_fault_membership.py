@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_plants import levels, noisy
+from fault_plants import LOAD, levels, noisy, record
 from scipy.optimize import linprog
 from test_fault_injection import small
 
@@ -15,7 +15,6 @@ from optid.faults import Fault, dictionary, inject, membership
 from optid.faults.consistency.bounded_noise import bounded_window, parity_proof
 from optid.program.solution import Status
 
-LOAD = np.array([0.3, -0.2, 0.5])
 N = 20
 
 
@@ -24,39 +23,31 @@ def found():
     return dictionary(small(), process={"load": LOAD}, kinds=["bias", "loss", "drift", "noise"])
 
 
-def record(found, seed, faults=(), missing=0.0, count=N):
-    u = levels(count, seed)
-    y = inject(found.model, u, faults, seed=seed, process={"load": LOAD})
-    y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
-    return Data(u, y)
+def window(found, seed, faults=(), missing=0.0):
+    return record(found.model, seed, faults, missing, N)
 
 
 def dense(model, data, process, output, extra=None):
     """The same linear programme without any of the library's forms: states, sizes and t as plain columns."""
     part = data.experiments[0]
     u, y, count, n = part.u, part.y, len(part.y), model.nx
-    f, d = model.expanded(u), 0 if extra is None else extra[0].shape[2]
-    rows, level = [], []
+    into_state, into_output = extra or (np.zeros((count, n, 0)), np.zeros((count, model.l, 0)))
+    f, size, rows = model.expanded(u), count * n + into_state.shape[2], []
     for k in range(count - 1):
         if model.L.any() and np.isnan(y[k]).any():
             continue  # what is fed back is not known
         for i in range(n):
-            row = np.zeros(count * n + d)
+            row = np.zeros(size)
             row[(k + 1) * n + i] = 1.0
             row[k * n : (k + 1) * n] -= model.A[i]
-            if d:
-                row[count * n :] = -extra[0][k + 1, i]
+            row[count * n :] = -into_state[k + 1, i]
             known = model.B[i] @ f[k] + model.offset_x[i] + model.L[i] @ np.nan_to_num(y[k])
             rows.append((row, known, process[i]))
-    for k in range(count):
-        for o in range(model.l):
-            if np.isnan(y[k, o]):
-                continue
-            row = np.zeros(count * n + d)
-            row[k * n : (k + 1) * n] = model.C[o]
-            if d:
-                row[count * n :] = extra[1][k, o]
-            rows.append((row, y[k, o] - model.D[o] @ f[k] - model.offset_y[o], output[o]))
+    for k, o in np.argwhere(~np.isnan(y)):
+        row = np.zeros(size)
+        row[k * n : (k + 1) * n] = model.C[o]
+        row[count * n :] = into_output[k, o]
+        rows.append((row, y[k, o] - model.D[o] @ f[k] - model.offset_y[o], output[o]))
     matrix, level, bounds = (np.array(part) for part in zip(*rows))
     A = np.vstack([np.hstack([matrix, -bounds[:, None]]), np.hstack([-matrix, -bounds[:, None]])])
     cost = np.zeros(A.shape[1])
@@ -87,7 +78,7 @@ def sigmas(model, times):
 @pytest.mark.parametrize("solver", ["auto", "highs"])
 def test_the_factor_is_that_of_a_plain_programme(found, missing, solver):
     for seed, size in ((1, 0.0), (2, 1.5)):
-        data = record(found, seed, Fault.step("sensor:y1", 8, size) if size else [], missing)
+        data = window(found, seed, Fault.step("sensor:y1", 8, size) if size else [], missing)
         result = membership(found.model, data, 2.0, solver=solver)
         process, output = sigmas(found.model, 2.0)
         assert result.factor == pytest.approx(dense(found.model, data, process, output), rel=1e-6)
@@ -98,7 +89,7 @@ def test_the_factor_is_that_of_a_plain_programme(found, missing, solver):
 def test_the_proof_adds_up_by_hand(found):
     process, output = sigmas(found.model, 2.0)
     for seed in range(4):
-        data = record(found, seed, Fault.step("sensor:y1", 8, 2.0), missing=0.1 * (seed % 2))
+        data = window(found, seed, Fault.step("sensor:y1", 8, 2.0), missing=0.1 * (seed % 2))
         result = membership(found.model, data, 2.0)
         total, most, start = by_hand(found.model, data, result.proof, process, output)
         assert result.impossible and total > most and start < 1e-9
@@ -128,8 +119,8 @@ def test_noise_within_its_bounds_never_exceeds_a_proof(found):
 def test_no_false_proof_and_no_false_exclusion(found):
     kinds = {"actuator:u1": Fault.step, "sensor:y2": Fault.step, "sensor:y1 drift": Fault.ramp}
     for seed, (label, make) in enumerate(kinds.items()):
-        assert not membership(found.model, record(found, seed), solver="highs").impossible
-        data = record(found, seed, make(found[label].name, 9, 0.4 if make == Fault.ramp else 2.5))
+        assert not membership(found.model, window(found, seed), solver="highs").impossible
+        data = window(found, seed, make(found[label].name, 9, 0.4 if make == Fault.ramp else 2.5))
         few = replace(found, candidates=tuple(found[c] for c in (label, "sensor:y1", "actuator:u2")))
         result = membership(found.model, data, 3.0, few, solver="highs")
         assert result.impossible and label in result.consistent
@@ -137,7 +128,7 @@ def test_no_false_proof_and_no_false_exclusion(found):
 
 @pytest.mark.slow
 def test_candidates_against_all_onsets_by_plain_programmes(found):
-    data = record(found, 5, Fault.step("sensor:y2", 9, 2.0))
+    data = window(found, 5, Fault.step("sensor:y2", 9, 2.0))
     process, output = sigmas(found.model, 2.0)
     u = data.experiments[0].u
     few = replace(found, candidates=tuple(found[c] for c in (
@@ -190,7 +181,7 @@ def test_states_without_noise_are_equations(found):
 
 
 def test_user_constraints_only_raise_the_factor(found):
-    data = record(found, 2, Fault.step("sensor:y1", 8, 1.0))
+    data = window(found, 2, Fault.step("sensor:y1", 8, 1.0))
     free = membership(found.model, data, solver="highs")
     held = membership(found.model, data, constraints=[lambda v: {"start": v["x"][0] == 0}])
     assert held.factor >= free.factor - 1e-9
@@ -201,7 +192,7 @@ def test_user_constraints_only_raise_the_factor(found):
 
 
 def test_a_solver_that_lies_proves_nothing(found):
-    data = record(found, 1)
+    data = window(found, 1)
 
     def liar(program, settings):
         answer = find("highs").run(program, settings)
@@ -220,7 +211,7 @@ def test_a_solver_that_lies_proves_nothing(found):
 
 
 def test_a_solver_that_fails_excludes_nothing(found):
-    data = record(found, 1, Fault.step("sensor:y1", 8, 2.0))
+    data = window(found, 1, Fault.step("sensor:y1", 8, 2.0))
     broken = BackEnd("broken", frozenset({"LP"}), lambda *_: Answer(Status.FAILED, "no memory"))
     result = membership(found.model, data, 2.0, replace(found, candidates=found.candidates[:2]), solver=broken)
     assert not result.impossible and result.parity_vector is None
@@ -229,24 +220,22 @@ def test_a_solver_that_fails_excludes_nothing(found):
 
 
 def test_bad_input(found):
-    model, data = found.model, record(found, 1)
+    model, data = found.model, window(found, 1)
     for bounds in (0.0, -1.0, np.nan, "wide", None.__class__):
         with pytest.raises((StructureError, TypeError)):
             membership(model, data, bounds)
-    for bounds, words in (({"process": [1, 1, 1]}, "'output'"), ({"process": [1, 1], "output": [1, 1]}, "shape"),
-                          ({"process": [1, 1, -1], "output": [1, 1]}, "negative"),
-                          ({"process": [0, 0, 0], "output": [0, 0]}, "all are zero")):
-        with pytest.raises(StructureError, match=words):
-            membership(model, data, bounds)
-    with pytest.raises(StructureError, match="no noise covariances"):
-        membership(replace(model, noise=None), data)
-    for onsets in ("some", [], [N], [-1]):
-        with pytest.raises(StructureError, match="onsets"):
-            membership(model, data, faults=found, onsets=onsets)
-    with pytest.raises(DataError, match="one at a time"):
-        membership(model, Data([levels(N, 0)] * 2, [np.zeros((N, 2))] * 2))
-    part = data.experiments[0]
-    u = part.u.copy()
-    u[3, 1] = np.nan
-    with pytest.raises(DataError, match="'u2' is missing at sample 3"):
-        membership(model, Data(u, part.y))
+    broken = data.u.copy()
+    broken[3, 1] = np.nan
+    several = Data([levels(N, 0)] * 2, [np.zeros((N, 2))] * 2)
+    for error, words, plant, record_, how in (
+        (StructureError, "'output'", model, data, {"bounds": {"process": [1, 1, 1]}}),
+        (StructureError, "shape", model, data, {"bounds": {"process": [1, 1], "output": [1, 1]}}),
+        (StructureError, "negative", model, data, {"bounds": {"process": [1, 1, -1], "output": [1, 1]}}),
+        (StructureError, "all are zero", model, data, {"bounds": {"process": [0, 0, 0], "output": [0, 0]}}),
+        (StructureError, "no noise covariances", replace(model, noise=None), data, {}),
+        *((StructureError, "onsets", model, data, {"faults": found, "onsets": k}) for k in ("some", [], [N], [-1])),
+        (DataError, "one at a time", model, several, {}),
+        (DataError, "'u2' is missing at sample 3", model, Data(broken, data.y), {}),
+    ):
+        with pytest.raises(error, match=words):
+            membership(plant, record_, **how)

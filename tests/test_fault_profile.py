@@ -2,20 +2,18 @@
 
 import numpy as np
 import pytest
-from fault_plants import levels
+from fault_plants import LOAD, record
 from scipy.optimize import nnls
 from test_fault_injection import small
 
 from formulations.faults.profile import profile_programme, smooth_programme
-from optid import Data
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, SolverFailed, StructureError
-from optid.faults import Fault, dictionary, inject, profile, scan, whiten
+from optid.faults import Fault, dictionary, profile, scan, whiten
 from optid.faults.consistency.profiles import course_problem
 from optid.program.solution import Status
 from optid.solving.solve import solve
 
-LOAD = np.array([0.3, -0.2, 0.5])
 N = 60
 
 
@@ -25,10 +23,8 @@ def found():
 
 
 def search(found, faults, seed=1, missing=0.0):
-    u = levels(N, seed)
-    y = inject(found.model, u, faults, seed=seed, process={"load": LOAD})
-    y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
-    return scan(found, whiten(found.model, Data(u, y), x0="zero"), u)
+    data = record(found.model, seed, faults, missing, N)
+    return scan(found, whiten(found.model, data, x0="zero"), data.u)
 
 
 @pytest.mark.sampled(3)
@@ -148,19 +144,19 @@ def test_solvers_that_fail_or_lie(found):
 
 def test_bad_input(found):
     s = search(found, [])
-    for how, words in (({"prior": "wavy"}, "prior="), ({"sign": "up"}, "sign="), ({"limit": 0.0}, "limit="),
-                       ({"slew": np.nan}, "slew="), ({"penalties": []}, "penalties="),
-                       ({"penalties": [-1]}, "penalties=")):
-        with pytest.raises(StructureError, match=words):
-            profile(s, "sensor:y1", **how)
-    for label in ("state", "actuator:u1 stuck"):
-        with pytest.raises(StructureError, match="several magnitudes"):
-            profile(s, label)
-    with pytest.raises(StructureError, match="noise has no course"):
-        profile(s, "sensor:y1 noise")
-    without = scan(found, s.whitened)
-    with pytest.raises(StructureError, match="depends on the input"):
-        profile(without, "actuator:u1 loss")
-    still = scan(found, s.whitened, np.zeros((N, 2)))
-    with pytest.raises(DataError, match="untestable"):
-        profile(still, "actuator:u2 loss")
+    without, still = scan(found, s.whitened), scan(found, s.whitened, np.zeros((N, 2)))
+    for error, words, where, label, how in (
+        (StructureError, "prior=", s, "sensor:y1", {"prior": "wavy"}),
+        (StructureError, "sign=", s, "sensor:y1", {"sign": "up"}),
+        (StructureError, "limit=", s, "sensor:y1", {"limit": 0.0}),
+        (StructureError, "slew=", s, "sensor:y1", {"slew": np.nan}),
+        (StructureError, "penalties=", s, "sensor:y1", {"penalties": []}),
+        (StructureError, "penalties=", s, "sensor:y1", {"penalties": [-1]}),
+        (StructureError, "several magnitudes", s, "state", {}),
+        (StructureError, "several magnitudes", s, "actuator:u1 stuck", {}),
+        (StructureError, "noise has no course", s, "sensor:y1 noise", {}),
+        (StructureError, "depends on the input", without, "actuator:u1 loss", {}),
+        (DataError, "untestable", still, "actuator:u2 loss", {}),
+    ):
+        with pytest.raises(error, match=words):
+            profile(where, label, **how)

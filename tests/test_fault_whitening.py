@@ -72,13 +72,9 @@ def test_healthy_records_are_white_and_of_unit_size():
     assert np.mean(p < 0.1) < 0.25 and np.mean(p > 0.5) > 0.3 and all(h.white and h.scaled for h in found)
     assert abs(np.mean([h.ratio for h in found]) - 1) < 0.06
     assert "p-value" in str(found[0]) and max(map(len, str(found[0]).splitlines())) <= 80
-
-
-def test_several_experiments_are_judged_together():
-    model, u = small(), levels(300, 0)
+    u = levels(300, 0)
     parts = whiten(model, Data([u, u[:200]], list(inject(model, [u, u[:200]], seed=1))))
-    assert [len(part.r) for part in parts] == [300, 200]
-    assert health(parts).samples == 500
+    assert [len(part.r) for part in parts] == [300, 200] and health(parts).samples == 500
 
 
 def test_innovations_that_are_not_white_are_refused():
@@ -114,12 +110,13 @@ def test_a_wrong_scale_of_the_noise_is_an_error_unless_it_is_taken_from_the_reco
 
 def test_bad_input():
     model, u = small(), levels(60, 0)
-    with pytest.raises(StructureError, match="noise covariances"):
-        whiten(replace(model, noise=None), Data(u, np.zeros((60, 2))))
-    with pytest.raises(DataError, match="too few"):
-        health(whiten(model, Data(u[:15], inject(model, u[:15]))))
-    with pytest.raises(DataError, match="determine"):
-        model_uncertainty(model, Data(u[:10], inject(model, u[:10])))
+    for error, words, act in (
+        (StructureError, "noise covariances", lambda: whiten(replace(model, noise=None), Data(u, np.zeros((60, 2))))),
+        (DataError, "too few", lambda: health(whiten(model, Data(u[:15], inject(model, u[:15]))))),
+        (DataError, "determine", lambda: model_uncertainty(model, Data(u[:10], inject(model, u[:10])))),
+    ):
+        with pytest.raises(error, match=words):
+            act()
 
 
 # -- the uncertainty of an identified model ----------------------------------------------------------------------------

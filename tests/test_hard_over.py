@@ -1,22 +1,18 @@
 """Hard-over losses: the decision table, the distribution of the tests by Monte Carlo, gates, and bad input."""
 
-import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from fault_plants import levels, standard
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-import optid
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults import Fault, hard_over_test, inject
 from optid.faults.rank.hard_over import HardOver, WindowVerdict
-from optid.faults.rank.order_power import MARGIN, coefficients, least_order
-from optid.faults.rank.zero_tests import ZeroTest, zero_test
+from optid.faults.rank.window_tests import MARGIN, ZeroTest, coefficients, least_order, zero_test
 from optid.identify.order.ranks import rank_test
 from optid.plants import two_mode_plant
 from optid.statistics.hankel import hankel_statistics
@@ -39,9 +35,6 @@ HEALTHY = {(coupled, process): run(coupled, process, n=3000, seed=99)
 def judged(coupled=False, process=0.1, fault=None, onset=0, n=N, seed=1, u=None, **settings):
     data = run(coupled, process, fault, onset, n, seed, u)
     return hard_over_test(data, HEALTHY[coupled, process], window=N, **settings)
-
-
-# -- the decision table ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("process", [0.0, 0.1])
@@ -84,22 +77,22 @@ def test_the_dead_channel_of_a_coupled_plant_is_named(fault):
         assert f"{fault} is dead" in found.explain()
 
 
-def test_an_uncoupled_plant_names_both_unless_its_sensor_still_moves():
-    assert set(judged(False, 0.1, "sensor:y1").candidates) == {"sensor:y1", "actuator:u1"}
-    assert judged(False, 0.1, "actuator:u1").candidates == ("actuator:u1",)  # y1 shows process noise
-    assert set(judged(False, 0.0, "actuator:u1").candidates) == {"sensor:y1", "actuator:u1"}
+@pytest.mark.parametrize("process, fault, dead", [
+    (0.1, "sensor:y1", {"sensor:y1", "actuator:u1"}), (0.0, "actuator:u1", {"sensor:y1", "actuator:u1"}),
+    (0.1, "actuator:u1", {"actuator:u1"})])  # y1 shows process noise
+def test_an_uncoupled_plant_names_both_unless_its_sensor_still_moves(process, fault, dead):
+    assert set(judged(False, process, fault).candidates) == dead
 
 
-def test_sensors_with_coloured_noise():
-    for coupled, dead in ((True, {"sensor:y1"}), (False, {"sensor:y1", "actuator:u1"})):
-        data = run(coupled, 0.1, "sensor:y1")
-        y = data.y.copy()
-        y[:, 0] += lfilter([0.3], [1, -0.9], np.random.default_rng(5).normal(size=N))
-        coloured = Data(data.u, y)
-        found = hard_over_test(coloured, HEALTHY[coupled, 0.1], window=N, white_sensors=False)
-        assert set(found.candidates) == dead
-        if coupled:  # no actuator explains it, so that the memory of the noise does not matter
-            assert set(hard_over_test(coloured, HEALTHY[coupled, 0.1], window=N).candidates) == dead
+@pytest.mark.parametrize("coupled, dead", [(True, {"sensor:y1"}), (False, {"sensor:y1", "actuator:u1"})])
+def test_sensors_with_coloured_noise(coupled, dead):
+    data = run(coupled, 0.1, "sensor:y1")
+    noise = lfilter([0.3], [1, -0.9], np.random.default_rng(5).normal(size=N))
+    coloured = Data(data.u, data.y + np.outer(noise, [1.0, 0.0]))
+    found = hard_over_test(coloured, HEALTHY[coupled, 0.1], window=N, white_sensors=False)
+    assert set(found.candidates) == dead
+    if coupled:  # no actuator explains it, so that the memory of the noise does not matter
+        assert set(hard_over_test(coloured, HEALTHY[coupled, 0.1], window=N).candidates) == dead
 
 
 @pytest.mark.slow
@@ -111,53 +104,37 @@ def test_a_healthy_record_gives_no_alarm():
             assert "No alarm" in found.explain()
 
 
-# -- stuck, frozen, nonlinear, missing -------------------------------------------------------------------------------
-
-
-def test_stuck_channels_count_as_dead():
-    model, u = two_mode_plant(True, 0.1), np.random.default_rng(3).normal(size=(N, 2))
-    for fault in (Fault.stuck("actuator:u1", 0, 2.0), Fault.stuck("sensor:y2", 0, 1.7), Fault.frozen("sensor:y2", 40)):
-        data = Data(u, inject(model, u, fault, seed=5))
-        data = data if fault.kind != "frozen" else Data(u[40:], data.y[40:])
-        found = hard_over_test(data, HEALTHY[True, 0.1], window=len(u) - 40 if fault.kind == "frozen" else N)
-        assert found.candidates == (fault.name,)
-        assert found.windows[0].rows[1].flat == (fault.name == "sensor:y2")
+@pytest.mark.parametrize("fault", [
+    Fault.stuck("actuator:u1", 0, 2.0), Fault.stuck("sensor:y2", 0, 1.7), Fault.frozen("sensor:y2", 0)],
+    ids=lambda fault: fault.kind)
+def test_stuck_channels_count_as_dead(fault):
+    u = np.random.default_rng(3).normal(size=(N, 2))
+    data = Data(u, inject(two_mode_plant(True, 0.1), u, fault, seed=5))
+    found = hard_over_test(data, HEALTHY[True, 0.1], window=N)
+    assert found.candidates == (fault.name,)
+    assert found.windows[0].rows[1].flat == (fault.name == "sensor:y2")
 
 
 def test_a_flat_sensor_hides_only_the_actuators_that_it_alone_shows():
     u = np.random.default_rng(3).normal(size=(N, 2))
     for coupled, dead in ((True, {"sensor:y1", "actuator:u1"}), (False, {"sensor:y1"})):
-        model = two_mode_plant(coupled, 0.1)
-        y = inject(model, u, [Fault.stuck("sensor:y1", 0, 1.7), Fault.loss("actuator:u1", 0, 1.0)], seed=5)
+        faults = [Fault.stuck("sensor:y1", 0, 1.7), Fault.loss("actuator:u1", 0, 1.0)]
+        y = inject(two_mode_plant(coupled, 0.1), u, faults, seed=5)
         found = hard_over_test(Data(u, y), HEALTHY[coupled, 0.1], window=N)
         assert set(found.candidates) == dead
         assert ("actuator:u1" in found.untestable) is not coupled
-    y = np.ones((N, 2))
-    assert set(hard_over_test(Data(u, y), HEALTHY[True, 0.1], window=N).candidates) == {"sensor:y1", "sensor:y2"}
+    still = hard_over_test(Data(u, np.ones((N, 2))), HEALTHY[True, 0.1], window=N)
+    assert set(still.candidates) == {"sensor:y1", "sensor:y2"}
 
 
-def standard_plant():
-    path = Path(os.environ.get("OPTID_DATA", "missing")) / "fault_plant.json"
-    if not path.exists():
-        pytest.skip("OPTID_DATA has no fault_plant.json")
-    plant = {key: np.array(value) for key, value in json.loads(path.read_text()).items()
-             if key in ("A", "B", "C", "D", "Q", "R")}
-    functions = optid.UserFunctions([lambda u: u + 0.25 * u**3], names=["f1"]), optid.UserFunctions(
-        [lambda u: np.tanh(1.5 * u) + 0.15 * u], names=["f2"])
-    shapes = tuple(optid.Nonlinearity(basis.fitted(-1.2, 1.2), np.ones(1)) for basis in functions)
-    noise = optid.NoiseCovariances(plant["Q"], plant["R"], np.zeros((4, 2)), np.eye(2))
-    return optid.HammersteinSS(*(plant[k] for k in "ABCD"), nonlinearities=shapes, noise=noise)
-
-
-def test_input_nonlinearities_of_a_model():
-    model = standard_plant()
-    u = np.repeat(np.random.default_rng(0).uniform(-1.2, 1.2, size=(1200, 2)), 5, axis=0)
+def test_input_nonlinearities_of_a_model(real_data):
+    model, u = standard(real_data)[0], levels(6000, 0)
     healthy = Data(u, inject(model, u, seed=1))
-    for name in ("actuator:u1", "actuator:u2", "sensor:y1", "sensor:y2"):
-        data = Data(u[:2000], inject(model, u[:2000], Fault.loss(name, 0, 1.0), seed=2))
-        assert hard_over_test(data, healthy, model=model, window=2000).candidates == (name,)
-    other = Data(u[:2000], inject(model, u[:2000], seed=2))
-    assert not hard_over_test(other, healthy, model=model, window=2000).detected
+    for name in ("actuator:u1", "actuator:u2", "sensor:y1", "sensor:y2", ""):
+        faults = [Fault.loss(name, 0, 1.0)] if name else []
+        data = Data(u[:2000], inject(model, u[:2000], faults, seed=2))
+        found = hard_over_test(data, healthy, model=model, window=2000)
+        assert found.detected == bool(name) and found.candidates == (name,) * bool(name)
 
 
 @pytest.mark.parametrize("fault", [None, "sensor:y2", "actuator:u1"])
@@ -178,7 +155,9 @@ def test_missing_inputs_before_a_nonlinearity():
     v = u.copy()
     v[2 * N + 50 :: 200, 1] = np.nan
     healthy, data = Data(u[: 2 * N], y[: 2 * N]), Data(v[2 * N :], y[2 * N :])
+    before = v.copy(), y.copy()
     assert hard_over_test(data, healthy, model=model, window=N).candidates == ("actuator:u1",)
+    assert np.array_equal(v, before[0], equal_nan=True) and np.array_equal(y, before[1])  # the caller's arrays
 
 
 def test_missing_samples_and_experiments():
@@ -193,17 +172,6 @@ def test_missing_samples_and_experiments():
     y[:, 0] = np.where(np.arange(2 * N) % 10, y[:, 0], np.nan)
     empty = hard_over_test(Data(data.u, y), HEALTHY[True, 0.1], window=N).windows[0]
     assert empty.order is None and "complete" in empty.order_note and len(empty.untestable) == 4
-
-
-def test_the_calling_arrays_are_not_changed():
-    u = np.random.default_rng(0).normal(size=(N, 2))
-    y = inject(two_mode_plant(True, 0.1), u)
-    before = u.copy(), y.copy()
-    hard_over_test(Data(u, y), HEALTHY[True, 0.1], window=N)
-    assert np.array_equal(u, before[0]) and np.array_equal(y, before[1])
-
-
-# -- the excitation gate ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fault", [None, "actuator:u1"])
@@ -238,9 +206,6 @@ def test_a_sinusoid_gives_rows_but_no_order():
     assert found.windows[0].order is None
     assert found.candidates == ("sensor:y1",)
     assert not judged(True, 0.1, u=u).detected
-
-
-# -- the distribution ------------------------------------------------------------------------------------------------
 
 
 def test_statistic_against_a_dense_regression():
@@ -319,10 +284,10 @@ def test_tails_of_the_forecast_against_the_windows_themselves():
 
 
 @pytest.mark.slow
-def test_healthy_streams_of_a_plant_with_a_weak_mode_give_no_alarm():
-    plant, count = standard_plant(), 0
+def test_healthy_streams_of_a_plant_with_a_weak_mode_give_no_alarm(real_data):
+    plant, count = standard(real_data)[0], 0
     for seed in range(8):
-        u = np.repeat(np.random.default_rng(seed).uniform(-1.2, 1.2, size=(1800, 2)), 5, axis=0)
+        u = levels(9000, seed)
         y = inject(plant, u, [], seed=seed)
         found = hard_over_test(Data(u[2 * N :], y[2 * N :]), Data(u[: 2 * N], y[: 2 * N]), model=plant, window=N,
                                hop=N // 10)
@@ -330,9 +295,6 @@ def test_healthy_streams_of_a_plant_with_a_weak_mode_give_no_alarm():
         assert found.nominal_order == 4 and not found.detected
         assert {w.least_order for w in found.windows} <= {2, 3}
     assert count >= 3  # the weakest mode is missed now and then
-
-
-# -- words and bad input ---------------------------------------------------------------------------------------------
 
 
 def test_prints_within_eighty_columns():
@@ -365,16 +327,15 @@ def test_alarm_by_order_comes_before_the_name():
 
 def test_bad_input_is_refused_by_name():
     data, healthy = run(True), HEALTHY[True, 0.1]
-    for settings in (dict(instruments="past"), dict(block_rows=1), dict(level=0.0), dict(window=100), dict(hop=0)):
-        with pytest.raises(StructureError, match=next(iter(settings)).replace("_", ".")):
-            hard_over_test(data, healthy, **settings)
-    with pytest.raises(RankError, match="No experiment has the 5000 samples"):
-        hard_over_test(data, healthy, window=5000)
-    with pytest.raises(DataError, match="must be the same"):
-        hard_over_test(Data(data.u, data.y, outputs=("a", "b")), healthy)
-    still = healthy.u.copy()
-    still[:, 1] = 2.0
-    with pytest.raises(RankError, match="u2 does not move"):
-        hard_over_test(data, Data(still, healthy.y))
-    with pytest.raises(RankError, match="do not excite"):
-        hard_over_test(data, Data(np.sin(np.outer(np.arange(3000), [0.1, 0.2])), healthy.y))
+    still = np.column_stack([healthy.u[:, 0], np.full(len(healthy.u), 2.0)])
+    sines = np.sin(np.outer(np.arange(3000), [0.1, 0.2]))
+    for error, words, judged_, sound, settings in (
+        *((StructureError, next(iter(wrong)).replace("_", "."), data, healthy, wrong) for wrong in (
+            dict(instruments="past"), dict(block_rows=1), dict(level=0.0), dict(window=100), dict(hop=0))),
+        (RankError, "No experiment has the 5000 samples", data, healthy, dict(window=5000)),
+        (DataError, "must be the same", Data(data.u, data.y, outputs=("a", "b")), healthy, {}),
+        (RankError, "u2 does not move", data, Data(still, healthy.y), {}),
+        (RankError, "do not excite", data, Data(sines, healthy.y), {}),
+    ):
+        with pytest.raises(error, match=words):
+            hard_over_test(judged_, sound, **settings)

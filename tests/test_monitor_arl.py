@@ -26,9 +26,6 @@ def test_run_lengths_against_simulated_charts():
     found = cusum_arl(0.3, 0.4, 2.5, two_sided=False)
     assert np.mean(ends) == pytest.approx(found, abs=4 * np.std(ends) / np.sqrt(len(ends)))
     assert cusum_arl(0.0, two_sided=False) == pytest.approx(2 * cusum_arl(0.0), rel=1e-12)
-
-
-def test_no_chart_without_a_threshold():
     with pytest.raises(StructureError, match="h=0"):
         cusum_arl(0.0, h=0)
 
@@ -78,7 +75,7 @@ def test_a_calibration_is_kept_and_travels():
 def test_a_simulation_that_is_too_short_is_refused_or_marked():
     model = plant()
     found = dictionary(model)
-    with pytest.raises(DataError, match="1000000000.*5e\\+10|cannot support a false alarm every 1e\\+09"):
+    with pytest.raises(DataError, match="cannot support a false alarm every 1e\\+09"):
         Monitor(model, found, arl0=1e9, samples=100_000)
     with pytest.raises(StructureError, match="arl0=10"):
         Monitor(model, found, arl0=10)

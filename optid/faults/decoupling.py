@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError
 from optid.faults.faults import place_of
 from optid.faults.whitening import Predictor, predictor
@@ -29,35 +28,6 @@ GENERIC = np.exp(0.7j) * 1.3
 """A point of the plane at which the rank of the transfer from the disturbances to the outputs is taken."""
 
 
-def disturbance_columns(
-    model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
-) -> tuple[Array, Array]:
-    """Return where disturbances enter: E (n, d) of the state equation and F (l, d) of the output equation.
-
-    Args:
-        model: the plant.
-        disturbances: names as in `Fault`: "actuator:u1", "sensor:y1", "process:load"; the part before the colon may be
-            left out where one channel or direction has the name.
-        process: directions (n,) in the state equation by name.
-
-    Raises:
-        LookupFailed: no such channel or direction.
-        StructureError: a direction of another shape.
-    """
-    parts = []
-    for name in disturbances:
-        kinds = {"actuator": model.inputs, "sensor": model.outputs, "process": tuple(process or {})}
-        here = [kind for kind, names in kinds.items() if name in names]
-        if ":" in name:
-            parts.append(place_of(model, name, None, process))
-        elif len(here) == 1:
-            parts.append(place_of(model, f"{here[0]}:{name}", None, process))
-        else:
-            known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
-            raise LookupFailed(f"disturbance {name!r}: {'none' if not here else 'several'} of {known} has this name.")
-    return np.hstack([part[0] for part in parts]), np.hstack([part[1] for part in parts])
-
-
 def decoupled(
     model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
 ) -> tuple["HammersteinSS", Predictor]:
@@ -65,15 +35,19 @@ def decoupled(
 
     Args:
         model: with noise covariances.
-        disturbances: see `disturbance_columns`.
-        process: directions by name.
+        disturbances: names as in `Fault`: "actuator:u1", "sensor:y1", "process:load"; the part before the colon may be
+            left out where one channel or direction has the name.
+        process: directions (n,) in the state equation by name.
 
     Raises:
         LookupFailed: no such channel or direction.
-        StructureError: disturbances that cover all outputs: nothing is left to judge; or none that an output sees.
+        StructureError: a direction of another shape; disturbances that cover all outputs: nothing is left to judge; or
+            one that no output sees.
     """
     steady = predictor(model)
-    E, F = disturbance_columns(model, disturbances, process)
+    kinds = {"actuator": model.inputs, "sensor": model.outputs, "process": tuple(process or {})}
+    parts = [place_of(model, _full_name(name, kinds), None, process) for name in disturbances]
+    E, F = np.hstack([part[0] for part in parts]), np.hstack([part[1] for part in parts])
     A, into = model.A + model.L @ model.C, E + model.L @ F  # what reaches the reading is fed back
     transfer = model.C @ np.linalg.solve(GENERIC * np.eye(model.nx) - A, into) + F
     seen = steady.root @ transfer
@@ -89,20 +63,20 @@ def decoupled(
     assert model.noise is not None
     E, F, noise = UNLIMITED * E / sizes, UNLIMITED * F / sizes, model.noise
     louder = replace(model, noise=replace(noise, Q=noise.Q + E @ E.T, R=noise.R + F @ F.T, S=noise.S + E @ F.T))
-    return louder, silenced(predictor(louder), steady, silent)
-
-
-def silenced(loud: Predictor, steady: Predictor, silent: int) -> Predictor:
-    """Return a predictor whose whitening leaves out the axes that are largest beside another one.
-
-    Args:
-        loud: the predictor.
-        steady: the one without disturbances.
-        silent: number of axes.
-    """
+    loud = predictor(louder)
     _, axes = np.linalg.eigh(steady.root @ loud.covariance @ steady.root.T)
-    kept = axes[:, : len(axes) - silent].T @ steady.root  # combinations of the outputs that do not feel them
-    small = kept @ loud.covariance @ kept.T
-    white = np.linalg.solve(np.linalg.cholesky(small), kept)
-    r: Any = np.linalg.qr(np.vstack([white, np.zeros((silent, white.shape[1]))])[:, ::-1], mode="r")  # triangular again
-    return replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
+    kept = axes[:, : model.l - silent].T @ steady.root  # combinations of the outputs that do not feel them
+    white = np.linalg.solve(np.linalg.cholesky(kept @ loud.covariance @ kept.T), kept)
+    r: Any = np.linalg.qr(np.vstack([white, np.zeros((silent, model.l))])[:, ::-1], mode="r")  # triangular again
+    return louder, replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
+
+
+def _full_name(name: str, kinds: Mapping[str, Sequence[str]]) -> str:
+    """The name of a place with the part before the colon."""
+    if ":" in name:
+        return name
+    here = [kind for kind, names in kinds.items() if name in names]
+    if len(here) == 1:
+        return f"{here[0]}:{name}"
+    known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
+    raise LookupFailed(f"disturbance {name!r}: {'none' if not here else 'several'} of {known} has this name.")

@@ -110,8 +110,6 @@ class Fault:
             raise DataError(f"{self.name}: onset {self.onset} lies beyond the record of {count} samples.")
         return slice(int(self.onset), count if self.end is None else min(int(self.end), count))
 
-    # -- additive ------------------------------------------------------------------------------------------------
-
     @classmethod
     def step(
         cls, name: str, onset: int, size: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
@@ -138,36 +136,17 @@ class Fault:
     def ramp(
         cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
     ) -> "Fault":
-        """Return a drift: slope at the onset, twice the slope one sample later, ....
-
-        Args:
-            name: as `step`.
-            onset: first sample that it can change.
-            slope: growth per sample; a number or a vector as the size of `step`.
-            end: first sample that it no longer changes.
-            direction: (n,) of a "process" fault.
-        """
+        """Return a drift: slope at the onset, twice the slope one sample later, .... Arguments as `step`."""
         return cls(name, "ramp", onset, end, _size(name, slope), _direction(name, direction))
 
     drift = ramp
-
-    # -- multiplicative --------------------------------------------------------------------------------------------
 
     @classmethod
     def loss(cls, name: str, onset: int, fraction: float, *, bias: float = 0.0, end: int | None = None) -> "Fault":
         """Return a loss of effectiveness, (1.10) and (1.11): (1 - fraction) f(u) + bias, or that of the output.
 
-        The noise of a sensor stays.
-
-        Args:
-            name: "actuator:u1" or "sensor:y1".
-            onset: first sample that it can change.
-            fraction: share lost, 0 to 1.
-            bias: constant added, in units of f (of the output for a sensor).
-            end: first sample that it no longer changes.
-
-        Raises:
-            StructureError: a fraction outside [0, 1].
+        The name is "actuator:u1" or "sensor:y1", the fraction the share lost, 0 to 1 (`StructureError` outside), the
+        bias in units of f (of the output for a sensor); onset and end as `step`. The noise of a sensor stays.
         """
         if not 0 <= fraction <= 1:
             raise StructureError(f"{name}: fraction = {fraction!r}; a share from 0 to 1 is needed.")
@@ -177,12 +156,8 @@ class Fault:
     def stuck(cls, name: str, onset: int, value: Any = "last", *, end: int | None = None) -> "Fault":
         """Return an actuator that no longer moves, or a sensor that repeats one reading without noise.
 
-        Args:
-            name: "actuator:u1" or "sensor:y1".
-            onset: first sample that it can change.
-            value: the input at which the actuator stands (the reading of the sensor), or "last": where the plant was
-                last driven from, the input two samples before the onset (the reading before the onset).
-            end: first sample that it no longer changes.
+        The value is the input at which the actuator stands (the reading of the sensor), or "last": where the plant was
+        last driven from, the input two samples before the onset (the reading before the onset); others as `loss`.
         """
         if not isinstance(value, str):
             value = float(_finite(name, value, "value"))
@@ -199,16 +174,10 @@ class Fault:
     def hard_over(cls, name: str, onset: int, value: float | None = None, *, end: int | None = None) -> "Fault":
         """Return a complete failure.
 
-        Args:
-            name: "actuator:u1" or "sensor:y1".
-            onset: first sample that it can change.
-            value: None for the complete loss of the dissertation (the channel contributes nothing, a sensor reads its
-                noise); a number for one that runs to a stop: the input (reading) there.
-            end: first sample that it no longer changes.
+        The value is None for the complete loss of the dissertation (the channel contributes nothing, a sensor reads
+        its noise), a number for one that runs to a stop: the input (reading) there; others as `loss`.
         """
         return cls(name, "hard_over", onset, end, None if value is None else float(_finite(name, value, "value")))
-
-    # -- noise -----------------------------------------------------------------------------------------------------
 
     @classmethod
     def process_noise(
@@ -217,20 +186,12 @@ class Fault:
     ) -> "Fault":
         """Return additional white noise in the state equation, (1.12).
 
-        Args:
-            name: "process:load" along a direction, or "process" in all states.
-            onset: first sample that it can change.
-            std: standard deviation of the added noise along the direction (of every state).
-            scale: instead, the factor by which the standard deviation of the noise that is there grows.
-            covariance: instead, (n, n).
-            end: first sample that it no longer changes.
-            direction: (n,).
-
-        Raises:
-            StructureError: not exactly one of std, scale and covariance, or one of them impossible.
+        The name is "process:load" along a direction, or "process" in all states. Give one (`StructureError`) of std,
+        the standard deviation along the direction (of every state), scale, the factor by which the standard deviation
+        of the noise that is there grows, and covariance (n, n); onset, end and direction as `step`.
         """
-        std, scale, covariance = _noise(name, std, scale, covariance)
-        return cls(name, "process_noise", onset, end, None, _direction(name, direction), 0.0, std, scale, covariance)
+        return cls(name, "process_noise", onset, end, None, _direction(name, direction), 0.0,
+                   *_noise(name, std, scale, covariance))
 
     @classmethod
     def sensor_noise(
@@ -238,10 +199,7 @@ class Fault:
         covariance: ArrayLike | None = None, end: int | None = None,
     ) -> "Fault":
         """Return additional white noise of a sensor, (1.13); "sensor" alone is all of them. As `process_noise`."""
-        std, scale, covariance = _noise(name, std, scale, covariance)
-        return cls(name, "sensor_noise", onset, end, std=std, scale=scale, covariance=covariance)
-
-    # -- other dynamics ----------------------------------------------------------------------------------------------
+        return cls(name, "sensor_noise", onset, end, None, None, 0.0, *_noise(name, std, scale, covariance))
 
     @classmethod
     def schedule(cls, onset: int = 0, *, A: Any = None, B: Any = None, end: int | None = None) -> "Fault":
@@ -278,13 +236,13 @@ def place_of(model: "HammersteinSS", name: str, direction: Any = None,
     place, _, channel = name.partition(":")
     n, l = model.nx, model.l  # noqa: E741
     if place == "actuator":
-        columns = [i for i, c in enumerate(model.input_of) if c == channel_of(model.inputs, name)]
+        columns = functions_of(model, name)
         return np.array(model.B[:, columns]), np.array(model.D[:, columns])
     if place == "sensor":
         reading = range(l) if not channel else [channel_of(model.outputs, name)]
         return np.zeros((n, len(reading))), np.eye(l)[:, list(reading)]
     if place == "process" and direction is None and channel:
-        states = numbered(n)
+        states = [f"x{i}" for i in range(1, n + 1)]
         if process is not None and channel in process:
             direction = process[channel]
         elif channel in states:
@@ -321,9 +279,38 @@ def channel_of(names: tuple[str, ...], name: str) -> int:
     return names.index(channel)
 
 
-def numbered(n: int) -> list[str]:
-    """Return the names of n states."""
-    return [f"x{i}" for i in range(1, n + 1)]
+def functions_of(model: "HammersteinSS", name: str) -> list[int]:
+    """Return the functions of the input that the name of a fault ends in; errors as `channel_of`."""
+    c = channel_of(model.inputs, name)
+    return [i for i, of in enumerate(model.input_of) if of == c]
+
+
+def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Array, count: int) -> Array:
+    """Return the matrices A(k) or B(k) of a schedule at some samples, (samples, ...).
+
+    Args:
+        label: of the fault, for messages.
+        word: "A" or "B".
+        given: one matrix, one for each of `count` samples, or a function of k; None for the healthy one.
+        samples: those wanted.
+        healthy: the matrix of the model.
+        count: samples of the record.
+
+    Raises:
+        StructureError: matrices of another shape, or not finite.
+    """
+    values = healthy if given is None else given
+    values = np.array([values(k) for k in samples]) if callable(values) else np.asarray(values, dtype=float)
+    if not callable(given) and values.shape == (count, *healthy.shape):
+        values = values[samples.start : samples.stop]
+    if values.shape not in (healthy.shape, (len(samples), *healthy.shape)):
+        raise StructureError(
+            f"{label}: {word} has shape {values.shape}; {healthy.shape} or {(count, *healthy.shape)} is needed, one "
+            "matrix for each sample."
+        )
+    if not np.isfinite(values).all():
+        raise StructureError(f"{label}: {word} has a value that is not finite.")
+    return np.broadcast_to(values, (len(samples), *healthy.shape))
 
 
 def _finite(name: str, value: Any, word: str) -> Any:

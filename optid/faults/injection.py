@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array, compact
 from optid.data.record import one_or_all
 from optid.errors import DataError, StructureError
-from optid.faults.faults import ADDITIVE, Fault, channel_of, place_of
+from optid.faults.faults import ADDITIVE, Fault, channel_of, functions_of, matrices_of, place_of
 from optid.models.experiments import check_inputs, records_of, state_like
 from optid.models.kalman import NoiseCovariances
 
@@ -47,15 +47,8 @@ class _Plan(NamedTuple):
 
 
 def inject(
-    model: "HammersteinSS",
-    u: Any,
-    faults: Fault | Sequence[Fault] = (),
-    *,
-    seed: int | None = 0,
-    x0: Any = "zero",
-    noise: NoiseCovariances | str = "model",
-    process: Mapping[str, ArrayLike] | None = None,
-    feedback: str = "measured",
+    model: "HammersteinSS", u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0, x0: Any = "zero",
+    noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
 ) -> Any:
     """Simulate a plant with faults, several at once where wanted.
 
@@ -90,15 +83,8 @@ def inject(
 
 
 def trajectory(
-    model: "HammersteinSS",
-    u: ArrayLike,
-    faults: Fault | Sequence[Fault] = (),
-    *,
-    seed: Any = 0,
-    x0: Any = "zero",
-    noise: NoiseCovariances | str = "model",
-    process: Mapping[str, ArrayLike] | None = None,
-    feedback: str = "measured",
+    model: "HammersteinSS", u: ArrayLike, faults: Fault | Sequence[Fault] = (), *, seed: Any = 0, x0: Any = "zero",
+    noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
 ) -> Trajectory:
     """Simulate one record as `inject` does and return the states, too."""
     from optid.faults.kernels import march_faulty
@@ -139,8 +125,10 @@ def _planned(
     count, n, l = len(u), model.nx, model.l  # noqa: E741
     root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
     healthy, *streams = (np.random.default_rng(s) for s in root.spawn(len(faults) + 1))
-    w, v = _noises(healthy, count, n, l, covariances)
-    f = model.expanded(u)
+    f, drawn = model.expanded(u), np.zeros((count, n + l))
+    if covariances is not None:
+        drawn = _draw(healthy, count, np.block([[covariances.Q, covariances.S], [covariances.S.T, covariances.R]]))
+    w, v = np.ascontiguousarray(drawn[:, :n]), np.ascontiguousarray(drawn[:, n:])
     plan = _Plan(
         f, f.copy(), np.zeros((count, n)), np.zeros(n), w, np.ones((count, l)), np.zeros((count, l)), v,
         np.full((count, l), np.nan), np.zeros((count, l), dtype=bool),
@@ -152,15 +140,13 @@ def _planned(
         if fault.kind in ADDITIVE:
             _add(model, plan, fault, now, before, process)
         elif fault.kind == "schedule":
-            plan = _scheduled(model, plan, fault, before, count)
-        elif fault.kind == "process_noise":
-            where, _ = place_of(model, fault.name, fault.direction, process)
-            spread = _added(fault, where, None if covariances is None else covariances.Q)
-            plan.w[before] += _draw(stream, before.stop - before.start, spread) @ where.T
-        elif fault.kind == "sensor_noise":
-            _, where = place_of(model, fault.name)
-            spread = _added(fault, where, None if covariances is None else covariances.R)
-            plan.v[now] += _draw(stream, now.stop - now.start, spread) @ where.T
+            plan = _scheduled(plan, fault, before, count)
+        elif fault.kind in ("process_noise", "sensor_noise"):
+            state, output = place_of(model, fault.name, fault.direction, process)
+            where, target, samples, word = (output, plan.v, now, "R") if fault.kind == "sensor_noise" else (
+                state, plan.w, before, "Q")
+            spread = _added(fault, where, None if covariances is None else getattr(covariances, word))
+            target[samples] += _draw(stream, samples.stop - samples.start, spread) @ where.T
         elif fault.place == "actuator":
             _break_actuator(model, plan, fault, now, before, u)
         else:
@@ -183,7 +169,7 @@ def _add(
     if fault.kind == "jump":
         course[now.start + 1 :] = 0.0
     if fault.place == "actuator":  # through B(k), which may be scheduled
-        columns = [i for i, c in enumerate(model.input_of) if c == channel_of(model.inputs, fault.name)]
+        columns = functions_of(model, fault.name)
         plan.output[:, columns] += np.outer(course, size)
         plan.state[:-1, columns] += np.outer(course[1:], size)
     else:
@@ -192,40 +178,25 @@ def _add(
     plan.start[:] += course[0] * (into_state @ size)
 
 
-def _scheduled(model: "HammersteinSS", plan: _Plan, fault: Fault, before: slice, count: int) -> _Plan:
+def _scheduled(plan: _Plan, fault: Fault, before: slice, count: int) -> _Plan:
     changed = {}
     for word, given, whole in (("A", fault.A, plan.A), ("B", fault.B, plan.B)):
-        if given is None:
-            continue
-        steps = range(before.start, before.stop)
-        values = np.array([given(k) for k in steps]) if callable(given) else np.asarray(given, dtype=float)
-        if not callable(given) and values.shape == (count, *whole.shape[1:]):
-            values = values[before]
-        if values.shape not in (whole.shape[1:], (len(steps), *whole.shape[1:])):
-            raise StructureError(
-                f"schedule: {word} has shape {values.shape}; {whole.shape[1:]} or {whole.shape} is needed."
-            )
-        if not np.isfinite(values).all():
-            raise StructureError(f"schedule: {word} has a value that is not finite.")
-        own = np.array(whole)
-        own[before] = values
-        changed[word] = own
+        if given is not None:
+            changed[word] = np.array(whole)
+            changed[word][before] = matrices_of("schedule", word, given, range(before.start, before.stop), whole[0],
+                                                count)
     return plan._replace(**changed)
 
 
 def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, u: Array) -> None:
-    c = channel_of(model.inputs, fault.name)
-    columns = [i for i, of in enumerate(model.input_of) if of == c]
-    size: Any = fault.size
+    c, size = channel_of(model.inputs, fault.name), fault.size
+    stop = u[max(now.start - 2, 0), c] if size == "last" else size
     for values, samples in ((plan.output, now), (plan.state, before)):
-        for i in columns:
+        for i in functions_of(model, fault.name):
             if fault.kind == "loss":
-                values[samples, i] = (1.0 - np.asarray(size)) * values[samples, i] + fault.bias
-            elif size is None:
-                values[samples, i] = 0.0
+                values[samples, i] = (1.0 - size) * values[samples, i] + fault.bias
             else:
-                stop = u[max(now.start - 2, 0), c] if size == "last" else size
-                values[samples, i] = model.nonlinearities[i](stop)
+                values[samples, i] = 0.0 if size is None else model.nonlinearities[i](stop)
 
 
 def _break_sensor(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice) -> None:
@@ -256,16 +227,6 @@ def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> Noise
             "noise='none' for a run without noise."
         )
     return model.noise
-
-
-def _noises(
-    rng: np.random.Generator, count: int, n: int, outputs: int, covariances: NoiseCovariances | None
-) -> tuple[Array, Array]:
-    if covariances is None:
-        return np.zeros((count, n)), np.zeros((count, outputs))
-    together = np.block([[covariances.Q, covariances.S], [covariances.S.T, covariances.R]])
-    drawn = _draw(rng, count, together)
-    return np.ascontiguousarray(drawn[:, :n]), np.ascontiguousarray(drawn[:, n:])
 
 
 def _draw(rng: np.random.Generator, count: int, covariance: Array) -> Array:

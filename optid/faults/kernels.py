@@ -101,20 +101,34 @@ def respond(A, C, K, L, present, into_state, into_output, response):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def propagate(A, drive, start, states):
-    """States of x(k+1) = A x + drive(k).
+def add_product(M, v, out):
+    """Add M v(k) to out(k) for every sample; the same digits for blocks of any length."""
+    for k in range(v.shape[0]):
+        for i in range(M.shape[0]):
+            total = 0.0
+            for j in range(M.shape[1]):
+                total += M[i, j] * v[k, j]
+            out[k, i] += total
 
-    Args:
-        A: (n, n).
-        drive: (N, n).
-        start: (n,).
-        states: (N, n) written.
-    """
-    n = start.size
-    for i in range(n):
-        states[0, i] = start[i]
-    for k in range(1, states.shape[0]):
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def predict(A, C, K, root, drive, y, direct, x, r):
+    """Run the steady predictor; write states x (T + 1, n) from x[0] on and whitened innovations r (T, l)."""
+    n, l = A.shape[0], C.shape[0]  # noqa: E741
+    e = np.empty(l)
+    for k in range(y.shape[0]):
+        for o in range(l):
+            e[o] = y[k, o] - direct[k, o]
+            for i in range(n):
+                e[o] -= C[o, i] * x[k, i]
+        for o in range(l):
+            r[k, o] = 0.0
+            for p in range(o + 1):
+                r[k, o] += root[o, p] * e[p]
         for i in range(n):
-            states[k, i] = drive[k - 1, i]
+            total = drive[k, i]
             for j in range(n):
-                states[k, i] += A[i, j] * states[k - 1, j]
+                total += A[i, j] * x[k, j]
+            for o in range(l):
+                total += K[i, o] * e[o]
+            x[k + 1, i] = total

@@ -9,13 +9,13 @@ that of the whole change, and exact for other magnitudes where B alone changes.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
-from optid.faults.faults import Fault
+from optid.faults.faults import Fault, matrices_of
 
 if TYPE_CHECKING:
     from optid.faults.signatures import Candidate, Dictionary
@@ -62,26 +62,11 @@ def change(model: "HammersteinSS", candidate: "Candidate", states: Array, u: Arr
     Raises:
         StructureError: matrices of another shape, or not finite.
     """
-    fault = candidate.schedule
+    fault, count = candidate.schedule, len(u)
     assert fault is not None
-    count = len(u)
-    A = _values(candidate.label, "A", fault.A, model.A, count)
-    B = _values(candidate.label, "B", fault.B, model.B, count)
+    A, B = (matrices_of(candidate.label, word, given, range(count), healthy, count)
+            for word, given, healthy in (("A", fault.A, model.A), ("B", fault.B, model.B)))
     step = np.einsum("kij,kj->ki", A - model.A, states) + np.einsum("kij,kj->ki", B - model.B, model.expanded(u))
     added = np.zeros((count, model.nx, 1))
     added[1:, :, 0] = step[:-1]
     return added, A
-
-
-def _values(label: str, word: str, given: Any, healthy: Array, count: int) -> Array:
-    if given is None:
-        return np.broadcast_to(healthy, (count, *healthy.shape))
-    values = np.array([given(k) for k in range(count)]) if callable(given) else np.asarray(given, dtype=float)
-    if values.shape not in (healthy.shape, (count, *healthy.shape)):
-        raise StructureError(
-            f"{label}: {word} has shape {values.shape}; {healthy.shape} or {(count, *healthy.shape)} is needed, one "
-            "matrix for each sample of the window."
-        )
-    if not np.isfinite(values).all():
-        raise StructureError(f"{label}: {word} has a value that is not finite.")
-    return np.broadcast_to(values, (count, *healthy.shape))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array, compact
-from optid.data.record import Data, Experiment
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
@@ -83,10 +83,36 @@ class Predictor:
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
         response = np.empty(into_output.shape)
-        parts = (self.A, self.C, self.K, self.L, into_state, into_output)
-        A, C, K, L, x, y = map(compact, parts)
-        kernels.respond(A, C, K, L, shown, x, y, response)
+        kernels.respond(*map(compact, (self.A, self.C, self.K, self.L)), shown, compact(into_state),
+                        compact(into_output), response)
         return response
+
+    def run(self, model: "HammersteinSS", x0: Array, f: Array, fed: Array, y: Array,
+            added: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
+        """Return states (T + 1, n) and whitened innovations (T, l) of complete samples of the model.
+
+        Args:
+            model: with the functions of inputs and outputs.
+            x0: (n,) state before the first sample.
+            f: (T, r) functions of the inputs.
+            fed: (T, s) functions of the outputs.
+            y: (T, l) readings.
+            added: what is added to the next state (T, n) and to the output (T, l).
+        """
+        from optid.faults.kernels import add_product, predict
+
+        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
+        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
+                                       (model.D, f, direct)):
+            if matrix.any():
+                add_product(np.ascontiguousarray(matrix), signal, target)
+        if added is not None:
+            drive += added[0]
+            direct += added[1]
+        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
+        x[0] = x0
+        predict(*map(np.ascontiguousarray, (model.A, model.C, self.K, self.root)), drive, y, direct, x, r)
+        return x, r
 
     def whitened(self, innovations: Array, present: Array | None = None) -> Array:
         """Return innovations (N, l) or (N, l, d) in units of their covariance, zero where a reading is missing.
@@ -119,29 +145,21 @@ def predictor(model: "HammersteinSS") -> Predictor:
             "The model has no noise covariances, and without them nothing says how large a deviation is: estimate "
             "them with optid.noise.with_noise(model, data)."
         )
-    noise = model.noise
-    steady, failure = _gain(model, noise.R)
-    if steady is None:
-        steady, _ = _gain(model, noise.R + ADDED * noise.innovation)
-        if steady is None:
-            raise StructureError(failure)
-        warnings.warn(
-            "The noise of the model has no power at some frequency, so that its predictor would never forget: "
-            f"measurement noise of {100 * ADDED:g} % of the innovations is added.", DataWarning, stacklevel=2,
-        )
-    return Predictor(model.A, model.C, model.L, steady.K, steady.innovation, _root(steady.innovation))
-
-
-def _gain(model: "HammersteinSS", R: Array) -> tuple[Any, str]:
-    """The steady gain for a measurement noise; None, and why, without one whose predictor forgets."""
-    assert model.noise is not None
-    try:
-        steady = kalman_gain(model.A, model.C, model.noise.Q, R, model.noise.S)
-    except StructureError as error:
-        return None, str(error)
-    if spectral_radius(model.A - steady.K @ model.C) > FORGETS:
-        return None, "The Riccati equation has no stabilising solution: a mode stays on the unit circle."
-    return steady, ""
+    noise, failure = model.noise, ""
+    for added in (0.0, ADDED):
+        try:
+            steady = kalman_gain(model.A, model.C, noise.Q, noise.R + added * noise.innovation, noise.S)
+        except StructureError as error:
+            failure = failure or str(error)
+            continue
+        if spectral_radius(model.A - steady.K @ model.C) <= FORGETS:
+            if added:
+                warnings.warn(
+                    "The noise of the model has no power at some frequency, so that its predictor would never forget: "
+                    f"measurement noise of {100 * ADDED:g} % of the innovations is added.", DataWarning, stacklevel=2)
+            return Predictor(model.A, model.C, model.L, steady.K, steady.innovation, _root(steady.innovation))
+        failure = failure or "The Riccati equation has no stabilising solution: a mode stays on the unit circle."
+    raise StructureError(failure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,41 +211,26 @@ def whiten(
         StructureError: no noise covariances.
     """
     steady = scale or (predictor(model) if uncertainty is None else uncertainty.predictor)
-    gained = replace(model, K=steady.K)
-    raw = in_units_of(model, data)
-    parts = raw.experiments
-    states = gained.initial_state(raw, "predict") if isinstance(x0, str) and x0 == "fit" else x0
-    predicted = gained.predict(raw, x0=states)
+    gained, raw, fitted = replace(model, K=steady.K), in_units_of(model, data), isinstance(x0, str) and x0 == "fit"
+    given = gained.initial_state(raw, "predict") if fitted else x0
+    predicted = gained.predict(raw, x0=given)
     predictions = predicted if isinstance(predicted, tuple) else (predicted,)
+    starts = [np.zeros(model.nx)] * len(predictions) if isinstance(given, str) else (
+        [given] if len(predictions) == 1 else given)
     found = []
-    for number, (part, prediction) in enumerate(zip(parts, predictions)):
-        present = ~np.isnan(part.y)
-        innovations = part.y - prediction
+    for part, prediction, start in zip(raw.experiments, predictions, starts):
+        present, start = ~np.isnan(part.y), np.asarray(start, dtype=float)
+        innovations, y = part.y - prediction, np.where(present, part.y, prediction)
         r = steady.whitened(np.where(present, innovations, 0.0), present)
-        start = states if len(parts) == 1 or isinstance(states, str) else states[number]
-        start = np.zeros(model.nx) if isinstance(start, str) else np.asarray(start, dtype=float)
-        white = Whitened(r, innovations, present, steady, model.outputs,
-                         states=_states(gained, part, prediction, start))
+        fed = np.array([g(y[:, o]) for g, o in zip(model.feedback, model.output_of)]).reshape(-1, len(y)).T
+        states = None if np.isnan(part.u).any() else steady.run(
+            model, start, np.ascontiguousarray(model.expanded(part.u)), np.ascontiguousarray(fed), y)[0][:-1]
+        white = Whitened(r, innovations, present, steady, model.outputs, states=states)
         if uncertainty is not None:
-            nuisance = uncertainty.nuisance(part, start, present, free_start=isinstance(x0, str) and x0 == "fit")
+            nuisance = uncertainty.nuisance(part, start, present, free_start=fitted)
             white = replace(white, r=nuisance(r), nuisance=nuisance)
         found.append(white)
     return found[0] if len(found) == 1 else tuple(found)
-
-
-def _states(model: "HammersteinSS", part: Experiment, prediction: Array, start: Array) -> Array | None:
-    """States (N, n) of the predictor; None where a missing input leaves them unknown."""
-    if np.isnan(part.u).any():
-        return None
-    from optid.faults.kernels import propagate
-
-    y = np.where(np.isnan(part.y), prediction, part.y)
-    drive = model.expanded(part.u) @ model.B.T + model.offset_x + y @ model.L.T + (y - prediction) @ model.K.T
-    for g, o, column in zip(model.feedback, model.output_of, model.E.T):
-        drive += np.outer(g(y[:, o]), column)
-    states = np.empty((len(y), model.nx))
-    propagate(np.ascontiguousarray(model.A), np.ascontiguousarray(drive), start, states)
-    return states
 
 
 @dataclass(frozen=True, eq=False)
@@ -340,17 +343,11 @@ def health(whitened: Any, lags: int = LAGS) -> Health:
                 total += signal[lag:].T @ signal[:-lag]
                 pairs += int(np.sum(there[lag:] & there[:-lag]))
         statistic += float(np.sum(total**2)) / max(pairs, 1)
-    return Health(
-        dict(zip(parts[0].outputs, np.sqrt(_each(parts)).tolist())), float(chdtrc(outputs**2 * lags, statistic)), lags,
-        count, covariance,
-    )
-
-
-def _each(parts: list[Whitened]) -> Array:
-    """Mean square of the innovation of every output over its predicted variance."""
     squares = np.nansum([np.nansum(part.innovations**2, axis=0) for part in parts], axis=0)
-    counts = np.sum([part.present.sum(axis=0) for part in parts], axis=0)
-    return np.asarray(squares / np.maximum(counts, 1) / np.diag(parts[0].predictor.covariance))
+    readings = np.maximum(np.sum([part.present.sum(axis=0) for part in parts], axis=0), 1)
+    sizes = np.sqrt(squares / readings / np.diag(parts[0].predictor.covariance)).tolist()
+    p_value = float(chdtrc(outputs**2 * lags, statistic))
+    return Health(dict(zip(parts[0].outputs, sizes)), p_value, lags, count, covariance)
 
 
 def _root(covariance: Array) -> Array:

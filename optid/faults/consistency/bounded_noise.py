@@ -17,6 +17,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
+from optid.faults.whitening import Predictor
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
@@ -77,22 +78,17 @@ class BoundedWindow:
             into_state: (N, n, d) additions to x(k), of unknown sizes.
             into_output: (N, l, d) additions to y(k).
         """
+        n, l = self.A.shape[0], len(self.C)  # noqa: E741
         starts = [0, *(np.flatnonzero(~self.steps[:-1]) + 1).tolist()]
-        n, d = self.A.shape[0], 0 if into_state is None else into_state.shape[2]
-        state, columns = np.zeros((n, len(starts) * n + d)), []
-        for k in range(self.count):
-            state = self.A @ state
-            if k in starts:
-                state[:, : len(starts) * n] = 0.0
-                at = starts.index(k) * n
-                state[:, at : at + n] = np.eye(n)
-            if into_state is not None:
-                state[:, len(starts) * n :] += into_state[k]
-            seen = self.C @ state
-            if into_output is not None:
-                seen[:, len(starts) * n :] += into_output[k]
-            columns.append(seen)
-        return np.where(self.present[:, :, None], np.stack(columns), 0.0).reshape(self.e.size, -1)
+        free = np.zeros((self.count, n, len(starts) * n))
+        for number, k in enumerate(starts):
+            free[k, :, number * n : (number + 1) * n] = np.eye(n)
+        state, output = free, np.zeros((self.count, l, free.shape[2]))
+        if into_state is not None and into_output is not None:
+            state, output = np.concatenate([state, into_state], 2), np.concatenate([output, into_output], 2)
+        still = np.zeros((n, l))
+        seen = Predictor(self.A, self.C, still, still, np.eye(l), np.eye(l)).respond(state, output)
+        return np.where(self.present[:, :, None], seen, 0.0).reshape(self.e.size, -1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 
 from optid.arrays import Array, check_probability
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.consistency.waveforms import LONGEST, RANK, same_place, start_matrix, waveform_matrix
+from optid.faults.consistency.waveforms import RANK, check_window, same_place, start_matrix, waveform_matrix
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
 
@@ -59,11 +59,9 @@ class NoisePlace:
         Returns:
             (M, K), or (M,).
         """
-        grown = 1 + rho[..., None] * self.s if rho.ndim == 1 else 1 + rho * self.s
-        spread = np.sum(np.log(grown), axis=-1)
-        if rho.ndim == 1:
-            return np.asarray(-0.5 * (spread + z2 @ (1 / grown - 1).T))
-        return np.asarray(-0.5 * (spread + np.einsum("mq,mq->m", z2, 1 / grown - 1)))
+        grown = 1 + rho.reshape(-1, 1) * self.s
+        energy = z2 @ (1 / grown - 1).T if rho.ndim == 1 else np.einsum("mq,mq->m", z2, 1 / grown - 1)
+        return np.asarray(-0.5 * (np.sum(np.log(grown), axis=1) + energy))
 
     def maximise(self, windows: Array) -> tuple[Array, Array]:
         """Return the variance (M,) and the gain in log-likelihood (M,) of windows (M, N l)."""
@@ -185,13 +183,6 @@ class NoiseTest:
         """Places within three nats of the best."""
         return tuple(change.label for change in self.changes if change.gain >= self.changes[0].gain - NATS)
 
-    @property
-    def probabilities(self) -> dict[str, float]:
-        """Posterior of the places, all equally probable before, each with its best variance."""
-        gains = np.array([change.gain for change in self.changes])
-        weights = np.exp(gains - gains.max())
-        return dict(zip((c.label for c in self.changes), (weights / weights.sum()).tolist()))
-
     def __getitem__(self, name: str) -> NoiseChange:
         """Return the result of a place.
 
@@ -224,18 +215,9 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
         free_start: whether the state at the start of the window may be wrong (as when it was fitted to the window).
 
     Raises:
-        DataError: other outputs than the model's.
-        StructureError: several experiments, an onset outside the window, a window that is too long.
+        DataError, StructureError: as `check_window`; no reading sees noise in any of the places.
     """
-    if not isinstance(whitened, Whitened):
-        raise StructureError("The noise test takes the whitened innovations of one experiment: test them one by one.")
-    if whitened.r.shape[1] != found.model.l:
-        raise DataError(f"The window has {whitened.r.shape[1]} outputs; the dictionary is of {found.model.l}.")
-    if onset != int(onset) or not 0 <= onset < len(whitened.r):
-        raise StructureError(f"onset={onset!r} lies outside the window of {len(whitened.r)} samples.")
-    if whitened.r.size > LONGEST:
-        raise StructureError(
-            f"{whitened.r.size} readings are too many for this test ({LONGEST}): use a shorter window.")
+    check_window(found, whitened, onset, "The noise test")
     start = start_matrix(found, whitened) if free_start else np.zeros((whitened.r.size, 0))
     left, sizes, _ = np.linalg.svd(start, full_matrices=False)
     start = left[:, sizes > 1e-8 * max(float(sizes.max(initial=0.0)), 1e-300)]
@@ -279,10 +261,8 @@ def noise_test(
         raise DataError(
             f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "
             f"{int(np.ceil(10 / false_alarm))}, or a higher probability.")
+    check_window(found, whitened, onset, "The noise test")
     prepared = noise_search(found, whitened, onset=onset, free_start=free_start) if search is None else search
-    if not np.isfinite(whitened.r).all():
-        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
-        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
     levels = prepared.healthy(draws, seed) if healthy is None else healthy
     window = whitened.r.reshape(1, -1)
     rho, gains = prepared.gains(window)

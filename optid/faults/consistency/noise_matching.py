@@ -1,12 +1,14 @@
 """Covariances of a window by lag, and what more noise at a place adds to them."""
 
-from dataclasses import dataclass, field
+import sys
+from dataclasses import dataclass
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.noise_changes import noise_places
+from optid.faults.consistency.waveforms import check_window
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Predictor, Whitened
 
@@ -66,7 +68,7 @@ class CovarianceMatch:
     gap: float
     certified: bool
     lags: int
-    status: str = field(default="")
+    status: str = ""
 
     @property
     def best(self) -> str:
@@ -108,20 +110,12 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
         DataError: fewer than ten complete samples for every lag, innovations that are not finite.
         StructureError: lags or an onset that do not fit the window, several experiments, no place.
     """
-    if not isinstance(whitened, Whitened):
-        raise StructureError("Covariances are matched in the innovations of one experiment: take them one by one.")
-    count, l = whitened.r.shape  # noqa: E741
-    if onset != int(onset) or not 0 <= onset < count:
-        raise StructureError(f"onset={onset!r} lies outside the window of {count} samples.")
-    used = count - int(onset)
-    most = max(1, used // 10)
+    check_window(found, whitened, onset, "The match of covariances", sys.maxsize)
+    l, used = whitened.r.shape[1], len(whitened.r) - int(onset)  # noqa: E741
     if lags is None:
-        lags = min(whitened.predictor.settling, most)
+        lags = min(whitened.predictor.settling, max(1, used // 10))
     if lags != int(lags) or not 0 <= lags < used:
         raise StructureError(f"lags={lags!r}; a whole number from 0 to {used - 1} is needed.")
-    if not np.isfinite(whitened.r).all():
-        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
-        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
     places = noise_places(found)
     if not places:
         raise StructureError("The dictionary has no place where noise may grow.")
@@ -135,28 +129,20 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
             raise DataError(
                 f"{pairs} pairs of complete samples at lag {lag} are too few: use a longer window or fewer lags.")
         S = r[lag:][there].T @ r[: used - lag][there] / pairs
-        if lag == 0:  # a variance scatters twice as much as a covariance
-            target.append((S - np.eye(l))[upper])
-            weights.append(np.sqrt(pairs / np.where(upper[0] == upper[1], 2.0, 1.0)))
-        else:
-            target.append(S.ravel())
-            weights.append(np.full(l * l, np.sqrt(pairs)))
-    weight = np.concatenate(weights)
-    n, steady = found.model.nx, whitened.predictor
-    by_process = _entries(steady, np.eye(n), np.zeros((l, n)), int(lags))
-    by_sensor = _entries(steady, np.zeros((n, l)), np.eye(l), int(lags))
-    columns = []
-    for _, candidate in places:
-        own = _entries(steady, candidate.into_state, candidate.into_output, int(lags))
-        d = candidate.into_state.shape[1]
-        columns.append(own @ np.eye(d).ravel())
-    noise = found.model.noise
+        target.append(S.ravel() if lag else (S - np.eye(l))[upper])
+        weights.append(np.full(target[-1].size, np.sqrt(pairs)))
+    weights[0] /= np.sqrt(np.where(upper[0] == upper[1], 2.0, 1.0))  # a variance scatters twice as much
+    weight = np.concatenate(weights)[:, None]
+    n, steady, noise = found.model.nx, whitened.predictor, found.model.noise
+    by_process = weight * _entries(steady, np.eye(n), np.zeros((l, n)), int(lags))
+    by_sensor = weight * _entries(steady, np.zeros((n, l)), np.eye(l), int(lags))
+    columns = [_entries(steady, c.into_state, c.into_output, int(lags)) @ np.eye(c.into_state.shape[1]).ravel()
+               for _, c in places]
     assert noise is not None
     units = [np.maximum(np.diag(c), 1e-6 * max(float(np.trace(c)), 1e-300)) for c in (noise.Q, noise.R)]
     return CovarianceProblem(
-        tuple(label for label, _ in places), weight * np.concatenate(target),
-        weight[:, None] * np.stack(columns, axis=1), weight[:, None] * by_process, weight[:, None] * by_sensor, n, l,
-        units[0], units[1], int(lags))
+        tuple(label for label, _ in places), weight[:, 0] * np.concatenate(target), weight * np.stack(columns, axis=1),
+        by_process, by_sensor, n, l, units[0], units[1], int(lags))
 
 
 def _entries(steady: Predictor, into_state: Array, into_output: Array, lags: int) -> Array:

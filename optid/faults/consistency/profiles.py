@@ -139,7 +139,6 @@ class CourseProblem:
             kept, best = trial, value
         return np.array(kept, dtype=int)
 
-
     def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
         """Move every change to the sample where it explains most beside the others, until none moves.
 

@@ -93,16 +93,6 @@ class WaveformTest:
             raise StructureError("No place was tested.")
         return self.consistent[0] if self.flat else self.places[0].name
 
-    @property
-    def energies(self) -> dict[str, float]:
-        """Energy that is left by place."""
-        return {place.name: place.energy for place in self.places}
-
-    @property
-    def faulty(self) -> bool:
-        """Whether a healthy plant is ruled out at the same probability."""
-        return bool(self.flat) or not self.healthy.consistent
-
     def __getitem__(self, name: str) -> Consistency:
         """Return the result of a place or of a candidate there.
 
@@ -147,10 +137,14 @@ def waveform_test(
         DataError: too few readings for a test, or other outputs than the model's.
         StructureError: one output only, several experiments, a window that is too long.
     """
-    _check(found, whitened, probability, onset)
-    count = whitened.r.size
-    r, readings = whitened.r.ravel(), int(whitened.present.sum())
-    start = start_matrix(found, whitened) if free_start else np.zeros((count, 0))
+    check_probability(probability, "probability")
+    check_window(found, whitened, onset, "The waveform test")
+    if found.model.l < 2:
+        raise StructureError(
+            "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
+            "(bias, drift, loss) can be told apart by the exact search."
+        )
+    start = start_matrix(found, whitened) if free_start else np.zeros((whitened.r.size, 0))
     columns: dict[str, list[Candidate]] = {}
     untested: dict[str, str] = {}
     for candidate in found.candidates:
@@ -164,10 +158,10 @@ def waveform_test(
     places = []
     for name, here in columns.items():
         matrix = waveform_matrix(found, here[0], whitened, onset)
-        places.append(_fitted(name, tuple(c.label for c in here), r, matrix, start, readings, probability,
-                              here[0].into_state.shape[1]))
+        fitted = _fitted(name, matrix, start, whitened, probability, here[0].into_state.shape[1])
+        places.append(fitted._replace(labels=tuple(c.label for c in here)))
     places.sort(key=lambda place: (-place.p_value, place.energy - 2 * place.freedom))
-    healthy = _fitted("healthy", (), r, np.zeros((count, 0)), start, readings, probability, 0)
+    healthy = _fitted("healthy", start[:, :0], start, whitened, probability, 1)
     flat = () if data is None else flat_lines(data)
     return WaveformTest(tuple(places), probability, healthy, onset, untested, flat)
 
@@ -198,35 +192,31 @@ def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened,
 
 def start_matrix(found: Dictionary, whitened: Whitened) -> Array:
     """Return what an error of the state at the start leaves in the window, (N l, n)."""
-    into_state = np.zeros((len(whitened.r), found.model.nx, found.model.nx))
-    into_state[0] = np.eye(found.model.nx)
-    into_output = np.zeros((len(whitened.r), found.model.l, found.model.nx))
-    response = whitened.predictor.respond(into_state, into_output, whitened.present)
+    n, (count, l) = found.model.nx, whitened.r.shape  # noqa: E741
+    into_state = np.zeros((count, n, n))
+    into_state[0] = np.eye(n)
+    response = whitened.predictor.respond(into_state, np.zeros((count, l, n)), whitened.present)
     return np.asarray(whitened.seen(response).reshape(whitened.r.size, -1))
 
 
-def _fitted(name: str, labels: tuple[str, ...], r: Array, matrix: Array, start: Array, readings: int,
-            probability: float, d: int) -> Consistency:
+def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probability: float, d: int) -> Consistency:
     from scipy.special import chdtrc, chdtri
 
-    whole = np.hstack([matrix, start])
+    whole, r, readings = np.hstack([matrix, start]), whitened.r.ravel(), int(whitened.present.sum())
     sizes = np.linalg.norm(whole, axis=0)
     seen = sizes > RANK * max(float(sizes.max(initial=0.0)), 1e-300)
-    course = np.full(matrix.shape[1], np.nan)
-    rank, rest = 0, r
+    course, rank, rest = np.full(whole.shape[1], np.nan), 0, r
     if seen.any():
         axes, solved = _projected(whole[:, seen] / sizes[seen], r)
         rank, rest = axes.shape[1], r - axes @ (axes.T @ r)
-        solved = solved / sizes[seen]
-        own = seen[: matrix.shape[1]]
-        course[own] = solved[: int(own.sum())]
+        course[seen] = solved / sizes[seen]
     freedom = readings - rank
     if freedom < 1:
         raise DataError(
             f"{name}: {readings} readings leave nothing to test a waveform of {rank} values with: use a longer window.")
     energy = float(rest @ rest)
-    return Consistency(name, labels, energy, freedom, float(chdtri(freedom, 1 - probability)),
-                       float(chdtrc(freedom, energy)), course.reshape(-1, max(d, 1)))
+    return Consistency(name, (), energy, freedom, float(chdtri(freedom, 1 - probability)),
+                       float(chdtrc(freedom, energy)), course[: matrix.shape[1]].reshape(-1, d))
 
 
 def _projected(columns: Array, r: Array) -> tuple[Array, Array]:
@@ -250,23 +240,30 @@ def same_place(first: Candidate, second: Candidate) -> bool:
     return parts[0].shape == parts[1].shape and bool(np.allclose(*parts, rtol=1e-12, atol=0))
 
 
-def _check(found: Dictionary, whitened: Whitened, probability: float, onset: int) -> None:
+def check_window(found: Dictionary, whitened: Whitened, onset: int, what: str, longest: int = LONGEST) -> None:
+    """Refuse whitened innovations that a test cannot take.
+
+    Args:
+        found: the candidates.
+        whitened: the window.
+        onset: sample of the window from which something is supposed to have changed.
+        what: the test, for messages.
+        longest: readings of a window at most.
+
+    Raises:
+        StructureError: several experiments, an onset outside the window, a window that is too long.
+        DataError: other outputs than the model's, innovations that are not finite.
+    """
     if not isinstance(whitened, Whitened):
+        raise StructureError(f"{what} takes the whitened innovations of one experiment: test them one by one.")
+    count, outputs = whitened.r.shape
+    if outputs != found.model.l:
+        raise DataError(f"The window has {outputs} outputs; the dictionary is of {found.model.l}.")
+    if onset != int(onset) or not 0 <= onset < count:
+        raise StructureError(f"onset={onset!r} lies outside the window of {count} samples.")
+    if whitened.r.size > longest:
         raise StructureError(
-            "The waveform test takes the whitened innovations of one experiment: test them one by one.")
-    check_probability(probability, "probability")
-    if whitened.r.shape[1] != found.model.l:
-        raise DataError(f"The window has {whitened.r.shape[1]} outputs; the dictionary is of {found.model.l}.")
-    if found.model.l < 2:
-        raise StructureError(
-            "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
-            "(bias, drift, loss) can be told apart by the exact search."
-        )
-    if onset != int(onset) or not 0 <= onset < len(whitened.r):
-        raise StructureError(f"onset={onset!r} lies outside the window of {len(whitened.r)} samples.")
-    if whitened.r.size > LONGEST:
-        raise StructureError(
-            f"{whitened.r.size} readings are too many for this test ({LONGEST}): use a shorter window.")
+            f"{whitened.r.size} readings are too many for this test ({longest}): use a shorter window.")
     if not np.isfinite(whitened.r).all():
         k, o = np.argwhere(~np.isfinite(whitened.r))[0]
         raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")

@@ -19,7 +19,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
-from optid.faults.monitor.columns import Columns, Window, search_matrices
+from optid.faults.monitor.columns import Columns, Window
 from optid.faults.whitening import Predictor
 
 ALARMS = 60
@@ -39,6 +39,9 @@ RUNS = 4
 
 HOLD = 5
 """Samples over which the simulated input keeps its level."""
+
+NODES = 80
+"""Nodes of the quadrature; the run lengths of the usual charts are right to ten digits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,19 +119,9 @@ def calibrate(
             f"Simulate {int(np.ceil(FEWEST * arl0))} samples (samples=), ask for a lower arl0, or let the tail be "
             "extrapolated (extrapolate=True)."
         )
-    largest = maxima(columns, steady, window, f, wanted, seed, effect)
-    q, alarms = equalised(largest, window, arl0)
-    labels = tuple(c.label for c in columns.candidates)
-    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated)
-
-
-def maxima(columns: Columns, steady: Predictor, window: int, f: Array, samples: int, seed: int | None,
-           effect: Array | None = None) -> Array:
-    """Return the largest statistics (B, C) of blocks of W samples of a healthy search."""
     l, period = len(steady.C), max(len(f), 1)  # noqa: E741
-    blocks = max(min(CHUNK, samples) // window, 1)
-    length = blocks * window
-    count = max(1, -(-samples // (RUNS * length)))
+    length = max(min(CHUNK, wanted) // window, 1) * window
+    count = max(1, -(-wanted // (RUNS * length)))
 
     def run(seeds: np.random.SeedSequence) -> Array:
         found, place = [], int(np.random.default_rng(seeds).integers(period))
@@ -144,7 +137,10 @@ def maxima(columns: Columns, steady: Predictor, window: int, f: Array, samples: 
         return np.vstack(found)
 
     with ThreadPoolExecutor(min(RUNS, os.cpu_count() or 1)) as pool:
-        return np.vstack(list(pool.map(run, np.random.SeedSequence(seed).spawn(RUNS))))
+        largest = np.vstack(list(pool.map(run, np.random.SeedSequence(seed).spawn(RUNS))))
+    q, alarms = equalised(largest, window, arl0)
+    labels = tuple(c.label for c in columns.candidates)
+    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated)
 
 
 def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: Array) -> Array:
@@ -157,9 +153,9 @@ def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: 
         f: (T + 1, r) functions of the inputs, from one sample earlier on.
         r: (T, l) whitened innovations.
     """
-    kept = Window(columns, window, len(steady.A), np.eye(len(steady.C)), steady)
-    _, statistic, _ = kept.advance(search_matrices(steady), columns.signals(f[:-1], f[1:]),
-                                   np.ascontiguousarray(r), np.full(len(columns.size), np.inf))
+    kept = Window(columns, window, len(steady.A), steady)
+    _, statistic, _ = kept.advance(columns.signals(f[:-1], f[1:]), np.ascontiguousarray(r),
+                                   np.full(len(columns.size), np.inf))
     count = len(statistic) // window
     return statistic[: count * window].reshape(count, window, -1).max(axis=1)
 
@@ -207,3 +203,37 @@ def held_levels(low: Array, high: Array, count: int, seed: int | None) -> Array:
     """Return inputs (N, m), uniform between two bounds, every level held."""
     drawn = np.random.default_rng(seed).uniform(low, high, (-(-count // HOLD), len(low)))
     return np.repeat(drawn, HOLD, axis=0)[:count]
+
+
+def cusum_arl(shift: float, k: float = 0.5, h: float = 5.0, *, two_sided: bool = True) -> float:
+    """Return the mean number of samples until S = max(0, S + x - k) exceeds h, for x ~ N(shift, 1) and S = 0 at first.
+
+    The integral equation of E. S. Page (Biometrika 41, 1954) is solved by Gauss-Legendre quadrature. The rates of the
+    two sides of a two-sided chart add up (K. W. Kemp, J. R. Stat. Soc. B 23, 1961).
+
+    Args:
+        shift: mean of the samples, in standard deviations; 0 gives the time between false alarms.
+        k: reference value.
+        h: threshold.
+        two_sided: whether -x is charted, too.
+
+    Raises:
+        StructureError: a threshold that is not positive.
+    """
+    if not (np.isfinite(h) and h > 0 and np.isfinite(k) and np.isfinite(shift)):
+        raise StructureError(f"shift={shift!r}, k={k!r}, h={h!r}: finite numbers and a positive threshold are needed.")
+    rate = 1 / _one_sided(shift, k, h)
+    return 1 / (rate + 1 / _one_sided(-shift, k, h)) if two_sided else 1 / rate
+
+
+def _one_sided(shift: float, k: float, h: float) -> float:
+    from scipy.special import ndtr
+
+    nodes, weights = np.polynomial.legendre.leggauss(NODES)
+    nodes, weights = (nodes + 1) * h / 2, weights * h / 2
+    starts = np.concatenate([[0.0], nodes])  # the sum may stay at zero, which has a probability of its own
+    kernel = np.empty((starts.size, starts.size))
+    kernel[:, 0] = ndtr(k - starts - shift)
+    step = nodes[None, :] - starts[:, None] + k - shift
+    kernel[:, 1:] = weights * np.exp(-(step**2) / 2) / np.sqrt(2 * np.pi)
+    return float(np.linalg.solve(np.eye(starts.size) - kernel, np.ones(starts.size))[0])

@@ -1,7 +1,6 @@
 """The decisions of a monitor: alarm, name, carry, clear."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -69,8 +68,9 @@ class Decisions:
         """(C,) energies at which the search must stop for a decision."""
         return self.q if self.phase == WATCHING else np.zeros(len(self.q))
 
-    def waits(self, now: int) -> bool:
-        """Whether the samples from now on can be searched as a block."""
+    @property
+    def waiting(self) -> bool:
+        """Whether the next samples can be searched as a block."""
         return self.phase == WATCHING and not self.passing
 
     def count_quiet(self, statistic: Array) -> None:
@@ -80,26 +80,18 @@ class Decisions:
 
     def excitation(self, weight: Array, now: int, window: int) -> list[Event]:
         """Return what becomes testable or untestable along weights (T, C) of samples from `now` on."""
-        events = []
-        for k, c in enumerate(self.columns.candidates):
-            if c.additive:
+        events, samples = [], now + np.arange(len(weight))
+        for c, candidate in enumerate(self.columns.candidates):
+            if candidate.additive:
                 continue
-            line = weight[:, k]
-            full = (line >= 0) & (now + np.arange(len(line)) - self.begun >= window)
-            for t in np.flatnonzero(full & np.where(self.testable[k], line < self.q[k], line > 1.2 * self.q[k])):
-                if self.testable[k] and line[t] < self.q[k]:
-                    self.testable[k] = False
-                    events.append(Event("untestable", now + int(t), ((self.labels[k], 1.0),),
-                                        now + int(t) - window + 1, (), float(line[t])))
-                elif not self.testable[k] and line[t] > 1.2 * self.q[k]:
-                    self.testable[k] = True
-                    events.append(Event("testable", now + int(t), ((self.labels[k], 1.0),), None, (), float(line[t])))
-            if full.any() and not self.testable[k]:  # later samples of the block, after a change of the flag
-                back = np.flatnonzero(full & (line > 1.2 * self.q[k]))
-                last = next((e.sample for e in reversed(events) if e.candidates[0][0] == self.labels[k]), now - 1)
-                for t in back[back + now > last][:1]:
-                    self.testable[k] = True
-                    events.append(Event("testable", now + int(t), ((self.labels[k], 1.0),), None, (), float(line[t])))
+            line, label = weight[:, c], ((self.labels[c], 1.0),)
+            clear = (line < self.q[c]) | (line > 1.2 * self.q[c])
+            at = np.flatnonzero(clear & (line >= 0) & (samples - self.begun >= window))
+            enough = line[at] > self.q[c]
+            for t in at[enough != np.concatenate([self.testable[[c]], enough])[:-1]].tolist():
+                self.testable[c] = line[t] > self.q[c]
+                events.append(Event("testable", now + t, label, statistic=float(line[t])) if self.testable[c] else
+                              Event("untestable", now + t, label, now + t - window + 1, statistic=float(line[t])))
         return sorted(events, key=lambda e: e.sample)
 
     def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
@@ -112,22 +104,21 @@ class Decisions:
             hold: whether nothing may be named yet, because a sensor repeats its reading.
         """
         gains = np.where(window.peak > 0, window.statistic - self.q, -np.inf)
-        best = int(np.argmax(gains))
-        if self.phase == WATCHING:
-            if gains[best] > 0:
-                self.phase, self.alarm = NAMING, now
-                return self._event("alarm", now, best, gains, window)
+        best, watching = int(np.argmax(gains)), self.phase == WATCHING
+        if self.phase in (WATCHING, LOST) and gains[best] > 0:
+            self.phase, self.alarm = NAMING, now
+            return self._event("alarm", now, best, gains, window) if watching else None
+        if watching:
             return self._review(now, window, plant)
         if not np.isfinite(gains[best]):
             return None
         if self.phase == LOST:
-            if gains[best] > 0:
-                self.phase, self.alarm = NAMING, now
-            elif self.quiet >= self.rules["still"]:
-                self.phase, self.named = WATCHING, NOTHING
-                return Event("cleared", now)
-            return None
+            return self._clear(now) if self.quiet >= self.rules["still"] else None
         return None if hold else self._name(now, best, gains, window, plant)
+
+    def _clear(self, now: int) -> Event:
+        self.phase, self.named = WATCHING, NOTHING
+        return Event("cleared", now)
 
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
         rule = self.rules
@@ -140,8 +131,7 @@ class Decisions:
             late = waited >= rule["patience"] or (waited >= rule["settle"] and old + rule["settle"] >= window.length)
             testable = self.columns.candidates[best].additive or self.testable[best]
             if self.quiet >= rule["still"] or (late and gains[best] <= 0):
-                self.phase, self.named = WATCHING, NOTHING
-                return Event("cleared", now)
+                return self._clear(now)
             if not late and not (sure and gains[best] > 0 and free >= 4 and testable):
                 return None
         else:
@@ -149,8 +139,7 @@ class Decisions:
                 return None
             chosen = best if sure else self.named
             if window.peak[chosen] == 0:
-                self.phase, self.named = WATCHING, NOTHING
-                return Event("cleared", now)
+                return self._clear(now)
             odd, free = self._left_over(chosen, window)
         if odd > rule["odd"]:
             return self._lost(now, chosen, window)
@@ -161,9 +150,13 @@ class Decisions:
         left = plant.carry(chosen, window)
         if np.isfinite(left):
             self.passing.append([chosen, now + _fading(plant, left, rule["faded"])])
+        self.forgive(window)
+        return None
+
+    def forgive(self, window: Window) -> None:
+        """Watch from the next sample on, as if there had been no alarm."""
         window.restart()
         self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
-        return None
 
     def _lost(self, now: int, best: int, window: Window) -> Event | None:
         said, onset = self.named == AGAIN, now - int(window.peak[best]) + 1
@@ -224,22 +217,14 @@ class Decisions:
             sizes, covariance = plant.held[own] + whole @ plant.x[at], whole @ plant.P[np.ix_(at, at)] @ whole.T
             energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
             if energy < self.rules["forgiven"] * self.q[owner]:
-                for p in reversed(rows):
-                    plant.forget(p, window, keep=False)
-                plant.release(own)
+                plant.release(rows, own, window)
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
             left = sum(window.length * plant.directions[p].power * plant.P[n + p, n + p] for p in rows)
             seen = min(plant.directions[p].age for p in rows) >= window.length
             if seen and 0 < left < self.rules["learned"]:
                 for p in reversed(rows):
-                    plant.forget(p, window, keep=True)
+                    plant.forget(p, window)
         return None
-
-    def excuse(self, onset: int, now: int, window: Window) -> None:
-        """Take back an alarm that a sensor raised which has been found frozen."""
-        if self.phase != WATCHING and now - int(window.peak.max(initial=0)) + 1 <= now and self.alarm >= onset:
-            self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
-        window.restart()
 
 
 def _fading(plant: RunningFilter, energy: float, faded: float) -> int:
@@ -256,21 +241,16 @@ def noisy_sensor(window: Window, count: int) -> tuple[int, float]:
     More noise of one sensor makes the whitened innovations larger along one direction alone, the others stay as they
     are.
     """
-    r = window.recent(count)
+    r, root = window.recent(count), window.steady.root
     l, best, found, factor = r.shape[1], 0.0, -1, 1.0  # noqa: E741
     if len(r) < 4:
         return found, factor
     total = float(np.sum(r**2))
-    for o, direction in enumerate(window.directions):
-        along = float(np.sum((r @ direction) ** 2))
+    for o, alongside in enumerate((r @ (root / np.linalg.norm(root, axis=0))).T):
+        along = float(np.sum(alongside**2))
         share, free = along / len(r), (l - 1) * len(r)
         rest = ((total - along) / free) ** (1 / 3) - 1 + 2 / (9 * free) if l > 1 else 0.0
         gain = len(r) * (share - 1 - np.log(share)) if share > 1 else 0.0
         if gain > best and rest < 4.3 * np.sqrt(2 / (9 * max(free, 1))):
             best, found, factor = gain, o, float(np.sqrt(share))
     return (found, factor) if best > 12 else (-1, 1.0)
-
-
-def kept(decisions: Decisions) -> dict[str, Any]:
-    """Return the state of the decisions in JSON types."""
-    return {**{name: getattr(decisions, name) for name in Decisions.KEPT}, "testable": decisions.testable.tolist()}

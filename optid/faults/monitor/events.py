@@ -60,3 +60,8 @@ class Carried:
     label: str
     size: tuple[float, ...]
     deviation: tuple[float, ...]
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        sizes = ", ".join(f"{size:.4g} +- {spread:.2g}" for size, spread in zip(self.size, self.deviation))
+        return f"carried: {self.label}, size {sizes}"

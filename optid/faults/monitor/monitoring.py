@@ -14,7 +14,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.monitor.arl import Calibration, calibrate, held_levels
-from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of, search_matrices
+from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
 from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect
@@ -59,21 +59,10 @@ class Monitor:
     """
 
     def __init__(
-        self,
-        model: "HammersteinSS",
-        faults: Dictionary | None = None,
-        arl0: float = 10_000,
-        window: int = 100,
-        seed: int | None = 0,
-        thresholds: Any = None,
-        *,
-        x0: Any = "unknown",
-        healthy: Data | None = None,
-        uncertainty: Data | ModelUncertainty | None = None,
-        u: ArrayLike | None = None,
-        samples: int | None = None,
-        extrapolate: bool = False,
-        **rules: float,
+        self, model: "HammersteinSS", faults: Dictionary | None = None, arl0: float = 10_000, window: int = 100,
+        seed: int | None = 0, thresholds: Any = None, *, x0: Any = "unknown", healthy: Data | None = None,
+        uncertainty: Data | ModelUncertainty | None = None, u: ArrayLike | None = None, samples: int | None = None,
+        extrapolate: bool = False, **rules: float,
     ) -> None:
         """Set up a monitor; the thresholds are simulated unless they are known.
 
@@ -129,14 +118,14 @@ class Monitor:
             self.calibration = self._given(thresholds, arl0)
         else:
             f = self._rehearsed(u) if inputs is None else inputs
-            self.calibration = self._simulated(f, arl0, samples, extrapolate, effect)
+            self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
                 self.calibration = calibrated_on(self, healthy, self.calibration)
         self.decisions.q = self.calibration.q
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
         elif not (isinstance(x0, str) and x0 == "zero"):
-            self.plant.x[: model.nx] = state_like(x0, (model.nx,))
+            self.plant.x[:] = state_like(x0, (model.nx,))
 
     def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float]) -> None:
         """Set up everything but the thresholds."""
@@ -156,32 +145,25 @@ class Monitor:
                 "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first."
             )
         self.columns = columns_of(model, chosen)
-        n, widest = model.nx, int(self.columns.size.max())
-        directions = steady.root / np.linalg.norm(steady.root, axis=0)
-        self.search = Window(self.columns, window, n + SPARE + 2 * widest, directions.T.copy(), steady)
-        self.plant = RunningFilter(model, steady, self.columns, np.zeros(n), np.zeros((n, n)),
-                                   np.zeros(self.columns.count), np.zeros(model.B.shape[1]))
+        self.search = Window(self.columns, window, model.nx + SPARE + 2 * int(self.columns.size.max()), steady)
+        self.plant = RunningFilter(model, steady, self.columns)
         self.checks = ReadingChecks(model)
         self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), rules, model.outputs,
                                    np.ones(len(chosen), dtype=bool), [])
         self.samples = 0
-        self._functions, self._input_of = tabulated(model.nonlinearities), np.array(model.input_of, dtype=np.int64)
-        self._output_of = np.array(model.output_of, dtype=np.int64)
-        self._steady = search_matrices(steady)
+        self._functions = tabulated(model.nonlinearities)
+        self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
 
-    def _simulated(
-        self, f: Array, arl0: float, samples: int | None, extrapolate: bool, effect: Array | None
-    ) -> Calibration:
-        c = self.columns
-        key = hashlib.sha256(repr((self.labels, float(arl0), samples, self.seed, extrapolate, self.window)).encode())
-        moving = [part for pair in c.losses for part in pair]
-        moving += [] if effect is None else [effect]
-        for part in (f, c.into_state, c.into_output, c.course, *moving, *self._steady):
+    def _simulated(self, f: Array, effect: Array | None, arl0: float, **how: Any) -> Calibration:
+        c, steady = self.columns, self.dictionary.predictor
+        key = hashlib.sha256(repr((self.labels, float(arl0), self.seed, self.window, how)).encode())
+        losses = [part for pair in c.losses for part in pair]
+        for part in (f, np.array([]) if effect is None else effect, c.into_state, c.into_output, c.course, *losses,
+                     *self.search.matrices):
             key.update(np.ascontiguousarray(part).tobytes())
         name = key.hexdigest()
         if name not in _KNOWN:
-            _KNOWN[name] = calibrate(c, self.dictionary.predictor, self.window, f, arl0, samples=samples,
-                                     seed=self.seed, extrapolate=extrapolate, effect=effect)
+            _KNOWN[name] = calibrate(c, steady, self.window, f, arl0, seed=self.seed, effect=effect, **how)
         return _KNOWN[name]
 
     def _given(self, thresholds: Any, arl0: float) -> Calibration:
@@ -222,11 +204,7 @@ class Monitor:
     # -- samples -------------------------------------------------------------------------------------------------
 
     def step(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
-        """Take in one sample; NaN is a missing value.
-
-        Args:
-            u: (m,) inputs.
-            y: (l,) readings.
+        """Take in one sample, (m,) inputs and (l,) readings; NaN is a missing value.
 
         Raises:
             DataError: another number of channels, or an infinite value.
@@ -244,11 +222,7 @@ class Monitor:
         return self._take_in(*rows)
 
     def run(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
-        """Take in a block of samples, with the same result as `step` for each of them.
-
-        Args:
-            u: (N, m) inputs.
-            y: (N, l) readings.
+        """Take in a block of inputs (N, m) and readings (N, l), with the same result as `step` for each sample.
 
         Raises:
             DataError: other channels than the model's, unequal lengths, or an infinite value.
@@ -258,28 +232,24 @@ class Monitor:
                 for part, names, what in ((u, model.inputs, "u"), (y, model.outputs, "y")))
         if len(u) != len(y):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
-        events: list[Event] = []
-        for start in range(0, len(u), BLOCK):
-            events += self._take_in(u[start : start + BLOCK], y[start : start + BLOCK])
-        return events
+        return [event for start in range(0, len(u), BLOCK)
+                for event in self._take_in(u[start : start + BLOCK], y[start : start + BLOCK])]
 
     def _take_in(self, u: Array, y: Array) -> list[Event]:
         start, count = self.samples, len(u)
-        f = self._expanded(u)
-        screened = self.checks.screen(u, y, start)
-        fed = self._fed(screened.y)
-        missing = np.isnan(screened.y).any(axis=1) | screened.unsure.any(axis=1)
-        stops = np.flatnonzero(missing | screened.repeating | np.isin(np.arange(count), list(screened.frozen)))
-        events, k = list(screened.events), 0
-        unsure = screened.unsure[:, self._input_of]
+        f, screened = self._expanded(u), self.checks.screen(u, y, start)
+        y, fed, unsure = screened.y, self._fed(screened.y), screened.unsure[:, self._input_of]
+        frozen = np.isin(np.arange(count), list(screened.frozen))
+        alone = np.isnan(y).any(axis=1) | screened.unsure.any(axis=1) | screened.repeating | frozen
+        stops, events, k = np.append(np.flatnonzero(alone), count), list(screened.events), 0
         while k < count:
-            clean = int(stops[np.searchsorted(stops, k)]) if stops.size and k <= stops[-1] else count
-            if clean > k and self.plant.certain and self.decisions.waits(start + k):
-                k += self._search_block(f[k:clean], fed[k:clean], screened.y[k:clean], events)
+            clean = int(stops[np.searchsorted(stops, k)])
+            if clean > k and self.plant.certain and self.decisions.waiting:
+                k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
                 continue
             if k in screened.frozen:
-                self._excuse(screened.frozen[k], start + k)
-            self._search_sample(f[k], fed[k], screened.y[k], unsure[k], screened.repeating[k], events)
+                self._excuse(screened.frozen[k])
+            self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
             k += 1
         return sorted(events, key=lambda e: e.sample)
 
@@ -287,45 +257,45 @@ class Monitor:
         """Search samples by the steady predictor until a decision is due; return how many."""
         plant, decisions, now = self.plant, self.decisions, self.samples
         x, r = plant.run(f, fed, y)
-        before = np.vstack([plant.before, f[:-1]])
-        moving = self.columns.signals(before, f)
-        done, statistic, weight = self.search.advance(self._steady, moving, r, decisions.limit)
+        moving = self.columns.signals(np.vstack([plant.before, f[:-1]]), f)
+        done, statistic, weight = self.search.advance(moving, r, decisions.limit)
         plant.x, plant.before = x[done].copy(), f[done - 1].copy()
         self.samples += done
         decisions.count_quiet(statistic)
         last = decisions.judge(self.samples - 1, self.search, plant, hold=False)
         events += decisions.excitation(weight if last is None else weight[:-1], now, self.window)
-        if last is not None:
-            events.append(last)
+        events += [] if last is None else [last]
         return done
 
     def _search_sample(self, f: Array, fed: Array, y: Array, unsure: np.ndarray, repeating: bool, events: list[Event]
                        ) -> None:
         plant, decisions, now = self.plant, self.decisions, self.samples
         used = np.where(np.isnan(f), plant.before, f)
-        moving = self.columns.signals(plant.before[None], used[None])
+        moving, limit = self.columns.signals(plant.before[None], used[None]), np.full(len(self.labels), np.inf)
         if plant.certain and not (np.isnan(y).any() or unsure.any()):
             x, r = plant.run(used[None], fed[None], y[None])
             plant.x, plant.before = x[1].copy(), used.copy()
-            parts, white, shown = self._steady, r, None
+            _, statistic, weight = self.search.advance(moving, r, limit)
         else:
-            innovation, parts = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
-            white, shown = innovation[None], int(np.count_nonzero(~np.isnan(y)))
-        _, statistic, weight = self.search.advance(parts, moving, white, np.full(len(self.labels), np.inf), shown)
+            innovation, matrices = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
+            _, statistic, weight = self.search.advance(moving, innovation[None], limit, matrices,
+                                                       int(np.count_nonzero(~np.isnan(y))))
         self.samples += 1
         if unsure.any():
             decisions.begun = now + 1
         decisions.count_quiet(statistic)
         watching = decisions.phase == WATCHING
-        event = decisions.judge(now, self.search, plant, hold=bool(repeating))
-        if event is None and watching and decisions.phase == WATCHING:
-            events += decisions.excitation(weight, now, self.window)
+        event = decisions.judge(now, self.search, plant, hold=repeating)
         if event is not None:
             events.append(event)
+        elif watching and decisions.phase == WATCHING:
+            events += decisions.excitation(weight, now, self.window)
 
-    def _excuse(self, onset: int, now: int) -> None:
+    def _excuse(self, onset: int) -> None:
         """Forget what a sensor did that has been found frozen."""
-        self.decisions.excuse(onset, now, self.search)
+        if self.decisions.phase != WATCHING and self.search.peak.any() and self.decisions.alarm >= onset:
+            self.decisions.forgive(self.search)
+        self.search.restart()
         self.plant.lose()
 
     def _expanded(self, u: Array) -> Array:
@@ -349,12 +319,8 @@ class Monitor:
     def __str__(self) -> str:
         """Say what is looked for, what the thresholds rest on, what was seen, and what is carried."""
         lines = [f"{self.samples} samples seen, window {self.window}" + ", in alarm" * self.alarmed]
-        lines.append(str(self.calibration))
-        lines += [f"  not monitored: {label}" for label in self.skipped]
-        for fault in self.carried:
-            sizes = ", ".join(f"{size:.4g} +- {spread:.2g}" for size, spread in zip(fault.size, fault.deviation))
-            lines.append(f"carried: {fault.label}, size {sizes}")
-        return "\n".join(lines)
+        lines += [str(self.calibration), *(f"  not monitored: {label}" for label in self.skipped)]
+        return "\n".join([*lines, *map(str, self.carried)])
 
     # -- what is known now ---------------------------------------------------------------------------------------
 
@@ -372,19 +338,17 @@ class Monitor:
     @property
     def carried(self) -> tuple[Carried, ...]:
         """The faults that were named and are accounted for."""
-        plant, n, found = self.plant, self.dictionary.model.nx, []
+        plant, size, found = self.plant, self.plant.held.copy(), []
+        variance = np.zeros(len(size))
+        for at, one in enumerate(plant.directions, self.dictionary.model.nx):
+            if self.columns.course[one.column] != DRIFT or one.growth > 0:
+                size[one.column] += plant.x[at]
+                variance[one.column] += plant.P[at, at]
         for number, label in enumerate(self.labels):
             own = self.columns.of(number)
-            size, variance = plant.held[own].copy(), np.zeros(own.stop - own.start)
-            mine = [p for p, one in enumerate(plant.directions) if one.owner == number]
-            for p in mine:
-                one = plant.directions[p]
-                if self.columns.course[one.column] != DRIFT or one.growth > 0:
-                    size[one.column - own.start] += plant.x[n + p]
-                    variance[one.column - own.start] += plant.P[n + p, n + p]
-            if mine or size.any():
-                spread = self.columns.in_order(number, np.sqrt(variance))
-                found.append(Carried(label, self.columns.in_order(number, size), spread))
+            if size[own].any() or any(one.owner == number for one in plant.directions):
+                found.append(Carried(label, *(self.columns.in_order(number, part[own])
+                                              for part in (size, np.sqrt(variance)))))
         return tuple(found)
 
     @property

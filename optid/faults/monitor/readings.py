@@ -1,7 +1,6 @@
 """What the readings themselves show before any search: dead and frozen sensors, inputs outside the identified range."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +21,7 @@ MARGIN = 0.02
 """Share of the identified range by which an input may leave it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Screened:
+class Screened(NamedTuple):
     """A block of samples after the checks.
 
     Attributes:
@@ -41,56 +39,42 @@ class Screened:
     frozen: dict[int, int]
 
 
-@dataclass(eq=False)
 class ReadingChecks:
     """Checks of one stream.
 
     Attributes:
         model: the plant.
         low, high: (m,) identified range of the inputs, infinite where none is known.
-        memory: numbers that a saved monitor keeps.
+        memory: numbers that a saved monitor keeps, by sensor, and where inputs left their range.
     """
 
-    model: HammersteinSS
-    low: Array = field(init=False)
-    high: Array = field(init=False)
-    memory: dict[str, Any] = field(init=False)
-
-    def __post_init__(self) -> None:
-        m, l = self.model.m, self.model.l  # noqa: E741
-        self.low, self.high = np.full(m, -np.inf), np.full(m, np.inf)
-        for c, function in zip(self.model.input_of, self.model.nonlinearities):
-            interval = function.basis.interval
-            if interval is not None:
-                self.low[c], self.high[c] = max(self.low[c], interval[0]), min(self.high[c], interval[1])
+    def __init__(self, model: HammersteinSS) -> None:
+        """Begin a stream."""
+        m, l = model.m, model.l  # noqa: E741
+        self.model, self.low, self.high = model, np.full(m, -np.inf), np.full(m, np.inf)
+        for c, function in zip(model.input_of, model.nonlinearities):
+            low, high = function.basis.interval or (-np.inf, np.inf)
+            self.low[c], self.high[c] = max(self.low[c], low), min(self.high[c], high)
         room = MARGIN * np.where(np.isfinite(self.high - self.low), self.high - self.low, 0.0)
         self.low, self.high = self.low - room, self.high + room
-        self.memory = {"last": [None] * l, "run": [0] * l, "repeats": [0] * l, "seen": [0] * l, "frozen": [False] * l,
-                       "missing": [0] * l, "outside": [-1] * m}
+        self.memory: dict[str, Any] = {"last": [None] * l, "frozen": [False] * l, "outside": [-1] * m}
+        self.memory |= {word: [0] * l for word in ("run", "repeats", "seen", "missing")}
 
     def screen(self, u: Array, y: Array, start: int) -> Screened:
-        """Check a block.
-
-        Args:
-            u: (T, m) inputs.
-            y: (T, l) readings.
-            start: sample of the stream at which it begins.
-        """
-        outside = (u < self.low) | (u > self.high)
-        events: list[Event] = []
+        """Check a block of inputs (T, m) and readings (T, l) that begins at the sample `start` of the stream."""
+        outside, blind = np.asarray((u < self.low) | (u > self.high)), np.isnan(u)
+        found = Screened(y.copy(), outside | blind, np.zeros(len(y), dtype=bool), [], {})
         for c in range(u.shape[1]):
-            self._range(c, u[:, c], outside[:, c], start, events)
-        y, frozen = y.copy(), dict[int, int]()
-        repeating, blind = np.zeros(len(y), dtype=bool), np.asarray(np.isnan(u).any(axis=1))
+            self._range(c, u[:, c], outside[:, c], start, found.events)
         for o in range(y.shape[1]):
-            self._sensor(o, y[:, o], blind, start, repeating, events, frozen)
-        return Screened(y, outside | np.isnan(u), repeating, sorted(events, key=lambda e: e.sample), frozen)
+            self._sensor(o, blind.any(axis=1), start, found)
+        found.events.sort(key=lambda e: e.sample)
+        return found
 
     def _range(self, c: int, u: Array, outside: np.ndarray, start: int, events: list[Event]) -> None:
-        since = self.memory["outside"]
+        since, name = self.memory["outside"], (("input:" + self.model.inputs[c], 1.0),)
         if since[c] < 0 and not outside.any():
             return
-        name = (("input:" + self.model.inputs[c], 1.0),)
         for k in range(len(u)):
             if outside[k] and since[c] < 0:
                 since[c] = start + k
@@ -100,43 +84,44 @@ class ReadingChecks:
                 events.append(Event("inside", start + k, name, since[c]))
                 since[c] = -1
 
-    def _sensor(self, o: int, y: Array, blind: np.ndarray, start: int, repeating: np.ndarray, events: list[Event],
-                frozen: dict[int, int]) -> None:
-        own = self.memory
-        before = np.concatenate([[np.nan if own["last"][o] is None else own["last"][o]], y[:-1]])
-        if not (own["run"][o] or own["missing"][o] or own["frozen"][o] or np.isnan(y).any() or np.any(y == before)):
-            own["seen"][o] += len(y)
-            own["last"][o] = float(y[-1]) if len(y) else own["last"][o]
+    def _sensor(self, o: int, blind: np.ndarray, start: int, found: Screened) -> None:
+        own = {word: values[o] for word, values in self.memory.items() if word != "outside"}
+        y, name = found.y[:, o], f"sensor:{self.model.outputs[o]}"
+        before = np.concatenate([[np.nan if own["last"] is None else own["last"]], y[:-1]])
+        if not (own["run"] or own["missing"] or own["frozen"] or np.isnan(y).any() or np.any(y == before)):
+            self.memory["seen"][o] += len(y)
+            self.memory["last"][o] = float(y[-1]) if len(y) else own["last"]
             return
-        name = f"sensor:{self.model.outputs[o]}"
+
+        def tell(kind: str, what: str, onset: int | None = None, note: str = "") -> None:
+            found.events.append(Event(kind, now, ((f"{name} {what}", 1.0),), onset, note=note))
+
         for k, value in enumerate(y.tolist()):
             now = start + k
             if np.isnan(value):
-                own["missing"][o] += not blind[k]
-                if own["missing"][o] == DEAD and not blind[k]:
-                    events.append(_named(name + " dead", now, now - DEAD + 1, f"no reading for {DEAD} samples"))
+                own["missing"] += int(not blind[k])
+                if own["missing"] == DEAD and not blind[k]:
+                    tell("isolated", "dead", now - DEAD + 1, f"no reading for {DEAD} samples")
                 continue
-            if own["missing"][o] >= DEAD:
-                events.append(Event("cleared", now, ((name + " dead", 1.0),)))
-            own["missing"][o] = 0
-            if value == own["last"][o]:
-                own["run"][o] += 1
-                repeating[k] = True
-                most = max(FROZEN - 1, np.log(CHANCE) / np.log((own["repeats"][o] + 1) / (own["seen"][o] + 2)))
-                if not own["frozen"][o] and own["run"][o] >= most:
-                    own["frozen"][o], onset = True, now - own["run"][o]
-                    events.append(_named(name + " frozen", now, onset, f"{own['run'][o] + 1} identical readings"))
-                    frozen[k] = min(onset, frozen.get(k, onset))
-                if own["frozen"][o]:
+            if own["missing"] >= DEAD:
+                tell("cleared", "dead")
+            own["missing"] = 0
+            if value == own["last"]:
+                own["run"] += 1
+                found.repeating[k] = True
+                most = max(FROZEN - 1, np.log(CHANCE) / np.log((own["repeats"] + 1) / (own["seen"] + 2)))
+                if not own["frozen"] and own["run"] >= most:
+                    own["frozen"], onset = True, now - own["run"]
+                    tell("isolated", "frozen", onset, f"{own['run'] + 1} identical readings")
+                    found.frozen[k] = min(onset, found.frozen.get(k, onset))
+                if own["frozen"]:
                     y[k] = np.nan
                 continue
-            if own["frozen"][o]:
-                events.append(Event("cleared", now, ((name + " frozen", 1.0),)))
+            if own["frozen"]:
+                tell("cleared", "frozen")
             else:
-                own["repeats"][o] += own["run"][o]
-                own["seen"][o] += own["run"][o] + 1
-            own["run"][o], own["frozen"][o], own["last"][o] = 0, False, value
-
-
-def _named(label: str, sample: int, onset: int, note: str) -> Event:
-    return Event("isolated", sample, ((label, 1.0),), onset, note=note)
+                own["repeats"] += own["run"]
+                own["seen"] += own["run"] + 1
+            own["run"], own["frozen"], own["last"] = 0, False, value
+        for word, value in own.items():
+            self.memory[word][o] = value

@@ -7,15 +7,16 @@ steady predictor, the plant is x+ = A x + ... + K e, y = C x + ... + e, whose st
 the steady predictor as soon as nothing else is uncertain.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
+from optid.faults.kernels import add_product
 from optid.faults.monitor.columns import SPARE, Columns, Matrices, Window
-from optid.faults.monitor.search_kernel import DRIFT, JUMP, add_product, predict
+from optid.faults.monitor.search_kernel import DRIFT, JUMP
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
@@ -49,7 +50,6 @@ class Direction:
     deviation: Any = 0.0
 
 
-@dataclass(eq=False)
 class RunningFilter:
     """State of the plant and of what is carried, before the next sample.
 
@@ -63,22 +63,19 @@ class RunningFilter:
         held: (D,) magnitudes that are known well and no longer estimated.
         before: (r,) functions of the inputs of the sample before.
         certain: whether the steady predictor is exact.
+        strength: energy that a state of unit size leaves in one innovation, at most.
     """
 
-    model: HammersteinSS
-    steady: Predictor
-    columns: Columns
-    x: Array
-    P: Array
-    held: Array
-    before: Array
-    directions: list[Direction] = field(default_factory=list)
-    certain: bool = True
+    KEPT = "x", "P", "held", "before"
 
-    @property
-    def strength(self) -> float:
-        """Energy that a state of unit size leaves in one innovation, at most."""
-        return float(np.max(np.sum((self.steady.root @ self.steady.C) ** 2, axis=0), initial=1e-300))
+    def __init__(self, model: HammersteinSS, steady: Predictor, columns: Columns) -> None:
+        """Begin with a state that is known to be zero."""
+        self.model, self.steady, self.columns = model, steady, columns
+        self.x, self.P = np.zeros(model.nx), np.zeros((model.nx, model.nx))
+        self.held, self.before = np.zeros(len(columns.course)), np.zeros(model.B.shape[1])
+        self.directions: list[Direction] = []
+        self.certain = True
+        self.strength = float(np.max(np.sum((steady.root @ steady.C) ** 2, axis=0), initial=1e-300))
 
     def lose(self) -> None:
         """From the next sample on the state is unknown."""
@@ -87,14 +84,13 @@ class RunningFilter:
         self.P[:n, :n] = WIDE / self.strength * np.eye(n)
         self.certain = False
 
-    def additions(self, before: Array, f: Array) -> tuple[Array, Array]:
-        """Return what held faults add to the state (T, n) and to the output (T, l)."""
-        model, count = self.model, len(f)
-        into_state, into_output = np.zeros((count, model.nx)), np.zeros((count, model.l))
+    def additions(self, f: Array) -> tuple[Array, Array]:
+        """Return what held faults add to the next state (T, n) and to the output (T, l)."""
+        into_state, into_output = (np.zeros((len(f), size)) for size in (self.model.nx, self.model.l))
         for j in np.flatnonzero(self.held):
             number = self.columns.driven[j]
             if number >= 0:
-                add_product(self.held[j] * self.columns.losses[number][0], before, into_state)
+                add_product(self.held[j] * self.columns.losses[number][0], f, into_state)
                 add_product(self.held[j] * self.columns.losses[number][1], f, into_output)
             else:
                 into_state += self.held[j] * self.columns.into_state[j]
@@ -109,21 +105,7 @@ class RunningFilter:
             fed: (T, s) functions of the outputs.
             y: (T, l) readings.
         """
-        model, steady = self.model, self.steady
-        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
-        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
-                                       (model.D, f, direct)):
-            if matrix.any():
-                add_product(np.ascontiguousarray(matrix), signal, target)
-        if self.held.any():
-            into_state, into_output = self.additions(f, f)
-            drive += into_state  # what the inputs of this sample add to the next state
-            direct += into_output
-        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
-        x[0] = self.x
-        predict(np.ascontiguousarray(model.A), np.ascontiguousarray(model.C), np.ascontiguousarray(steady.K),
-                np.ascontiguousarray(steady.root), drive, y, direct, x, r)
-        return x, r
+        return self.steady.run(self.model, self.x, f, fed, y, self.additions(f) if self.held.any() else None)
 
     def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
         """Take in one sample; return the whitened innovation (l,) and the matrices of the search.
@@ -135,8 +117,7 @@ class RunningFilter:
             unsure: (r,) functions of the inputs of which nothing is known at this sample.
         """
         model, steady, n, q = self.model, self.steady, self.model.nx, len(self.directions)
-        there = np.flatnonzero(~np.isnan(y))
-        lost = np.where(np.isnan(y), model.L, 0.0)
+        there, lost = np.flatnonzero(~np.isnan(y)), np.where(np.isnan(y), model.L, 0.0)
         _, shift = self.columns.units(self.before, f)
         later, _ = self.columns.units(f, f)
         H, J = np.zeros((model.l, q)), np.zeros((n, q))
@@ -144,7 +125,7 @@ class RunningFilter:
             H[:, p] = shift[one.column] * one.grown
             one.grown += one.growth
             J[:, p] = later[one.column] * one.grown
-        held_state, held_output = (part[0] for part in self.additions(f[None], f[None]))
+        held_state, held_output = (part[0] for part in self.additions(f[None]))
         C = np.hstack([model.C, H])
         predicted = C @ self.x + model.D @ f + model.offset_y + held_output
         A = np.zeros((n + q, n + q))
@@ -175,7 +156,6 @@ class RunningFilter:
             r[there] = inverse @ innovation
             x += gain[:, there] @ innovation
         forget, left = drift - gain @ C, noise - gain
-        left[:, np.isnan(y)] = noise[:, np.isnan(y)]
         blind = into - gain @ onto
         self.P = forget @ self.P @ forget.T + left @ steady.covariance @ left.T + (blind * spread) @ blind.T
         self.P = (self.P + self.P.T) / 2
@@ -196,61 +176,53 @@ class RunningFilter:
     def carry(self, number: int, window: Window) -> float:
         """Correct the state by the estimate of a candidate and carry it; return the energy left in the state alone."""
         sizes, covariance, whole = window.estimate(number)
-        n, q, own = self.model.nx, len(self.directions), self.columns.of(number)
-        moved = whole[: n + q]
+        n, q, own, grown = self.model.nx, len(self.directions), self.columns.of(number), int(window.peak[number])
+        kind, moved = self.columns.course[own.start], whole[: n + q]
+        drifting, jump, course = kind == DRIFT, kind == JUMP, grown + 1.0 if kind == DRIFT else 1.0
+        energy = self.strength * float(np.sum((moved[:n] @ sizes) ** 2)) if jump else np.inf
+        if not jump:
+            later, _ = self.columns.units(self.before, self.before)
+            moved[:n] += course * later[own].T  # at the next sample
         self.x = self.x + moved @ sizes
-        grown = window.peak[number]
-        jump = self.columns.course[own.start] == JUMP
         self.P = self.P + moved @ covariance @ moved.T
         self.certain = False
-        if jump:
-            return self.strength * float(np.sum((moved[:n] @ sizes) ** 2))
-        later, _ = self.columns.units(self.before, self.before)
-        drifting = self.columns.course[own.start] == DRIFT
-        columns = list(range(own.start, own.stop))
-        course = float(grown + 1) if drifting else 1.0
-        added = np.zeros_like(moved)
-        added[:n] = course * later[own].T
-        self.x = self.x + added @ sizes
-        self.P = self.P + (moved @ covariance @ added.T) + (added @ covariance @ moved.T) + added @ covariance @ added.T
-        self._append(number, columns, sizes, covariance, moved + added, 1.0 if drifting else 0.0, course)
+        if not jump:
+            self._append(number, own, sizes, covariance, moved, float(drifting), course)
         if drifting:  # an onset that is a little off leaves a constant
             self.P[n + q :, n + q :] *= 4.0
             guess = np.diag(np.diag(covariance)) * (2.0 * grown) ** 2
-            constant = np.vstack([self._constant(own, int(grown)), np.zeros((q + len(sizes), len(sizes)))])
+            constant = np.vstack([self._constant(own, grown), np.zeros((q + len(sizes), len(sizes)))])
             self.P = self.P + constant @ guess @ constant.T
-            self._append(number, columns, np.zeros(len(sizes)), guess, constant, 0.0, 1.0)
-        return np.inf
+            self._append(number, own, np.zeros(len(sizes)), guess, constant, 0.0, 1.0)
+        return energy
 
-    def _append(self, number: int, columns: list[int], sizes: Array, covariance: Array, moved: Array, growth: float,
+    def _append(self, number: int, own: slice, sizes: Array, covariance: Array, moved: Array, growth: float,
                 grown: float) -> None:
         cross = moved @ covariance
         self.P = np.block([[self.P, cross], [cross.T, covariance]])
         self.x = np.concatenate([self.x, sizes])
-        self.directions += [Direction(number, j, growth, grown) for j in columns]
+        self.directions += [Direction(number, j, growth, grown) for j in range(own.start, own.stop)]
 
     def _constant(self, own: slice, count: int) -> Array:
         """What constants in the place of columns have done to the state after some samples of the steady predictor."""
         steady, jolt, shift = self.steady, self.columns.into_state[own].T, self.columns.into_output[own].T
-        moved = jolt.copy()
+        moved = jolt
         for _ in range(count):
-            moved = steady.A @ moved - steady.K @ (steady.C @ moved + shift) + jolt
+            moved = steady.F @ moved - steady.K @ shift + jolt
         return moved
 
-    def forget(self, p: int, window: Window | None, *, keep: bool) -> None:
-        """Stop estimating a constant; its estimate is held, or taken out."""
+    def forget(self, p: int, window: Window | None) -> None:
+        """Stop estimating a constant; its estimate is held."""
         n, one = self.model.nx, self.directions.pop(p)
-        if keep:
-            self.held[one.column] += self.x[n + p] * one.grown
-        else:
-            later, _ = self.columns.units(self.before, self.before)
-            self.x[:n] -= later[one.column] * one.grown * self.x[n + p]
+        self.held[one.column] += self.x[n + p] * one.grown
         self.x, self.P = np.delete(self.x, n + p), np.delete(np.delete(self.P, n + p, 0), n + p, 1)
         if window is not None:
             window.drop(n + p)
 
-    def release(self, own: slice) -> None:
-        """Stop accounting for the held magnitudes of columns."""
+    def release(self, rows: list[int], own: slice, window: Window) -> None:
+        """Stop accounting for columns, estimated in some rows of the constants or held."""
+        for p in reversed(rows):
+            self.forget(p, window)
         later, _ = self.columns.units(self.before, self.before)
         self.x[: self.model.nx] -= self.held[own] @ later[own]
         self.held[own] = 0.0
@@ -259,4 +231,4 @@ class RunningFilter:
         """Hold the oldest constants until so many new ones find room."""
         most = SPARE + 2 * int(self.columns.size.max()) - count
         while len(self.directions) > most:
-            self.forget(0, None, keep=True)
+            self.forget(0, None)

@@ -13,9 +13,9 @@ Nothing is said where the inputs do not move: behind every verdict stands what a
 same window. Open loop is assumed: under feedback inputs depend on sensor noise, and rows of dead sensors are not zero.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from textwrap import wrap
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array, check_integer, check_probability, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.faults.rank.order_power import Positions, coefficients, least_order
-from optid.faults.rank.zero_tests import ZeroTest, smallest_excitation, zero_test
+from optid.faults.rank.window_tests import ZeroTest, coefficients, least_order, smallest_excitation, zero_test
 from optid.identify.order.ranks import RankTest, rank_test
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 
@@ -71,6 +70,11 @@ class WindowVerdict:
     moving: frozenset[str] = frozenset()
     least_order: int = 0
 
+    @property
+    def tests(self) -> tuple[ZeroTest, ...]:
+        """Those of the sensors, then those of the actuators."""
+        return (*self.rows, *self.columns)
+
     def changed(self, nominal: int) -> bool:
         """Whether the order is another one than a healthy plant of the nominal order would show."""
         return self.order is not None and not min(self.least_order, nominal) <= self.order <= nominal
@@ -89,7 +93,7 @@ class WindowVerdict:
     @property
     def untestable(self) -> tuple[str, ...]:
         """Channels of which this window can say nothing."""
-        return tuple(test.name for test in (*self.rows, *self.columns) if not test.testable)
+        return tuple(test.name for test in self.tests if not test.testable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,40 +178,19 @@ class HardOver:
         return words
 
     def __str__(self) -> str:
-        names = [test.name for test in (*self.windows[0].rows, *self.windows[0].columns)]
-        lines = ["statistic / threshold of each channel; up to 1 is dead, - is untestable"]
-        shown = [name if len(name) <= 13 else name[:12] + "." for name in names][:4]
-        lines.append(f"{'samples':<15}{'order':>6}" + "".join(f"{name:>14}" for name in shown))
+        """Print the first four channels of every window, and what was found."""
+        names = [test.name for test in self.windows[0].tests[:4]]
+        shown = "".join(f"{name if len(name) <= 13 else name[:12] + '.':>14}" for name in names)
+        lines = ["statistic / threshold of each channel; up to 1 is dead, - is untestable",
+                 f"{'samples':<15}{'order':>6}{shown}"]
         for verdict in self.windows:
-            tests = [*verdict.rows, *verdict.columns][:4]
-            cells = "".join(f"{f'{t.ratio:.3g}' if t.testable else '-':>14}" for t in tests)
+            cells = "".join(f"{f'{t.ratio:.3g}' if t.testable else '-':>14}" for t in verdict.tests[:4])
             order = "-" if verdict.order is None else verdict.order
             lines.append(f"{f'{verdict.start}-{verdict.stop - 1}':<15}{order:>6}{cells}")
-        from textwrap import wrap
-
         return "\n".join([*lines, *wrap(self.explain(), 80)])
 
 
-@dataclass(frozen=True, eq=False)
-class _Layout:
-    """Positions of the signals [f(u) | y] in windows of 3 alpha samples."""
-
-    inputs: tuple[tuple[int, ...], ...]
-    p: int
-    l: int  # noqa: E741 - the field's letter
-    alpha: int
-
-    @property
-    def all(self) -> range:
-        return range(self.p)
-
-    @property
-    def y(self) -> range:
-        return range(self.p, self.p + self.l)
-
-
-@dataclass(frozen=True, eq=False)
-class _Healthy:
+class _Healthy(NamedTuple):
     """What a healthy record shows: order, coefficients of all outputs, sizes, excitation, coefficients of the tests."""
 
     order: int
@@ -219,17 +202,9 @@ class _Healthy:
 
 
 def hard_over_test(
-    data: Data,
-    healthy: Data,
-    *,
-    model: "HammersteinSS | None" = None,
-    order: int | None = None,
-    window: int | None = None,
-    hop: int | None = None,
-    block_rows: int = BLOCK_ROWS,
-    instruments: str = "inputs",
-    level: float = LEVEL,
-    white_sensors: bool = True,
+    data: Data, healthy: Data, *, model: "HammersteinSS | None" = None, order: int | None = None,
+    window: int | None = None, hop: int | None = None, block_rows: int = BLOCK_ROWS, instruments: str = "inputs",
+    level: float = LEVEL, white_sensors: bool = True,
 ) -> HardOver:
     """Test a record for dead sensors and actuators, window by window.
 
@@ -264,133 +239,120 @@ def hard_over_test(
     if window < least or hop < 1:
         raise StructureError(f"window={window}, hop={hop}: a window of at least {least} samples (20 per block row and "
                              "output) and a hop of at least 1 are needed.")
-    layout = _layout(data, model, int(block_rows))
-    nominal = _reference(_signals(healthy, model), layout, healthy, order, instruments)
-    found = []
-    for e, record in enumerate(_signals(data, model)):
+    tests = _Tests(data, model, int(block_rows), instruments, level)
+    nominal, found = tests.reference(healthy, order), []
+    for e, record in enumerate(tests.signals(data)):
         for start in range(0, len(record) - window + 1, hop):
-            verdict = _judged(record[start : start + window], layout, nominal, data, instruments, level,
-                              (e, start, start + window))
+            verdict = tests.judge(record[start : start + window], nominal, (e, start, start + window))
             found.append(verdict if white_sensors else replace(verdict, moving=frozenset()))
     if not found:
         raise RankError(f"No experiment has the {window} samples of a window: shorten it or take fewer block rows.")
-    return HardOver(tuple(found), nominal.order, window, hop, layout.alpha, instruments, data.name)
+    return HardOver(tuple(found), nominal.order, window, hop, tests.alpha, instruments, data.name)
 
 
-def _layout(data: Data, model: "HammersteinSS | None", alpha: int) -> _Layout:
-    if model is None:
-        return _Layout(tuple((i,) for i in range(data.m)), data.m, data.l, alpha)
-    if model.feedback:
-        raise StructureError("The model feeds outputs back: this test is for plants in open loop.")
-    if (model.inputs, model.outputs) != (data.inputs, data.outputs):
-        raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
-    groups = tuple(tuple(c for c, i in enumerate(model.input_of) if i == j) for j in range(data.m))
-    return _Layout(groups, len(model.input_of), data.l, alpha)
+class _Tests:
+    """The tests of windows of 3 alpha samples of the signals [f(u) | y], and their positions among them."""
 
+    def __init__(self, data: Data, model: "HammersteinSS | None", alpha: int, instruments: str, level: float) -> None:
+        if model is not None and model.feedback:
+            raise StructureError("The model feeds outputs back: this test is for plants in open loop.")
+        if model is not None and (model.inputs, model.outputs) != (data.inputs, data.outputs):
+            raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
+        self.model, self.alpha, self.instruments, self.level = model, alpha, instruments, level
+        self.input_of = range(data.m) if model is None else model.input_of
+        self.u = range(len(self.input_of))
+        self.y = range(len(self.u), len(self.u) + data.l)
+        self.channels = (*(data.inputs[i] for i in self.input_of), *data.outputs)
+        self.sensors, self.actuators = ([f"{place}:{c}" for c in names] for place, names in
+                                        (("sensor", data.outputs), ("actuator", data.inputs)))
 
-def _signals(data: Data, model: "HammersteinSS | None") -> Iterator[Array]:
-    for e in data.experiments:
-        yield np.hstack([e.u if model is None else model.expanded(e.u), e.y])
+    def signals(self, data: Data) -> list[Array]:
+        return [np.hstack([e.u if self.model is None else self.model.expanded(e.u), e.y]) for e in data.experiments]
 
-
-def _reference(
-    records: Iterator[Array], layout: _Layout, data: Data, order: int | None, instruments: str
-) -> _Healthy:
-    alpha = layout.alpha
-    statistics = hankel_statistics(list(records), 3 * alpha, centre="mean")
-    statistics.check()
-    mean = statistics.gram[0] / statistics.windows
-    sizes = np.sqrt(np.maximum(np.diag(statistics.gram) / statistics.windows - mean**2, 0))
-    for c, size in enumerate(sizes[1 : 1 + statistics.d]):
-        if not size > 0:
-            channel = (*(data.inputs[i] for i, g in enumerate(layout.inputs) for _ in g), *data.outputs)[c]
-            raise RankError(f"{channel} does not move in the healthy record: take one in which every channel does.")
-    every = statistics.at(layout.all, range(2 * alpha))
-    excitation = smallest_excitation(statistics, every, sizes[every])
-    if excitation < 1e-10:
-        raise RankError(f"the inputs of the healthy record do not excite {2 * alpha} block rows (smallest eigenvalue "
-                        f"{excitation:.1e}): use richer inputs or fewer block rows.")
-    z, phi, y = _positions(statistics, layout, instruments)
-    if order is None:
-        order = _rank(statistics, z, phi, y, layout, sizes, LEVEL).order
-    rows, columns, _ = _tests(statistics, layout, data, sizes, None, LEVEL)
-    return _Healthy(order, coefficients(statistics, z, y), sizes, excitation, tuple(t for _, t in rows),
-                    tuple(t for _, t in columns))
-
-
-def _judged(
-    record: Array, layout: _Layout, nominal: _Healthy, data: Data, instruments: str, level: float,
-    place: tuple[int, int, int],
-) -> WindowVerdict:
-    alpha = layout.alpha
-    names = [f"sensor:{c}" for c in data.outputs], [f"actuator:{c}" for c in data.inputs]
-    nothing = [tuple(ZeroTest(name, float("nan"), float("nan"), float("nan"), 0.0) for name in kind) for kind in names]
-    try:
-        statistics = hankel_statistics([record], 3 * alpha, centre="mean", method="gram")
+    def reference(self, healthy: Data, order: int | None) -> _Healthy:
+        statistics = hankel_statistics(self.signals(healthy), 3 * self.alpha, centre="mean")
         statistics.check()
-    except RankError as error:
-        return WindowVerdict(*place, None, str(error), float("nan"), nothing[0], nothing[1])
-    every = statistics.at(layout.all, range(2 * alpha))
-    excitation = smallest_excitation(statistics, every, nominal.sizes[every]) / nominal.excitation
-    rows, columns, moving = _tests(statistics, layout, data, nominal.sizes, nominal, level)
-    order, least, note = None, 0, f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"
-    if excitation >= STILL:
-        z, phi, y = _positions(statistics, layout, instruments)
+        mean = statistics.gram[0] / statistics.windows
+        sizes = np.sqrt(np.maximum(np.diag(statistics.gram) / statistics.windows - mean**2, 0))
+        for channel, size in zip(self.channels, sizes[1:]):
+            if not size > 0:
+                raise RankError(f"{channel} does not move in the healthy record: take one in which every channel does.")
+        excitation = self.excitation(statistics, sizes)
+        if excitation < 1e-10:
+            raise RankError(f"the inputs of the healthy record do not excite {2 * self.alpha} block rows (smallest "
+                            f"eigenvalue {excitation:.1e}): use richer inputs or fewer block rows.")
+        z, _, y = self.positions(statistics)
+        if order is None:
+            order = self.rank(statistics, sizes, LEVEL).order
+        rows, columns, _ = self.channel_tests(statistics, sizes, None, LEVEL)
+        theta = (tuple(coefficients for _, coefficients in part) for part in (rows, columns))
+        return _Healthy(order, coefficients(statistics, z, y), sizes, excitation, *theta)
+
+    def judge(self, record: Array, nominal: _Healthy, place: tuple[int, int, int]) -> WindowVerdict:
         try:
-            test = _rank(statistics, z, phi, y, layout, nominal.sizes, level)
+            statistics = hankel_statistics([record], 3 * self.alpha, centre="mean", method="gram")
+            statistics.check()
         except RankError as error:
-            note = f"untestable: {error}"
-        else:
-            order, note = test.order, test.reason
-            least = least_order(statistics, z, phi, nominal.outputs, test, nominal.order, nominal.sizes[y])
-    return WindowVerdict(*place, order, note, excitation, tuple(t for t, _ in rows), tuple(t for t, _ in columns),
-                         moving, least)
+            nothing = (tuple(ZeroTest(name, *3 * (np.nan,), healthy=0.0) for name in names)
+                       for names in (self.sensors, self.actuators))
+            return WindowVerdict(*place, None, str(error), float("nan"), *nothing)
+        excitation = self.excitation(statistics, nominal.sizes) / nominal.excitation
+        rows, columns, moving = self.channel_tests(statistics, nominal.sizes, nominal, self.level)
+        order, least = None, 0
+        note = f"untestable: smallest eigenvalue of the inputs {excitation:.1e} of the healthy one"
+        if excitation >= STILL:
+            z, phi, y = self.positions(statistics)
+            try:
+                test = self.rank(statistics, nominal.sizes, self.level)
+            except RankError as error:
+                note = f"untestable: {error}"
+            else:
+                order, note = test.order, test.reason
+                least = least_order(statistics, z, phi, nominal.outputs, test, nominal.order, nominal.sizes[y])
+        return WindowVerdict(*place, order, note, excitation, tuple(t for t, _ in rows), tuple(t for t, _ in columns),
+                             moving, least)
 
+    def excitation(self, statistics: HankelStatistics, sizes: Array) -> float:
+        every = statistics.at(self.u, range(2 * self.alpha))
+        return smallest_excitation(statistics, every, sizes[every])
 
-def _positions(statistics: HankelStatistics, layout: _Layout, instruments: str
-               ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Instruments, regressors and outputs of the order test."""
-    alpha, at = layout.alpha, statistics.at
-    z = [np.zeros(1, dtype=np.intp), at(layout.all, range(2 * alpha))]
-    if instruments == "inputs+past":
-        z.append(at(layout.y, range(alpha)))
-    phi = np.concatenate([np.zeros(1, dtype=np.intp), at(layout.all, range(alpha, 2 * alpha))])
-    return np.concatenate(z), phi, at(layout.y, range(alpha, 2 * alpha))
+    def positions(self, statistics: HankelStatistics) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+        """Instruments, regressors and outputs of the order test."""
+        at, past, future = statistics.at, range(self.alpha), range(self.alpha, 2 * self.alpha)
+        z = np.r_[0, at(self.u, range(2 * self.alpha)), at(self.y if self.instruments == "inputs+past" else [], past)]
+        return z, np.r_[0, at(self.u, future)], at(self.y, future)
 
+    def rank(self, statistics: HankelStatistics, sizes: Array, level: float) -> RankTest:
+        z, phi, y = self.positions(statistics)
+        return rank_test(statistics, z, phi, y, rows=2 * self.alpha, level=level,
+                         largest=(self.alpha - 1) * len(self.y), scale=sizes[y])
 
-def _rank(
-    statistics: HankelStatistics, z: Positions, phi: Positions, y: NDArray[np.intp], layout: _Layout, sizes: Array,
-    level: float,
-) -> RankTest:
-    return rank_test(statistics, z, phi, y, rows=2 * layout.alpha, level=level, largest=(layout.alpha - 1) * layout.l,
-                     scale=sizes[y])
+    def channel_tests(
+        self, statistics: HankelStatistics, sizes: Array, nominal: _Healthy | None, level: float
+    ) -> tuple[list[tuple[ZeroTest, Array]], list[tuple[ZeroTest, Array]], frozenset[str]]:
+        """Row tests, column tests, and the sensors that move by themselves."""
+        alpha, at, rows, columns, moving = self.alpha, statistics.at, [], [], set()
+        past, future, now, until = range(alpha), range(alpha, 2 * alpha), [alpha], range(alpha + 1)
 
+        def test(tested: NDArray[np.intp], others: NDArray[np.intp], y: NDArray[np.intp], name: str,
+                 theta: Array | None) -> tuple[ZeroTest, Array]:
+            return zero_test(statistics, tested, others, y, rows=2 * alpha, level=level, name=name, scale=sizes[y],
+                             coefficients=theta)
 
-def _tests(
-    statistics: HankelStatistics, layout: _Layout, data: Data, sizes: Array, nominal: _Healthy | None, level: float
-) -> tuple[list[tuple[ZeroTest, Array]], list[tuple[ZeroTest, Array]], frozenset[str]]:
-    """Row tests, column tests, and the sensors that move by themselves."""
-    alpha, at = layout.alpha, statistics.at
-    past, future, now = range(alpha), range(alpha, 2 * alpha), range(alpha, alpha + 1)
-    every = at(layout.all, range(2 * alpha))
-    rows, columns, moving = [], [], set()
-    for i, (s, channel) in enumerate(zip(layout.y, data.outputs)):
-        name, y = f"sensor:{channel}", at([s], future)
-        rows.append(zero_test(statistics, every, [0], y, rows=2 * alpha, level=level, name=name, scale=sizes[y],
-                              coefficients=None if nominal is None else nominal.rows[i]))
-        own = zero_test(statistics, at([s], past), np.concatenate([[0], every]), at([s], now), rows=2 * alpha,
-                        level=level, scale=sizes[at([s], now)])[0]
-        if own.statistic > own.threshold:
-            moving.add(name)
-    seen = [i for i, (test, _) in enumerate(rows) if not test.flat]  # flat sensors tell nothing of actuators
-    y = at([layout.y[i] for i in seen], now)
-    for j, (group, channel) in enumerate(zip(layout.inputs, data.inputs)):
-        if not seen:
-            columns.append((ZeroTest(f"actuator:{channel}", *3 * (float("nan"),), healthy=0.0), np.zeros((0, 0))))
-            continue
-        others = [c for c in layout.all if c not in group]
-        rest = np.concatenate([[0], at(others, range(alpha + 1)), at(layout.y, past)])
-        columns.append(zero_test(statistics, at(group, range(alpha + 1)), rest, y, rows=2 * alpha, level=level,
-                                 name=f"actuator:{channel}", scale=sizes[y],
-                                 coefficients=None if nominal is None else nominal.columns[j][:, seen]))
-    return rows, columns, frozenset(moving)
+        every = at(self.u, range(2 * alpha))
+        for i, (s, name) in enumerate(zip(self.y, self.sensors)):
+            rows.append(test(every, np.zeros(1, dtype=np.intp), at([s], future), name,
+                             None if nominal is None else nominal.rows[i]))
+            own, _ = test(at([s], past), np.r_[0, every], at([s], now), name, None)
+            if own.statistic > own.threshold:
+                moving.add(name)
+        seen = [i for i, (row, _) in enumerate(rows) if not row.flat]  # flat sensors tell nothing of actuators
+        for j, name in enumerate(self.actuators):
+            if not seen:
+                columns.append((ZeroTest(name, *3 * (np.nan,), healthy=0.0), np.zeros((0, 0))))
+                continue
+            group, others = ([c for c in self.u if (self.input_of[c] == j) == own] for own in (True, False))
+            columns.append(test(at(group, until), np.r_[0, at(others, until), at(self.y, past)],
+                                at([self.y[i] for i in seen], now), name,
+                                None if nominal is None else nominal.columns[j][:, seen]))
+        return rows, columns, frozenset(moving)

@@ -1,4 +1,4 @@
-"""Is a group of coefficients zero? Wald tests on windows of a record, with the serial correlation of the windows.
+"""Tests on windows of a record with the serial correlation of the windows: zero coefficients, and missing orders.
 
 With [o; t; y] the rows of a Hankel matrix, regress y on o and t. Let z_t be the part of the tested rows t that the
 others o do not explain, normalised, and e_t the residuals of y, normalised. If the coefficients of t are zero,
@@ -8,6 +8,11 @@ others o do not explain, normalised, and e_t the residuals of y, normalised. If 
 is nearly g chi2_h / j, with g and h from the covariances of e and z at every lag at which windows overlap
 (`optid.identify.order.ranks`). If they are Theta instead, T grows by |C_z^(1/2) Theta C_e^(-1/2)|^2: with Theta of a
 healthy record this says whether a test on another record can tell anything at all.
+
+The order test accepts an order k when the sum T(k) of the squared singular values of R22 = L31 Q2 after the first k is
+no more than noise. On a healthy plant the outputs are Pi times the instruments and noise, with Pi the same on every
+record. With L11 and Q2 of a window, Pi L11 Q2 is what its R22 would be without noise. Where the squares after the first
+k fall short of the threshold, the window is too short or too quiet to reject the order k, and no failure is to blame.
 """
 
 from collections.abc import Sequence
@@ -17,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.identify.order.ranks import lagged_covariances, moments_of_sum
+from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum
 from optid.statistics.hankel import HankelStatistics
 
 Positions = Sequence[int] | NDArray[np.intp]
@@ -29,7 +34,7 @@ QUIET = 1e-7
 """Residuals relative to the spread of the healthy output that count as rounding."""
 
 MARGIN = 3.0
-"""A test counts only where a healthy channel would exceed its threshold this many times."""
+"""A test counts, and an order is rejected, only where a healthy plant would exceed the threshold this many times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +74,8 @@ class ZeroTest:
 
 
 def zero_test(
-    statistics: HankelStatistics,
-    tested: Positions,
-    others: Positions,
-    outputs: Positions,
-    *,
-    rows: int,
-    level: float,
-    name: str = "",
-    scale: Array | None = None,
-    coefficients: Array | None = None,
+    statistics: HankelStatistics, tested: Positions, others: Positions, outputs: Positions, *, rows: int, level: float,
+    name: str = "", scale: Array | None = None, coefficients: Array | None = None,
 ) -> tuple[ZeroTest, Array]:
     """Test whether the coefficients of some rows are zero.
 
@@ -151,3 +148,38 @@ def _regressed(gram: Array, on: NDArray[np.intp], of: NDArray[np.intp], size: Ar
     scaled = gram[np.ix_(on, on)] / np.outer(size[on], size[on])
     inverse = np.linalg.pinv(scaled, rcond=1e-13, hermitian=True)
     return inverse @ (gram[np.ix_(on, of)] / size[on][:, None]) / size[on][:, None]
+
+
+def coefficients(statistics: HankelStatistics, instruments: Positions, outputs: Positions) -> Array:
+    """Return Pi (y, z), the regression of the outputs on the instruments."""
+    z = np.asarray(instruments, dtype=np.intp)
+    triangle = statistics.triangle(np.concatenate([z, np.asarray(outputs, dtype=np.intp)]))
+    scale = np.maximum(np.linalg.norm(triangle[: z.size, : z.size], axis=0), 1e-300)
+    return np.linalg.lstsq(triangle[: z.size, : z.size] / scale, triangle[: z.size, z.size :], rcond=1e-13)[0].T / scale
+
+
+def least_order(
+    statistics: HankelStatistics, instruments: Positions, regressors: Positions, healthy: Array, test: RankTest,
+    order: int, scale: Array,
+) -> int:
+    """Return the order that a healthy plant would show at least on a window.
+
+    Args:
+        statistics: moments of the window.
+        instruments: positions of z, the regressors among them.
+        regressors: positions of phi.
+        healthy: Pi (y, z) of a healthy record.
+        test: the test of the window.
+        order: of the healthy plant.
+        scale: (y,) sizes of the outputs.
+    """
+    z, phi = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors))
+    triangle = statistics.triangle(z) / np.sqrt(statistics.windows)
+    place = {int(position): c for c, position in enumerate(z)}
+    basis = np.linalg.qr(triangle[:, [place[int(p)] for p in phi]], mode="complete")[0]
+    expected = (healthy @ triangle.T @ basis[:, phi.size :]) / scale[:, None]
+    squares = np.linalg.svd(expected, compute_uv=False)[:order] ** 2
+    tails = np.cumsum(squares[::-1])[::-1]
+    count = min(order, tails.size, test.thresholds.size)
+    sure = tails[:count] > np.maximum(MARGIN * test.thresholds[:count], test.floor**2)
+    return count if sure.all() else int(np.argmin(sure))
