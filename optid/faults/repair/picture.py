@@ -100,7 +100,7 @@ def _attainable(ax: Axes, found: "Reformulation", shown: "tuple[MemberModel, ...
     if before is not None:
         _outline(ax, before, MUTED, "before", "--")
     for member, colour in zip(shown, COLOURS):
-        if member.allocation is not None and member.allocation.problem is not None:
+        if member.allocation is not None and member.allocation.problem.linear:
             _outline(ax, member.allocation, colour, "now" if len(shown) == 1 else shorten(member.label, 20), "-")
     ax.set(title="outputs that can be held", xlabel=plain(shorten(names[0])), ylabel=plain(shorten(names[1])))
     if ax.get_legend_handles_labels()[0]:
