@@ -10,129 +10,137 @@ v: the bounds of the inputs are those of v, and u = f^-1(v) keeps them. A stuck 
 * both with several members that stand for what may be broken: the same v for all, the worst of them made least
   (min-max), each a plant with its own gains and constants in the v of the healthy nonlinearities.
 * with ``norm``: ‖S v_k‖ <= limit, a limit that actuators share (a pump, a power supply); a second-order cone.
+* with ``equations``: in the inputs u themselves, as `formulations.faults.reallocation_nlp` does it.
 
-Named variables: ``v``, ``x``, ``y`` (``x[i]``, ``y[i]`` of member i), ``worst`` where there are several.
+Named variables: ``v``, ``x``, ``y`` (``x[i]``, ``y[i]`` of member i), ``worst`` where there are several, and ``u``.
 """
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
 from optid.faults.repair.allocation_problem import AllocationProblem, Member
-from optid.program.program import Program, Values
+from optid.program.program import Program
 from optid.program.view import View
 
 TIE = 1e-8
 """Weight of the distance of v from the middle of its range, to decide between resting points of the same outputs."""
 
+Equations = Callable[[AllocationProblem, Any, Any, Any], dict[str, tuple[Any, ...]]]
+"""(problem, u, v, y) -> the constraints that tie v to u and y, with u and v (r,) or (horizon, r)."""
 
-def target(problem: AllocationProblem, *, reference: Any, constraints: Sequence[Any] = ()) -> Program:
+
+def target(problem: AllocationProblem, *, reference: Any, equations: Equations | None = None,
+           constraints: Sequence[Any] = ()) -> Program:
     """Pose the resting point nearest to a reference.
 
     Args:
         problem: what is left of the plant.
         reference: (l,) outputs wanted.
+        equations: what ties v to the inputs u, which are then variables, too; without them v is free in its bounds.
         constraints: builders of further constraints in v, x and y.
     """
     r = np.asarray(reference, dtype=float)
-    v = cp.Variable(problem.columns, name="v")
-    variables: dict[str, cp.Variable] = {"v": v}
-    structural: dict[str, tuple[Any, ...]] = {}
-    costs = []
-    for number, member in enumerate(problem.members):
-        label = f"[{number + 1}]" if len(problem.members) > 1 else ""
+    v, structural, costs = cp.Variable(problem.columns, name="v"), {}, []
+    variables = {"v": v}
+    for label, member in _labelled(problem):
         x = variables[f"x{label}"] = cp.Variable(member.A.shape[0], name=f"x{label}")
         y = variables[f"y{label}"] = cp.Variable(member.C.shape[0], name=f"y{label}")
         structural[f"rest{label}"] = (x == member.A @ x + member.B @ v + member.d,)
         structural[f"outputs{label}"] = (y == member.C @ x + member.D @ v + member.c,)
         costs.append(cp.sum_squares(cp.multiply(problem.weights, y - r)))
-    tie = TIE * problem.tie(r) * cp.sum_squares((v - problem.middle) / problem.half)
-    return _posed("allocation.target", problem, variables, structural, costs, tie, v, constraints,
-                  float(np.sum((problem.weights * (r - problem.rest()[1])) ** 2)))
+    middle = problem.middle if equations is None else (problem.u_low + problem.u_high) / 2
+    return _posed("allocation.target", problem, variables, structural, costs, TIE * problem.scale, middle, r,
+                  equations, constraints, {})
 
 
-def track(problem: AllocationProblem, *, reference: Any, states: Sequence[Any], goal: Any, horizon: int = 40,
-          effort: float = 1e-3, rates: Any = None, previous: Any = None, constraints: Sequence[Any] = ()) -> Program:
-    """Pose the control of a horizon from given states; reference, states and goal are parameters of the programme.
+def track(problem: AllocationProblem, *, reference: Any, states: Sequence[Any], goal: Any, rests: Any = None,
+          horizon: int = 40, effort: float = 1e-3, rates: Any = None, previous: Any = None,
+          equations: Equations | None = None, constraints: Sequence[Any] = ()) -> Program:
+    """Pose the control of a horizon; reference, states, goal, rests and previous are parameters of the programme.
 
     Args:
         problem: what is left of the plant.
         reference: (l,) outputs wanted.
         states: (n,) of every member.
-        goal: (columns,) v of the resting point.
+        goal: v (r,) of the resting point, or its u (m,) with equations.
+        rests: (n,) state of every member there; that of v by default.
         horizon: samples.
-        effort: weight of ((v - goal) / half its range)².
-        rates: (low, high), each (horizon, columns): bounds of the steps of v; None for none.
-        previous: (columns,) v of the sample before, where there are rates.
+        effort: weight of ((v - goal) / half its range)², of u with equations.
+        rates: (m,) largest steps of u; None for none; with equations.
+        previous: (m,) u of the sample before, where there are rates.
+        equations: as in `target`.
         constraints: builders of further constraints.
     """
-    v = cp.Variable((horizon, problem.columns), name="v")
-    variables: dict[str, cp.Variable] = {"v": v}
-    parameters: dict[str, cp.Parameter] = {
-        "reference": cp.Parameter(problem.weights.size, value=np.asarray(reference, dtype=float), name="reference"),
-        "goal": cp.Parameter(problem.columns, value=np.asarray(goal, dtype=float), name="goal"),
-    }
-    structural: dict[str, tuple[Any, ...]] = {}
-    costs: list[Any] = []
-    start = problem.rest()[1]
-    for number, (member, state) in enumerate(zip(problem.members, states, strict=True)):
-        label = f"[{number + 1}]" if len(problem.members) > 1 else ""
-        n, outputs = member.A.shape[0], member.C.shape[0]
-        x = variables[f"x{label}"] = cp.Variable((horizon + 1, n), name=f"x{label}")
-        y = variables[f"y{label}"] = cp.Variable((horizon, outputs), name=f"y{label}")
-        x0 = parameters[f"state{label}"] = cp.Parameter(n, value=np.asarray(state, dtype=float), name=f"state{label}")
-        rest = parameters[f"rest{label}"] = cp.Parameter(n, value=member.rest_state(np.asarray(goal)),
-                                                         name=f"rest{label}")
-        ones = np.ones((horizon, 1))
+    parameters: dict[str, cp.Parameter] = {}
+
+    def given(name: str, value: Any) -> cp.Parameter:
+        value = np.asarray(value, dtype=float)
+        return parameters.setdefault(name, cp.Parameter(value.shape, value=value, name=name))
+
+    wanted, goal = given("reference", reference), given("goal", goal)
+    v, structural, costs = cp.Variable((horizon, problem.columns), name="v"), {}, []
+    variables, ones = {"v": v}, np.ones((horizon, 1))
+    if rests is None:
+        rests = [member.rest_state(np.asarray(goal.value)) for member in problem.members]
+    for (label, member), state, rest in zip(_labelled(problem), states, rests, strict=True):
+        x = variables[f"x{label}"] = cp.Variable((horizon + 1, member.A.shape[0]), name=f"x{label}")
+        y = variables[f"y{label}"] = cp.Variable((horizon, member.C.shape[0]), name=f"y{label}")
         structural[f"dynamics{label}"] = (
-            x[0] == x0, x[1:] == x[:-1] @ member.A.T + v @ member.B.T + ones @ member.d[None, :],
+            x[0] == given(f"state{label}", state),
+            x[1:] == x[:-1] @ member.A.T + v @ member.B.T + ones @ member.d[None, :],
         )
         structural[f"outputs{label}"] = (y == x[:-1] @ member.C.T + v @ member.D.T + ones @ member.c[None, :],)
-        wanted = cp.vstack([parameters["reference"]] * horizon)
-        cost = cp.sum_squares(cp.multiply(ones @ problem.weights[None, :], y - wanted))
-        costs.append(cost + cp.sum_squares(problem.terminal_root(number) @ (x[horizon] - rest)))
-    moved = cp.vstack([parameters["goal"]] * horizon)
-    moves = effort * problem.scale * cp.sum_squares((v - moved) @ np.diag(1 / problem.half))
-    if rates is not None:
-        low, high = (np.asarray(part, dtype=float) for part in rates)
-        steps = cp.diff(cp.vstack([np.asarray(previous, dtype=float)[None, :], v]), axis=0)
-        structural["rates"] = (steps >= low, steps <= high)
-    program = _posed("allocation.track", problem, variables, structural, costs, moves, v, constraints,
-                     float(horizon * np.sum((problem.weights * (np.asarray(reference) - start)) ** 2)))
-    return replace(program, parameters=parameters)
+        cost = cp.sum_squares(cp.multiply(ones @ problem.weights[None, :], y - cp.vstack([wanted] * horizon)))
+        costs.append(cost + cp.sum_squares(member.terminal_root(problem) @ (x[horizon] - given(f"rest{label}", rest))))
+    program = _posed("allocation.track", problem, variables, structural, costs, effort * problem.scale,
+                     cp.vstack([goal] * horizon), wanted.value, equations, constraints, parameters)
+    if rates is None:
+        return program
+    u: Any = program.variables["u"]
+    before: Any = cp.reshape(given("previous", previous), (1, u.shape[1]), order="C")
+    steps, most = cp.diff(cp.vstack([before, u]), axis=0), ones @ np.asarray(rates, dtype=float)[None, :]
+    return program.subject_to({"rates": [steps >= -most, steps <= most]})
+
+
+def _labelled(problem: AllocationProblem) -> Iterator[tuple[str, Member]]:
+    """Yield the members, each with what is added to the names of its variables."""
+    for number, member in enumerate(problem.members):
+        yield f"[{number + 1}]" if len(problem.members) > 1 else "", member
 
 
 def _posed(name: str, problem: AllocationProblem, variables: dict[str, cp.Variable],
-           structural: dict[str, tuple[Any, ...]], costs: list[Any], extra: Any, v: cp.Variable,
-           constraints: Sequence[Any], scale: float) -> Program:
-    """Add the bounds, by actuator, and the objective: the cost, or the worst cost of several members."""
-    at: Any = (lambda i: v[i]) if v.ndim == 1 else (lambda i: v[:, i])
-    for i, word in enumerate(problem.names):
-        if problem.low[i] == problem.high[i]:
-            structural[f"held {word}"] = (at(i) == problem.low[i],)
-            continue
-        structural[f"least {word}"] = (at(i) >= problem.low[i],)
-        structural[f"most {word}"] = (at(i) <= problem.high[i],)
+           structural: dict[str, tuple[Any, ...]], costs: list[Any], weight: float, goal: Any, reference: Any,
+           equations: Equations | None, constraints: Sequence[Any], parameters: dict[str, cp.Parameter]) -> Program:
+    """Add the bounds, by actuator, and the objective: the cost, or the worst cost of several members, and the effort.
+
+    Both are of v, or of u where equations tie v to it.
+    """
+    free = v = variables["v"]
+    words, low, high, half = problem.names, problem.low, problem.high, problem.half
+    if equations is not None:
+        words, low, high = tuple(f"actuator:{one}" for one in problem.inputs), problem.u_low, problem.u_high
+        half = (high - low) / 2
+        free = variables["u"] = cp.Variable((*v.shape[:-1], low.size), name="u")
+        structural |= equations(problem, free, v, variables["y"])
+    for i, word in enumerate(words):
+        column = free[..., i]
+        if low[i] == high[i]:
+            structural[f"held {word}"] = (column == low[i],)
+        else:
+            structural[f"least {word}"], structural[f"most {word}"] = (column >= low[i],), (column <= high[i],)
     if problem.norm is not None:
         rows = [v] if v.ndim == 1 else [v[k] for k in range(v.shape[0])]
-        structural["shared limit"] = tuple(cp.norm(problem.norm @ row, 2) <= problem.limit for row in rows)
-    if len(costs) == 1:
-        objective = costs[0] + extra
-    else:
+        structural["shared limit"] = tuple(cp.sum_squares(problem.norm @ row) <= problem.limit**2 for row in rows)
+    effort = weight * cp.sum_squares((free - goal) @ np.diag(1 / half))
+    if len(costs) > 1:
         worst = variables["worst"] = cp.Variable(name="worst")
         structural["worst member"] = tuple(cost <= worst for cost in costs)
-        objective = worst + extra
-
-    def recover(values: Values) -> np.ndarray:
-        return np.asarray(values["v"])
-
-    names = tuple(problem.names)
-    view = View(dict(variables), channels=names, outputs=tuple(problem.outputs))
-    return Program(name, cp.Minimize(objective), structural, variables, {}, recover, view, frozenset(structural),
-                   scale=scale or 1.0).subject_to(*constraints)
-
-
-__all__ = ["Member", "target", "track"]
+        costs = [worst]
+    rest = problem.members[0].rest_output(np.append(problem.middle, np.zeros(len(problem.feedback))))
+    scale = (1 if v.ndim == 1 else v.shape[0]) * float(np.sum((problem.weights * (reference - rest)) ** 2))
+    view = View(dict(variables), channels=problem.names, outputs=problem.outputs)
+    return Program(name, cp.Minimize(costs[0] + effort), structural, variables, {}, lambda values: values["v"], view,
+                   frozenset(structural), parameters=parameters, scale=scale or 1.0).subject_to(*constraints)

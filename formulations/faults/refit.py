@@ -59,33 +59,27 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
     Returns:
         The model; its value of the objective is a local minimum.
     """
-    theta = problem.start
-    r, s = problem.linearised(theta)
-    solution: Any = None
+    z = np.append(problem.start, np.zeros(len(problem.curves)))
+    r, s = problem.linearised(problem.start)
     objective = np.inf
-    lost: dict[str, float] = {}
     for _ in range(STEPS):
-        program = _step("refit.parameters", problem, theta, r, s, constraints)
-        before = _cost(problem, theta, lost, r) if solution is not None else np.inf
-        solution = yield program
+        solution = yield _step("refit.parameters", problem, z[: problem.start.size], r, s, constraints)
         if not solution.has_point:
             break
-        new, lost_new = _vector(problem, solution.values), _lost(problem, solution.values)
-        step, length = new - theta, 1.0
+        before, step, length = objective, _vector(problem, solution.values) - z, 1.0
         for _ in range(HALVINGS):
-            trial = theta + length * step
-            at = {name: lost.get(name, 0.0) + length * (g - lost.get(name, 0.0)) for name, g in lost_new.items()}
-            r_trial, s_trial = problem.linearised(trial)
-            objective = _cost(problem, trial, at, r_trial)
+            trial = z + length * step
+            r, s = problem.linearised(trial[: problem.start.size])
+            objective = _cost(problem, trial, r)
             if np.isfinite(objective) and objective <= before:
                 break
             length /= 2
-        theta, r, s, lost = trial, r_trial, s_trial, at
+        z = trial
         if before - objective < SETTLED * max(objective, 1e-300):
             break
     status = Status.LOCAL if solution.has_point else solution.status
-    bound = Bound(-np.inf, False, "none", "innovations are not linear in A and C: a local minimum, no bound is known")
-    return Evidence(Refitted(problem, theta, lost), float(objective), bound, status, solution.reason)
+    bound = Bound.none("innovations are not linear in A and C: a local minimum, no bound is known")
+    return Evidence(Refitted(problem, z), float(objective), bound, status, solution.reason)
 
 
 class Refitted:
@@ -97,72 +91,49 @@ class Refitted:
         model: the model.
     """
 
-    def __init__(self, problem: Refitting, theta: Array, lost: dict[str, float]) -> None:
-        self.theta, self.lost, self.model = theta, lost, problem.model_at(theta)
+    def __init__(self, problem: Refitting, z: Array) -> None:
+        self.theta, shares = np.split(z, [problem.start.size])
+        self.lost = dict(zip((curve.name for curve in problem.curves), shares.tolist()))
+        self.model = problem.model_at(self.theta)
 
 
 def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
           ) -> Program:
     """Pose the programme linearised at theta: one sum of squares, of the record and of what is believed beforehand."""
-    shares = {f"lost[{curve.name}]": curve for curve in problem.curves}
-    width = problem.size + len(shares)
-    rows, target = np.zeros((len(r), width)), s @ theta - r
-    rows[:, : problem.size] = s
+    if isinstance(constraints, str) and constraints != "default":
+        raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
     believed, wanted = problem.believed()
-    triangle, target, rest = _compressed(np.vstack([rows, believed]), np.concatenate([target, wanted]))
-    variables = {key: cp.Variable(shape, name=key) for key, shape in problem.shapes.items()}
-    variables |= {key: cp.Variable(1, name=key) for key in shares}
-    edges = [(part.start, part.stop) for part in problem.slices.values()]
-    edges += [(problem.size + i, problem.size + i + 1) for i in range(len(shares))]
-    terms = [
-        triangle[:, first:last] @ (v if v.ndim == 1 else cp.vec(v, order="C"))
-        for (first, last), v in zip(edges, variables.values())
-    ]
-    forecast: Any = (cp.sum(cp.vstack(terms), axis=0) if len(terms) > 1 else terms[0]) - target
-    residual = cp.Variable(target.size, name="residual")
+    rows = np.vstack([np.pad(s, ((0, 0), (0, len(problem.curves)))), believed])
+    triangle, target, rest = _compressed(rows, np.concatenate([s @ theta - r, wanted]))
+    variables = {key: cp.Variable(value.shape, name=key) for key, value in problem.unknowns.items()}
+    variables |= {f"lost[{curve.name}]": cp.Variable(1, name=f"lost[{curve.name}]") for curve in problem.curves}
+    point = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="C") for v in variables.values()])
+    forecast, residual = triangle @ point - target, cp.Variable(target.size, name="residual")
     structural: dict[str, tuple[Any, ...]] = {"residuals": (residual == forecast,)}
-    spread = problem.spread()
     for key, part in problem.slices.items():
-        zeros = np.flatnonzero(spread[part] == 0)
-        if zeros.size:
-            structural[f"zeros stay[{key}]"] = tuple(
-                _entry(variables[key], int(i)) == problem.start[part][i] for i in zeros
-            )
-    expressions: dict[str, Any] = dict(variables)
+        if problem.held[part].any():
+            structural[f"zeros stay[{key}]"] = (variables[key] == 0,)
     rules: list[Any] = []
-    for key, curve in shares.items():
-        mu, lost = variables[f"mu[{curve.name}]"], variables[key]
-        structural[f"share {key}"] = (lost >= 0, lost <= 1)
-        if curve.dead:
-            structural[f"dead[{curve.name}]"] = (mu == 0,)
-        if len(shares) == 1:
-            expressions["mu"] = mu
-        if isinstance(constraints, str) and not curve.dead:
-            rules += _not_stronger(curve, mu)
+    for curve in problem.curves:
+        lost = variables[f"lost[{curve.name}]"]
+        structural[f"share lost[{curve.name}]"] = (lost >= 0, lost <= 1)
+        rules += [] if curve.dead else _not_stronger(curve, variables[f"mu[{curve.name}]"])
     if not isinstance(constraints, str):
         rules = [named_constraint(rule) if isinstance(rule, str) else rule for rule in constraints]
-    elif constraints != "default":
-        raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
+    expressions: dict[str, Any] = dict(variables)
+    if len(problem.curves) == 1:
+        expressions["mu"] = variables[f"mu[{problem.curves[0].name}]"]
     view = View(expressions, channels=tuple(curve.name for curve in problem.curves), gauge="none",
                 bases={curve.name: curve.basis for curve in problem.curves}, outputs=problem.model.outputs)
-
-    def recover(values: Values) -> Refitted:
-        return Refitted(problem, _vector(problem, values), _lost(problem, values))
-
-    start = problem.unpack(theta) | {key: np.zeros(1) for key in shares}
-    begin = np.concatenate([theta, np.zeros(len(shares))])
+    begin = np.append(theta, np.zeros(len(problem.curves)))
+    start = problem.unpack(theta) | {f"lost[{curve.name}]": np.zeros(1) for curve in problem.curves}
+    misfit = triangle @ begin - target
     program = Program(
         name, cp.Minimize(cp.sum_squares(residual) + rest), structural, {**variables, "residual": residual},
-        {**start, "residual": triangle @ begin - target}, recover, view, frozenset(structural),
-        derived={"residual": forecast},
-        scale=float(np.sum((triangle @ begin - target) ** 2)) + rest or 1.0,
+        {**start, "residual": misfit}, lambda values: Refitted(problem, _vector(problem, values)), view,
+        frozenset(structural), derived={"residual": forecast}, scale=float(misfit @ misfit) + rest or 1.0,
     )
     return program.subject_to(*rules)
-
-
-def _entry(variable: cp.Variable, flat: int) -> Any:
-    """One entry of a variable, counted row by row."""
-    return variable[np.unravel_index(flat, variable.shape)] if variable.ndim > 1 else variable[flat]
 
 
 def _not_stronger(curve: Any, mu: Any) -> list[Any]:
@@ -186,21 +157,13 @@ def _compressed(s: Array, target: Array) -> tuple[Array, Array, float]:
     return factor[:q, :q], factor[:q, q], rest
 
 
-def _lost(problem: Refitting, values: Values) -> dict[str, float]:
-    return {curve.name: float(np.ravel(values[f"lost[{curve.name}]"])[0]) for curve in problem.curves}
-
-
 def _vector(problem: Refitting, values: Values) -> Array:
-    """Return the unknowns; what is held is held exactly."""
-    theta = problem.pack(values)
-    for curve in problem.curves:
-        if curve.dead:
-            theta[problem.slices[f"mu[{curve.name}]"]] = 0.0
-    return theta
+    """Return [unknowns; shares lost]; what stays zero is zero exactly."""
+    theta = np.where(problem.held, 0.0, problem.pack(values))
+    return np.append(theta, [float(np.ravel(values[f"lost[{curve.name}]"])[0]) for curve in problem.curves])
 
 
-def _cost(problem: Refitting, theta: Array, lost: dict[str, float], r: Array) -> float:
-    """Value of the objective with the innovations r at theta, linearised in nothing."""
+def _cost(problem: Refitting, z: Array, r: Array) -> float:
+    """Value of the objective with the innovations r at z, linearised in nothing."""
     rows, wanted = problem.believed()
-    point = np.concatenate([theta, [lost.get(curve.name, 0.0) for curve in problem.curves]])
-    return float(np.sum(r**2) + np.sum((rows @ point - wanted) ** 2))
+    return float(np.sum(r**2) + np.sum((rows @ z - wanted) ** 2))

@@ -1,7 +1,8 @@
 """Control of a damaged plant with the actuators that are left: what can be reached, and how."""
 
 import warnings
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -11,19 +12,21 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.errors import DataWarning, StructureError
 from optid.faults.repair.allocation_problem import AllocationProblem, Member
-from optid.faults.repair.inversion import Inverse, inverse
+from optid.faults.repair.inversion import inverse
 from optid.faults.repair.virtual_sensor import check_stabilisable
 
 if TYPE_CHECKING:
     from optid.faults.repair.control import Controller
+    from optid.faults.repair.damage import Damage
     from optid.models import HammersteinSS
+    from optid.program.program import Program
     from optid.program.solution import Solution
 
 REACHED = 1e-4
 """A target is reached when its distance is below this share of the scale of the outputs."""
 
 ACTIVE = 1e-6
-"""A bound limits when its multiplier is above this share of the largest."""
+"""A bound limits when its multiplier is above this share of the largest, and of the scale of the outputs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +41,9 @@ class Target:
         x: (n,) state there.
         distance: weighted distance of y from the reference.
         reachable: whether there is none to speak of.
-        limiting: {actuator: by how much the distance falls per unit of v by which its bound moves}, the most limiting
-            first; empty where the reference is reached.
-        solution: of the programme behind it; None on the NLP route.
+        limiting: {actuator: by how much the distance falls per unit of v, on the NLP route of u, by which its bound
+            moves}, the most limiting first; empty where the reference is reached.
+        solution: of the programme behind it; None where no actuator is left.
         idle: why nothing can be done, where no actuator is left; "" otherwise.
     """
 
@@ -71,30 +74,43 @@ class Target:
 class Allocation:
     """What a plant can still do; `attainable` and `controller` use it.
 
+    With several members (`robust_allocation`) both are right for all of them: the worst of them is made least.
+
     Attributes:
-        model: the plant as it is now.
-        problem: what is left of it in v = f(u); None where it is not linear in v.
-        inverses: f^-1 of every function of the inputs.
-        low: (m,) least inputs.
-        high: (m,) largest inputs.
-        weights: (l,) of the outputs.
-        route: "qp" (in v, exact), or "nlp" (in u, by IPOPT).
+        model: the plant as it is now; the healthy one with several members.
+        problem: what is left of it in v = f(u), with the bounds.
+        route: "qp" (in v, exact), or "nlp" (in u).
         messages: why the route is what it is, and what is not as it was.
-        solver: back end of the programmes.
+        solver: back end of the programmes; on the NLP route one that takes no such programmes gives way to "auto".
+        labels: of several members.
     """
 
     model: "HammersteinSS"
-    problem: AllocationProblem | None
-    inverses: tuple[Inverse, ...]
-    low: Array
-    high: Array
-    weights: Array
+    problem: AllocationProblem
     route: str
     messages: tuple[str, ...] = ()
     solver: Any = "auto"
+    labels: tuple[str, ...] = ()
+
+    @property
+    def low(self) -> Array:
+        """(m,) least inputs."""
+        return self.problem.u_low
+
+    @property
+    def high(self) -> Array:
+        """(m,) largest inputs."""
+        return self.problem.u_high
+
+    @property
+    def middle(self) -> Array:
+        """(m,) middle of the ranges of the inputs."""
+        return (self.low + self.high) / 2
 
     def attainable(self, reference: ArrayLike) -> Target:
         """Return the resting point nearest to a reference, its weighted distance, and the actuators that limit it.
+
+        With several members the one that they share, and y of the worst.
 
         Args:
             reference: (l,) outputs wanted.
@@ -102,83 +118,67 @@ class Allocation:
         Raises:
             StructureError: a reference of the wrong size or not finite, or a solver that finds no point.
         """
-        r = self._reference(reference)
-        if not self.moving:
-            return self._idle(r)
-        if self.route == "nlp":
-            return self._resting(r)
         from optid.registry import fault_formulation
-        from optid.solving.solve import solve
 
-        assert self.problem is not None
-        program = fault_formulation("allocation.target")(self.problem, reference=r)
-        solution = solve(program, self.solver)
-        if not solution.has_point or solution.status.value not in ("optimal", "locally optimal", "inaccurate"):
-            why = solution.reason or solution.claimed
-            raise StructureError(f"no resting point was found: {solution.status} ({why})")
-        v = np.clip(solution.values["v"], self.problem.low, self.problem.high)
-        member = self.problem.members[0]
-        x, y = member.rest_state(v), member.rest_output(v)
-        distance = float(np.linalg.norm(self.weights * (y - r)))
-        reachable = distance <= REACHED * np.sqrt(self.problem.scale)
-        limiting = {} if reachable else self._limiting(v, y - r, distance)
-        return Target(r, y, self.inputs(v), v, x, distance, reachable, limiting, solution)
+        problem, r = self.problem, self.checked(reference)
+        if not self.moving:  # where the outputs come to rest by themselves, every actuator where it stands
+            return self._target(r, self.middle, self.model.expanded(self.middle[None, :])[0], None)
+        if self.route == "qp":
+            solution = self.solved(fault_formulation("allocation.target")(problem, reference=r), {})
+            v = np.clip(solution.values["v"], problem.low, problem.high)
+            return self._target(r, self.inputs(v), v, solution)
+        program, third = fault_formulation("allocation.resting")(problem, reference=r), (self.high - self.low) / 3
+        found, failure = [], None
+        for u in (self.middle, self.middle + third, self.middle - third):
+            v = self.model.expanded(u[None, :])[0]
+            x, y = self._rests(u, v)[0]
+            try:
+                solution = self.solved(program, {"u": u, "v": self.columns(u, y), "x": x, "y": y})
+            except StructureError as error:
+                failure = error
+                continue
+            u = np.clip(solution.values["u"], self.low, self.high)
+            found.append(self._target(r, u, self.model.expanded(u[None, :])[0], solution))
+        if failure is not None and not found:
+            raise failure
+        return min(found, key=lambda one: one.distance)
+
+    def _target(self, r: Array, u: Array, v: Array, solution: "Solution | None") -> Target:
+        """What the plant, of several members the worst, does at rest at u and v."""
+        weights, points = self.problem.weights, self._rests(u, v)
+        distances = [float(np.linalg.norm(weights * (y - r))) for _, y in points]
+        distance, (x, y) = max(distances), points[int(np.argmax(distances))]
+        scale = self.problem.scale if self.moving else np.sum((weights * (np.abs(r) + np.abs(y))) ** 2)
+        reachable = distance <= REACHED * (np.sqrt(scale) or 1.0)
+        limiting = {} if reachable else self._limiting(solution, distance)
+        return Target(r, y, u, v, x, distance, reachable, limiting, solution, self.idle)
+
+    def _rests(self, u: Array, v: Array) -> list[tuple[Array, Array]]:
+        """Return state and outputs of every member at rest."""
+        if self.problem.feedback:
+            return [self.model.equilibrium(u)]
+        return [(one.rest_state(v), one.rest_output(v)) for one in self.problem.members]
+
+    def _limiting(self, solution: "Solution | None", distance: float) -> dict[str, float]:
+        """Actuators at a bound beyond which the outputs would come nearer, with the multipliers of the distance."""
+        if solution is None:
+            return {f"actuator:{name}": float("nan") for name in self.model.inputs}
+        prices = {}
+        for name, dual in solution.duals.items():  # of the square of the distance
+            side, _, word = name.partition(" ")
+            if side in ("held", "least", "most"):
+                prices[word] = prices.get(word, 0.0) + abs(float(dual[0])) / (2 * distance)
+        least = ACTIVE * max([np.sqrt(self.problem.scale), *prices.values()])
+        kept = {word: price for word, price in prices.items() if price > least}
+        return dict(sorted(kept.items(), key=lambda pair: -pair[1]))
 
     @property
     def idle(self) -> str:
         """Why nothing can be controlled, where no actuator moves; "" otherwise."""
         return "" if self.moving else f"nothing acts on {', '.join(self.model.outputs)}"
 
-    def _idle(self, r: Array) -> Target:
-        """Where the outputs come to rest by themselves, every actuator where it stands."""
-        u = (self.low + self.high) / 2
-        x, y = self.model.equilibrium(u)
-        distance = float(np.linalg.norm(self.weights * (y - r)))
-        scale = float(np.linalg.norm(self.weights * (np.abs(r) + np.abs(y)))) or 1.0
-        reached = distance <= REACHED * scale
-        limiting = {} if reached else {f"actuator:{name}": float("nan") for name in self.model.inputs}
-        return Target(r, y, u, self.model.expanded(u[None, :])[0], x, distance, reached, limiting, None, self.idle)
-
-    def _limiting(self, v: Array, miss: Array, distance: float) -> dict[str, float]:
-        """Actuators at a bound beyond which the outputs would come nearer, with the multipliers of the distance."""
-        assert self.problem is not None
-        slopes = (self.weights * (self.weights * miss)) @ self.problem.members[0].gain() / distance
-        prices = {}
-        for i, word in enumerate(self.problem.names):
-            held = self.problem.low[i] == self.problem.high[i]
-            slack = 1e-6 * self.problem.half[i]
-            at_low, at_high = v[i] <= self.problem.low[i] + slack, v[i] >= self.problem.high[i] - slack
-            if held or (at_low and slopes[i] > 0) or (at_high and slopes[i] < 0):
-                prices[word] = abs(float(slopes[i]))
-        largest = max(prices.values(), default=0.0)
-        kept = {word: price for word, price in prices.items() if price > ACTIVE * largest}
-        return dict(sorted(kept.items(), key=lambda pair: -pair[1]))
-
-    def _resting(self, r: Array) -> Target:
-        from optid.registry import fault_formulation
-
-        find = fault_formulation("allocation.resting")
-        best: Any = None
-        for start in self._starts():
-            u, x, y, _ = find(self.model, self.low, self.high, self.weights, r, start)
-            distance = float(np.linalg.norm(self.weights * (y - r)))
-            if best is None or distance < best[0]:
-                best = distance, u, x, y
-        distance, u, x, y = best
-        scale = float(np.linalg.norm(self.weights * (np.abs(r) + np.abs(y)))) or 1.0
-        reachable = distance <= REACHED * scale
-        slack = 1e-4 * (self.high - self.low)
-        held = (u <= self.low + slack) | (u >= self.high - slack)
-        limiting = {} if reachable else {
-            f"actuator:{name}": float("nan") for name, bound in zip(self.model.inputs, held) if bound
-        }
-        return Target(r, y, u, self.model.expanded(u[None, :])[0], x, distance, reachable, limiting)
-
-    def _starts(self) -> list[Array]:
-        middle, third = (self.low + self.high) / 2, (self.high - self.low) / 3
-        return [middle, middle + third, middle - third]
-
-    def _reference(self, reference: ArrayLike) -> Array:
+    def checked(self, reference: ArrayLike) -> Array:
+        """Return a reference (l,); refuse another size, and numbers that are not finite."""
         r = np.atleast_1d(np.asarray(reference, dtype=float))
         if r.shape != (self.model.l,) or not np.all(np.isfinite(r)):
             raise StructureError(
@@ -187,12 +187,36 @@ class Allocation:
             )
         return r
 
+    def solved(self, program: "Program", start: dict[str, Array], prove: bool = True) -> "Solution":
+        """Solve a programme from a start, and refuse an outcome without a point.
+
+        Raises:
+            StructureError: no point.
+        """
+        from optid.backends.choice import find
+        from optid.solving.solve import solve
+
+        program.assign(start)
+        solver = self.solver
+        if isinstance(solver, str) and solver != "auto" and program.kind == "NLP" and find(solver).refuses(program):
+            solver = "auto"
+        solution = solve(program, solver, prove=prove, warm=False)
+        if not solution.has_point or solution.status.value not in ("optimal", "locally optimal", "inaccurate"):
+            what = "resting point was" if program.name == "allocation.target" else "move was"
+            raise StructureError(f"no {what} found: {solution.status} ({solution.reason or solution.claimed})")
+        return solution
+
     def inputs(self, v: Array, near: Array | None = None) -> Array:
         """Return the inputs (m,) whose nonlinearities have the values v (r,); their bounds are kept exactly."""
-        u = (self.low + self.high) / 2 if near is None else np.array(near, dtype=float)
-        for i, (one, c) in enumerate(zip(self.inverses, self.model.input_of)):
-            u[c] = float(one(np.array(v[i]), float(u[c])))
+        u = self.middle if near is None else np.array(near, dtype=float)
+        for value, one, c in zip(v, self.problem.inverses, self.problem.input_of):
+            u[c] = float(one(value, float(u[c])))
         return np.clip(u, self.low, self.high)
+
+    def columns(self, u: Array, y: Array) -> Array:
+        """Return the columns [f(u); g(y)] of one sample."""
+        fed = [float(g(y[o])) for g, o in self.problem.feedback]
+        return np.append(self.model.expanded(u[None, :])[0], fed)
 
     def corners(self) -> Array:
         """Return the corners (k, 2) of the set of outputs that can be held at rest, two outputs, in order.
@@ -200,9 +224,9 @@ class Allocation:
         With a limit that the actuators share this is the set without it.
 
         Raises:
-            StructureError: other than two outputs, or the NLP route.
+            StructureError: other than two outputs, or a plant that is not linear in f(u).
         """
-        if self.model.l != 2 or self.problem is None:
+        if self.model.l != 2 or not self.problem.linear:
             raise StructureError(
                 "The attainable set is drawn for two outputs and a plant that is linear in f(u); ask "
                 "attainable(reference) point by point."
@@ -221,7 +245,7 @@ class Allocation:
     @cached_property
     def moving(self) -> tuple[str, ...]:
         """Names of the inputs that still move something."""
-        live = {c for one, c in zip(self.inverses, self.model.input_of) if not one.dead}
+        live = {c for one, c in zip(self.problem.inverses, self.problem.input_of) if not one.dead}
         return tuple(self.model.inputs[c] for c in sorted(live))
 
     def controller(self, horizon: int = 40, *, effort: float = 1e-3, rates: ArrayLike | None = None,
@@ -230,7 +254,7 @@ class Allocation:
         from optid.faults.repair.control import Controller
 
         if self.idle:
-            rest = ", ".join(f"{value:.4g}" for value in self.model.equilibrium((self.low + self.high) / 2)[1])
+            rest = ", ".join(f"{value:.4g}" for value in self.attainable(np.zeros(self.model.l)).y)
             raise StructureError(
                 f"not reachable: {self.idle}, so that there is nothing to control. The outputs rest at ({rest}); "
                 "attainable(reference) says how far that is from a reference, and the observer goes on watching."
@@ -240,7 +264,7 @@ class Allocation:
     def __str__(self) -> str:
         """Say which actuators are left and by which route."""
         rows = [f"actuators that move: {', '.join(self.moving) or 'none'}; route {self.route}"]
-        for one, c in zip(self.inverses, self.model.input_of):
+        for one, c in zip(self.problem.inverses, self.problem.input_of):
             state = "does not move" if one.dead else f"f from {one.v_low:.4g} to {one.v_high:.4g}"
             rows.append(f"  {self.model.inputs[c]}: {state} over [{self.low[c]:.4g}, {self.high[c]:.4g}]")
         return "\n".join([*rows, *(f"  {message}" for message in self.messages)])
@@ -272,46 +296,68 @@ def allocate(
     """
     if route not in ("auto", "qp", "nlp"):
         raise StructureError(f"route={route!r}: use 'auto', 'qp' or 'nlp'.")
-    least, most = _bounds(model, low, high)
+    problem = _problem(model, low, high, weights)
+    inverses = problem.inverses
+    messages = [f"{model.inputs[c]}: {one.message}" for one, c in zip(inverses, model.input_of) if one.message]
+    check_stabilisable(model, [i for i, one in enumerate(inverses) if not one.dead])
+    if len(set(model.input_of)) < len(model.input_of):
+        messages.append("an input acts through several nonlinearities: their values are not free of one another")
+    if model.feedback:
+        messages.append("the plant has nonlinear feedback: it is not linear in f(u)")
+    if route == "qp" and not problem.linear:
+        raise StructureError(f"route 'qp' is not possible: {messages[-1]}. Use route='nlp'.")
+    if messages and route == "auto":
+        messages[-1] += "; the allocation falls back to the NLP route"
+        warnings.warn("; ".join(messages), DataWarning, stacklevel=2)
+    taken = route if route != "auto" else "nlp" if messages else "qp"
+    if norm is not None or np.isfinite(limit):
+        root = np.eye(len(inverses)) if norm is None else np.atleast_2d(np.asarray(norm, dtype=float))
+        if root.shape[1] != len(inverses) or not limit > 0:
+            raise StructureError(f"norm of shape {root.shape} and limit {limit!r}: ({len(inverses)} columns, and a "
+                                 "positive limit are needed.")
+        problem = replace(problem, norm=root, limit=limit)
+    return Allocation(model, problem, taken, tuple(messages), solver)
+
+
+def robust_allocation(model: "HammersteinSS", members: "Sequence[Damage]", *, low: Any, high: Any, weights: Any,
+                      solver: Any = "auto") -> Allocation:
+    """Prepare the control of a plant of which several explanations are left; arguments as of `allocate`.
+
+    Every member is a gain and a constant of the v of the healthy nonlinearities, as the diagnosis estimates them.
+
+    Raises:
+        StructureError: an input with several nonlinearities, a nonlinearity that turns back, or nonlinear feedback.
+    """
+    problem = _problem(model, low, high, weights)
+    if len(set(model.input_of)) < len(model.input_of) or any(one.turns for one in problem.inverses):
+        raise StructureError("The members share no v: an input has several nonlinearities, or one that turns back.")
+    if model.feedback:
+        raise StructureError("The model has nonlinear feedback: it is not linear in f(u). Use the route 'nlp', which "
+                             "needs no such structure.")
+    plants = tuple(Member.of(model, one.gains, one.constants, one.added) for one in members)
+    return Allocation(model, replace(problem, members=plants), "qp", (), solver, tuple(one.label for one in members))
+
+
+def _problem(model: "HammersteinSS", low: Any, high: Any, weights: Any) -> AllocationProblem:
+    least, most = input_bounds(model, low, high)
     w = np.ones(model.l) if weights is None else np.broadcast_to(np.asarray(weights, dtype=float), (model.l,)).copy()
     if not np.all(np.isfinite(w) & (w > 0)):
         raise StructureError(f"weights {w.tolist()}: positive numbers are needed, one per output.")
     inverses = tuple(inverse(f, least[c], most[c]) for f, c in zip(model.nonlinearities, model.input_of))
-    messages = [
-        f"{model.inputs[c]}: {one.message}" for one, c in zip(inverses, model.input_of) if one.message
-    ]
-    check_stabilisable(model, [i for i, one in enumerate(inverses) if not one.dead])
-    several = len(set(model.input_of)) < len(model.input_of)
-    linear = not model.feedback and not several
-    if several:
-        messages.append("an input acts through several nonlinearities: their values are not free of one another")
-    if model.feedback:
-        messages.append("the plant has nonlinear feedback: it is not linear in f(u)")
-    if route == "qp" and not linear:
-        raise StructureError(f"route 'qp' is not possible: {messages[-1]}. Use route='nlp'.")
-    taken = route if route != "auto" else "qp" if linear and not messages else "nlp"
-    if taken == "nlp" and norm is not None:
-        raise StructureError("A limit that actuators share is a cone in f(u); the route 'nlp' does not take it.")
-    if messages and route == "auto":
-        messages[-1] += "; the allocation falls back to the NLP route"
-        warnings.warn("; ".join(messages), DataWarning, stacklevel=2)
-    problem = None
-    if linear:
-        root = None
-        if norm is not None or np.isfinite(limit):
-            root = np.eye(len(inverses)) if norm is None else np.atleast_2d(np.asarray(norm, dtype=float))
-            if root.shape[1] != len(inverses) or not limit > 0:
-                raise StructureError(f"norm of shape {root.shape} and limit {limit!r}: ({len(inverses)} columns, and a "
-                                     "positive limit are needed.")
-        problem = AllocationProblem(
-            (Member.of(model),), np.array([one.v_low for one in inverses]),
-            np.array([one.v_low if one.dead else one.v_high for one in inverses]),
-            tuple(f"actuator:{model.inputs[c]}" for c in model.input_of), model.outputs, w, root, limit,
-        )
-    return Allocation(model, problem, inverses, least, most, w, taken, tuple(messages), solver)
+    return AllocationProblem(
+        (Member.of(model),), np.array([one.v_low for one in inverses]),
+        np.array([one.v_low if one.dead else one.v_high for one in inverses]),
+        tuple(f"actuator:{model.inputs[c]}" for c in model.input_of), model.outputs, w, None, np.inf, inverses,
+        model.input_of, model.inputs, least, most, tuple(zip(model.feedback, model.output_of)),
+    )
 
 
-def _bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Array]:
+def input_bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Array]:
+    """Return the least and largest inputs (m,), those of the bases where none are given.
+
+    Raises:
+        StructureError: bounds that are missing, empty or not finite.
+    """
     ends = []
     for word, given, side in (("low", low, 0), ("high", high, 1)):
         if given is not None:
@@ -331,5 +377,3 @@ def _bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Array]:
             f"the range of input {model.inputs[c]!r}, [{ends[0][c]:g}, {ends[1][c]:g}], is empty or not finite."
         )
     return ends[0], ends[1]
-
-

@@ -1,24 +1,22 @@
 """What is left of a plant to control: linear dynamics in v = f(u), bounds of v, and what the actuators share."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import StructureError
+from optid.faults.repair.inversion import Inverse
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
-
-DEAD_HALF = 1.0
-"""Half range that an actuator without one is given where something is divided by it."""
+    from optid.models.nonlinearity import Nonlinearity
 
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """x+ = A x + B v + d, y = C x + D v + c.
+    """x+ = A x + B v + d, y = C x + D v + c; nonlinear feedback g(y) is a further column of v.
 
     Attributes:
         A: (n, n), output injection included.
@@ -37,22 +35,13 @@ class Member:
     c: Array
 
     @classmethod
-    def of(cls, model: "HammersteinSS", gains: Array | None = None, constants: Array | None = None) -> "Member":
-        """Take a model, with v replaced by gains v + constants where some of the actuators are broken.
-
-        Raises:
-            StructureError: nonlinear feedback, with which the plant is not linear in v.
-        """
-        if model.feedback:
-            raise StructureError(
-                "The model has nonlinear feedback: it is not linear in f(u). Use the route 'nlp', which needs no such "
-                "structure."
-            )
-        gains = np.ones(model.B.shape[1]) if gains is None else gains
-        constants = np.zeros(model.B.shape[1]) if constants is None else constants
+    def of(cls, model: "HammersteinSS", gains: Any = 1.0, constants: Any = 0.0, added: Any = 0.0) -> "Member":
+        """Take a model, with v replaced by gains v + constants where actuators are broken, and a load on its states."""
+        constants = np.broadcast_to(constants, model.B.shape[1])
         A, B = model.A + model.L @ model.C, model.B + model.L @ model.D
-        d = model.offset_x + model.L @ model.offset_y + B @ constants
-        return cls(A, B * gains, model.C, model.D * gains, d, model.offset_y + model.D @ constants)
+        d = model.offset_x + model.L @ model.offset_y + B @ constants + added
+        D = np.hstack([model.D * gains, np.zeros((model.l, len(model.feedback)))])
+        return cls(A, np.hstack([B * gains, model.E]), model.C, D, d, model.offset_y + model.D @ constants)
 
     def rest_state(self, v: Array) -> Array:
         """Return the state (n,) that rests at v, the nearest where a pole is at 1."""
@@ -67,10 +56,27 @@ class Member:
         """Return the static gain (l, r)."""
         return np.asarray(self.C @ np.linalg.lstsq(np.eye(len(self.A)) - self.A, self.B, rcond=None)[0] + self.D)
 
+    def terminal_root(self, problem: "AllocationProblem") -> Array:
+        """Return T with T'T the cost from the end of the horizon on at v at rest, (n, n).
+
+        The cost to go of a stable plant whose v rests; the slowest weight that is finite otherwise: of the plant held
+        by its optimal feedback.
+        """
+        from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+        weighted, r = problem.weights[:, None] * self.C, problem.low.size
+        if np.max(np.abs(np.linalg.eigvals(self.A)), initial=0.0) < 1 - 1e-9:
+            P = solve_discrete_lyapunov(self.A.T, weighted.T @ weighted)
+        else:
+            R = problem.scale * np.diag(1 / problem.half**2)
+            P = solve_discrete_are(self.A, self.B[:, :r], weighted.T @ weighted + 1e-9 * np.eye(len(self.A)), R)
+        sizes, axes = np.linalg.eigh((P + P.T) / 2)
+        return np.asarray(np.sqrt(np.maximum(sizes, 0.0))[:, None] * axes.T)
+
 
 @dataclass(frozen=True, eq=False)
 class AllocationProblem:
-    """Numbers of a re-allocation.
+    """Numbers of a re-allocation of r columns v = f(u) and m inputs u.
 
     Attributes:
         members: the plant; several where it is not known what is broken.
@@ -81,6 +87,12 @@ class AllocationProblem:
         weights: (l,) of the outputs.
         norm: (k, r) matrix S of ‖S v‖ <= limit; None for none.
         limit: of the norm.
+        inverses: (r) f and f^-1.
+        input_of: the input of every column.
+        inputs: names of the inputs.
+        u_low: (m,) least inputs.
+        u_high: (m,) largest inputs.
+        feedback: function and output of the columns beyond r.
     """
 
     members: tuple[Member, ...]
@@ -89,14 +101,24 @@ class AllocationProblem:
     names: tuple[str, ...]
     outputs: tuple[str, ...]
     weights: Array
-    norm: Array | None = None
-    limit: float = np.inf
-    roots: dict[int, Array] = field(default_factory=dict, repr=False)
+    norm: Array | None
+    limit: float
+    inverses: tuple[Inverse, ...]
+    input_of: tuple[int, ...]
+    inputs: tuple[str, ...]
+    u_low: Array
+    u_high: Array
+    feedback: "tuple[tuple[Nonlinearity, int], ...]" = ()
+
+    @property
+    def linear(self) -> bool:
+        """Whether the plant is linear in v and every v is free of the others."""
+        return not self.feedback and len(set(self.input_of)) == len(self.input_of)
 
     @property
     def columns(self) -> int:
-        """Number of columns of v."""
-        return self.low.size
+        """Number of columns of v, those of the feedback included."""
+        return self.low.size + len(self.feedback)
 
     @property
     def middle(self) -> Array:
@@ -107,38 +129,10 @@ class AllocationProblem:
     def half(self) -> Array:
         """(r,) half of the ranges; one for an actuator that does not move."""
         half = (self.high - self.low) / 2
-        return np.where(half > 0, half, DEAD_HALF)
+        return np.where(half > 0, half, 1.0)
 
     @cached_property
     def scale(self) -> float:
         """Weighted square of what one actuator can do at most to the outputs at rest."""
-        reach = np.abs(self.weights[:, None] * self.members[0].gain()) * self.half
+        reach = np.abs(self.weights[:, None] * self.members[0].gain()[:, : self.low.size]) * self.half
         return float(np.max(np.sum(reach**2, axis=0), initial=0.0)) or 1.0
-
-    def tie(self, reference: Array) -> float:
-        """Scale of the cost of a target."""
-        return self.scale
-
-    def rest(self) -> tuple[Array, Array]:
-        """Return state and outputs of the first member at rest in the middle of the ranges."""
-        return self.members[0].rest_state(self.middle), self.members[0].rest_output(self.middle)
-
-    def terminal_root(self, number: int) -> Array:
-        """Return T with T'T the cost from the end of the horizon on at v at rest, (n, n).
-
-        The cost to go of a stable plant whose v rests; the slowest weight that is finite otherwise: of the plant held
-        by its optimal feedback.
-        """
-        if number not in self.roots:
-            from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
-
-            member = self.members[number]
-            weighted = self.weights[:, None] * member.C
-            if np.max(np.abs(np.linalg.eigvals(member.A)), initial=0.0) < 1 - 1e-9:
-                P = solve_discrete_lyapunov(member.A.T, weighted.T @ weighted)
-            else:
-                R = self.scale * np.diag(1 / self.half**2)
-                P = solve_discrete_are(member.A, member.B, weighted.T @ weighted + 1e-9 * np.eye(len(member.A)), R)
-            sizes, axes = np.linalg.eigh((P + P.T) / 2)
-            self.roots[number] = np.sqrt(np.maximum(sizes, 0.0))[:, None] * axes.T
-        return self.roots[number]

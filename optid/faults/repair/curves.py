@@ -1,7 +1,7 @@
-"""A damaged nonlinearity: the nodes at which its values are estimated, and what a record says of each."""
+"""A damaged nonlinearity: the nodes at which its values are estimated, what a record says of each, and the estimate."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,29 +16,44 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A nonlinearity of an input that is damaged.
+    """A nonlinearity of an input that is damaged; printed as a table after its refit.
 
     Attributes:
-        name: "actuator:u1", with the number of the function where the input has several.
+        name: the input, with the number of the function where it has several.
         column: its index among the nonlinearities of the model.
         basis: the basis of its new values.
-        nodes: (P + 1,) inputs at which its values are estimated.
-        to_nodes: (P + 1, P + 1) of [mu; constant] to those values.
+        to_nodes: (P + 1, P + 1) of [mu; constant] to the values at its nodes.
         healthy: (P + 1,) values before the fault.
         visited: (P + 1,) how many samples after the fault lie at each node, shared between neighbours.
         seen: smallest and largest input after the fault.
         dead: whether it is held flat: the actuator no longer moves.
+        values: (P + 1,) values after the refit, in the scale of the healthy one; empty before.
+        std: (P + 1,) their standard errors, bounds not counted.
+        excitation: smallest eigenvalue of what the record says of the values that it visits, in squared deviations
+            of the innovations per half of the healthy range.
     """
 
     name: str
     column: int
     basis: Triangular
-    nodes: Array
     to_nodes: Array
     healthy: Array
     visited: Array
     seen: tuple[float, float]
-    dead: bool = False
+    dead: bool
+    values: Array
+    std: Array
+    excitation: float = 0.0
+
+    @property
+    def nodes(self) -> Array:
+        """(P + 1,) inputs at which its values are estimated."""
+        return self.basis.nodes
+
+    @property
+    def values_open(self) -> int:
+        """How many values are estimated."""
+        return 1 if self.dead else self.nodes.size
 
     @property
     def half_range(self) -> float:
@@ -50,8 +65,17 @@ class Curve:
         """(P + 1,) whether the record says nothing of a value: less than half a sample lies there."""
         return self.visited < 0.5
 
+    def __str__(self) -> str:
+        """Print the values as a table."""
+        head = f"  {'u':>9}{'before':>12}{'now':>12}{'+-':>10}"
+        rows = [
+            f"  {u:>9.3g}{old:>12.4g}{new:>12.4g}{std:>10.2g}{'  prior only' if unseen else ''}"
+            for u, old, new, std, unseen in zip(self.nodes, self.healthy, self.values, self.std, self.prior_only)
+        ]
+        return "\n".join([f"f of {self.name}", head, *rows])
 
-def curve_of(model: "HammersteinSS", column: int, inputs: Array, raw: Data, nodes: int) -> Curve:
+
+def curve_of(model: "HammersteinSS", column: int, inputs: Array, raw: Data, nodes: int, dead: bool) -> Curve:
     """Return the nodes of a damaged nonlinearity: those of its own hats, or even ones over its range.
 
     Args:
@@ -60,26 +84,21 @@ def curve_of(model: "HammersteinSS", column: int, inputs: Array, raw: Data, node
         inputs: (N, m) after the fault.
         raw: the whole record, whose range is taken where the basis has none.
         nodes: number of even nodes.
+        dead: whether the actuator no longer moves.
     """
     healthy, c = model.nonlinearities[column], model.input_of[column]
-    u = inputs[:, c]
-    basis = healthy.basis
+    u, basis = inputs[:, c], healthy.basis
     if not isinstance(basis, Triangular):
-        interval = basis.interval
+        interval: Any = basis.interval
         if interval is None:
             whole = np.concatenate([part.u[:, c] for part in raw.experiments])
             interval = float(np.nanmin(whole)), float(np.nanmax(whole))
             if not interval[0] < interval[1]:
                 interval = interval[0] - 0.5, interval[1] + 0.5
-        outside = "clamp" if basis.outside == "error" else basis.outside
-        basis = Triangular(nodes - 1, interval, outside)
+        basis = Triangular(nodes - 1, interval, "clamp" if basis.outside == "error" else basis.outside)
     at = basis.nodes
-    to_nodes = np.column_stack([basis.values(at), np.ones(at.size)])
     weights = np.maximum(1 - np.abs(np.clip(u, at[0], at[-1])[:, None] - at) / (at[1] - at[0]), 0.0)
-    several = model.input_of.count(c) > 1
-    number = [i for i, of in enumerate(model.input_of) if of == c].index(column) + 1
-    name = model.inputs[c] + f" {number}" * several
-    return Curve(
-        name, column, basis, at, to_nodes, np.asarray(healthy(at), dtype=float), weights.sum(axis=0),
-        (float(u.min()), float(u.max())),
-    )
+    mine = [i for i, of in enumerate(model.input_of) if of == c]
+    name = model.inputs[c] + f" {mine.index(column) + 1}" * (len(mine) > 1)
+    return Curve(name, column, basis, np.column_stack([basis.values(at), np.ones(at.size)]), np.asarray(healthy(at)),
+                 weights.sum(axis=0), (float(u.min()), float(u.max())), dead, np.zeros(0), np.zeros(0))

@@ -98,7 +98,7 @@ def _tables(found: Reformulation) -> list[Table]:
     for one in () if found.schedule is None else found.schedule.values:
         rows = [
             (number(u, 4), number(old, 4), number(new, 4), number(std, 2), "prior only" if unseen else "")
-            for u, old, new, std, unseen in zip(one.u, one.healthy, one.values, one.std, one.prior_only)
+            for u, old, new, std, unseen in zip(one.nodes, one.healthy, one.values, one.std, one.prior_only)
         ]
         note = (
             f"Inputs after the fault from {one.seen[0]:.4g} to {one.seen[1]:.4g}; smallest eigenvalue of what the "

@@ -67,11 +67,11 @@ def _input(ax: Axes, found: "Reformulation", shown: "tuple[MemberModel, ...]", c
             values = [] if member.schedule is None else [v for v in member.schedule.values if _of(v.name, found, c)]
             if values:
                 one = values[columns.index(i)] if len(values) > columns.index(i) else values[0]
-                ax.plot(one.u, one.values, color=colour, label=name)
-                ax.fill_between(one.u, one.values - 2 * one.std, one.values + 2 * one.std, color=colour, alpha=0.2,
+                ax.plot(one.nodes, one.values, color=colour, label=name)
+                ax.fill_between(one.nodes, one.values - 2 * one.std, one.values + 2 * one.std, color=colour, alpha=0.2,
                                 linewidth=0)
-                ax.plot(one.u[~one.prior_only], one.values[~one.prior_only], "o", color=colour, markersize=4)
-                ax.plot(one.u[one.prior_only], one.values[one.prior_only], "o", color=colour, markersize=4,
+                ax.plot(one.nodes[~one.prior_only], one.values[~one.prior_only], "o", color=colour, markersize=4)
+                ax.plot(one.nodes[one.prior_only], one.values[one.prior_only], "o", color=colour, markersize=4,
                         markerfacecolor="white", label="prior only" if one.prior_only.any() else None)
             else:
                 ax.plot(u, actuator_values(member.model, found.healthy, i, u), color=colour, label=name)
@@ -100,7 +100,7 @@ def _attainable(ax: Axes, found: "Reformulation", shown: "tuple[MemberModel, ...
     if before is not None:
         _outline(ax, before, MUTED, "before", "--")
     for member, colour in zip(shown, COLOURS):
-        if member.allocation is not None and member.allocation.problem is not None:
+        if member.allocation is not None and member.allocation.problem.linear:
             _outline(ax, member.allocation, colour, "now" if len(shown) == 1 else shorten(member.label, 20), "-")
     ax.set(title="outputs that can be held", xlabel=plain(shorten(names[0])), ylabel=plain(shorten(names[1])))
     if ax.get_legend_handles_labels()[0]:

@@ -5,21 +5,22 @@ Its innovations are linear in the values of a damaged nonlinearity, since the co
 the other parameters they are linearised.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.record import Data
-from optid.errors import DataError, RankError, StructureError
+from optid.data.stretches import interpolated
+from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.faults.repair.curves import Curve, curve_of
-from optid.faults.repair.windows import Window, cut, fed, observed
 from optid.faults.signatures import Candidate
-from optid.faults.whitening import Predictor, predictor
+from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models.experiments import in_units_of
 from optid.models.nonlinearity import Nonlinearity
 
@@ -29,10 +30,10 @@ if TYPE_CHECKING:
 NODES = 7
 """Values of a damaged nonlinearity that are estimated, where it has no nodes of its own."""
 
-MATRICES = ("A", "B", "C", "D")
+LONGEST = 20_000
+"""Samples after the fault that are used at most."""
 
-HELD = 1e12
-"""Inverse variance of what does not move."""
+MATRICES = ("A", "B", "C", "D")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,28 @@ class Prior:
                 raise StructureError(f"prior: {word} = {getattr(self, word)!r}; a positive number is needed.")
 
 
+class Window(NamedTuple):
+    """A record from the sample before the fault on, or from the fault on where nothing is known before it.
+
+    Attributes:
+        u: (N, m) inputs.
+        y: (N, l) readings.
+        present: (N, l) whether a reading is there.
+        fed: (N, n) what measured outputs drive the state with: E g(y) + L y, missing readings interpolated.
+        x0: (n,) predicted state at the first sample; unknown where not held.
+        e0: (l,) innovation there.
+        held: whether the first sample is before the fault: its innovation belongs to the healthy plant.
+    """
+
+    u: Array
+    y: Array
+    present: Array
+    fed: Array
+    x0: Array
+    e0: Array
+    held: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Refitting:
     """A record after a fault and what is open in the model.
@@ -84,39 +107,41 @@ class Refitting:
     prior: Prior
 
     @cached_property
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the unknowns, in their order."""
-        found: dict[str, tuple[int, ...]] = {}
+    def unknowns(self) -> dict[str, Array]:
+        """The unknowns by name, in their order, at the healthy plant."""
+        found: dict[str, Array] = {}
         for curve in self.curves:
-            found[f"mu[{curve.name}]"] = (curve.basis.size,)
-            found[f"constant[{curve.name}]"] = (1,)
-        found |= {f"size[{c.label}]": (c.into_state.shape[1],) for c in self.offsets}
+            coefficients: Any = np.linalg.solve(curve.to_nodes, curve.healthy)
+            found[f"mu[{curve.name}]"], found[f"constant[{curve.name}]"] = coefficients[:-1], coefficients[-1:]
+        found |= {f"size[{c.label}]": np.zeros(c.into_state.shape[1]) for c in self.offsets}
         if self.whole:
-            found |= {name: getattr(self.model, name).shape for name in MATRICES}
-            found |= {f"mu {i + 1}": self.model.nonlinearities[i].mu.shape for i in self.others}
-        if any(window.free_start for window in self.windows):
-            found["x0"] = (len(self.windows), self.model.nx)
+            found |= {name: getattr(self.model, name) for name in MATRICES}
+            found |= {f"mu {i + 1}": self.model.nonlinearities[i].mu for i in self.others}
+        if not all(window.held for window in self.windows):
+            found["x0"] = np.array([window.x0 for window in self.windows])
         return found
 
     @cached_property
     def others(self) -> tuple[int, ...]:
         """Healthy nonlinearities with a shape of their own."""
         damaged = {curve.column for curve in self.curves}
-        return tuple(
-            i for i, f in enumerate(self.model.nonlinearities)
-            if i not in damaged and f.basis.size > 1 and not isinstance(f.basis, Linear)
-        )
+        return tuple(i for i, f in enumerate(self.model.nonlinearities)
+                     if i not in damaged and f.basis.size > 1 and not isinstance(f.basis, Linear))
 
     @cached_property
     def slices(self) -> dict[str, slice]:
         """Where each unknown lies in the vector, flattened row by row."""
-        edges = np.cumsum([0, *(int(np.prod(shape)) for shape in self.shapes.values())])
-        return {name: slice(int(a), int(b)) for name, a, b in zip(self.shapes, edges, edges[1:])}
+        edges = np.cumsum([0, *(value.size for value in self.unknowns.values())]).tolist()
+        return {name: slice(a, b) for name, a, b in zip(self.unknowns, edges, edges[1:])}
 
-    @property
-    def size(self) -> int:
-        """Number of unknowns."""
-        return max((part.stop for part in self.slices.values()), default=0)
+    def part(self, curve: Curve) -> slice:
+        """Return where [mu; constant] of a damaged nonlinearity lie."""
+        return slice(self.slices[f"mu[{curve.name}]"].start, self.slices[f"constant[{curve.name}]"].stop)
+
+    @cached_property
+    def start(self) -> Array:
+        """The healthy plant as a vector of unknowns."""
+        return self.pack(self.unknowns)
 
     @property
     def readings(self) -> int:
@@ -130,52 +155,43 @@ class Refitting:
 
     def unpack(self, theta: Array) -> dict[str, Array]:
         """Return the unknowns by name."""
-        return {name: theta[self.slices[name]].reshape(shape) for name, shape in self.shapes.items()}
+        return {name: theta[self.slices[name]].reshape(value.shape) for name, value in self.unknowns.items()}
 
     def pack(self, values: Any) -> Array:
         """Return the vector of unknowns given by name."""
-        theta = np.empty(self.size)
-        for name, part in self.slices.items():
-            theta[part] = np.ravel(values[name])
-        return theta
+        return np.concatenate([np.zeros(0), *(np.ravel(values[name]) for name in self.unknowns)])
 
     @cached_property
-    def start(self) -> Array:
-        """The healthy plant as a vector of unknowns."""
-        values: dict[str, Array] = {}
+    def held(self) -> Array:
+        """(q,) unknowns that stay zero: the shape of a dead actuator, and a matrix of zeros."""
+        held = np.zeros(self.start.size, dtype=bool)
         for curve in self.curves:
-            coefficients: Any = np.linalg.solve(curve.to_nodes, curve.healthy)
-            values[f"mu[{curve.name}]"], values[f"constant[{curve.name}]"] = coefficients[:-1], coefficients[-1:]
-        values |= {f"size[{c.label}]": np.zeros(c.into_state.shape[1]) for c in self.offsets}
-        if self.whole:
-            values |= {name: getattr(self.model, name) for name in MATRICES}
-            values |= {f"mu {i + 1}": self.model.nonlinearities[i].mu for i in self.others}
-        if "x0" in self.shapes:
-            values["x0"] = np.array([window.x0 for window in self.windows])
-        return self.pack(values)
+            held[self.slices[f"mu[{curve.name}]"]] = curve.dead
+        for name in self.anchored:
+            held[self.slices[name]] = not self.unknowns[name].any()
+        return held
 
-    def spread(self) -> Array:
-        """Return the standard deviations of the prior of every unknown; inf where nothing is believed."""
-        spread = np.full(self.size, np.inf)
-        if self.whole:
-            for name in (*MATRICES, *(f"mu {i + 1}" for i in self.others)):
-                values = self.start[self.slices[name]]
-                spread[self.slices[name]] = self.prior.healthy * np.abs(values).max(initial=0.0)
-        return spread
+    @property
+    def anchored(self) -> tuple[str, ...]:
+        """Names of the unknowns that are believed to be those of the healthy plant."""
+        return (*MATRICES, *(f"mu {i + 1}" for i in self.others)) if self.whole else ()
 
     def believed(self) -> tuple[Array, Array]:
         """Return what is believed beforehand: rows of a least-squares problem in [z; shares lost], and their target."""
-        width = self.size + len(self.curves)
-        spread = self.spread()
-        finite = np.flatnonzero(np.isfinite(spread) & (spread > 0))
-        rows, wanted = [np.eye(width)[finite] / spread[finite, None]], [self.start[finite] / spread[finite]]
+        width = self.start.size + len(self.curves)
+        rows, wanted = [np.zeros((0, width))], [np.zeros(0)]
+        for name in self.anchored:
+            part, values = self.slices[name], np.ravel(self.unknowns[name])
+            if values.any():
+                spread = self.prior.healthy * np.abs(values).max()
+                rows.append(np.eye(width)[part] / spread)
+                wanted.append(values / spread)
         for i, curve in enumerate(self.curves):
-            first = self.slices[f"mu[{curve.name}]"].start
-            part, count, half = slice(first, first + curve.nodes.size), curve.nodes.size, curve.half_range
+            count, half, part = curve.nodes.size, curve.half_range, self.part(curve)
             near, bend = np.zeros((count, width)), np.zeros((max(count - 2, 0), width))
             near[:, part] = curve.to_nodes / (self.prior.damaged * half)
             second: Any = np.diff(np.eye(count), n=2, axis=0) / (self.prior.curvature * half)
-            bend[:, part], bend[:, self.size + i] = second @ curve.to_nodes, second @ curve.healthy
+            bend[:, part], bend[:, self.start.size + i] = second @ curve.to_nodes, second @ curve.healthy
             rows += [near, bend]
             wanted += [curve.healthy / (self.prior.damaged * half), second @ curve.healthy]
         return np.vstack(rows), np.concatenate(wanted)
@@ -187,134 +203,101 @@ class Refitting:
         """
         r, s = self.linearised(self.start)
         rows, wanted = self.believed()
-        shares = np.eye(self.size + len(self.curves))[self.size :] / 0.5
+        shares = np.eye(rows.shape[1])[self.start.size :] / 0.5
         rows, wanted = np.vstack([rows, shares]), np.concatenate([wanted, np.ones(len(shares))])
-        full = np.column_stack([s, np.zeros((len(s), len(self.curves)))])
+        full, target = np.pad(s, ((0, 0), (0, len(self.curves)))), s @ self.start - r
         before, after = rows.T @ rows, rows.T @ rows + full.T @ full
         told = rows.any(axis=0)  # the others, as an unknown initial state, have a flat prior
         before, mean = before[np.ix_(told, told)], np.zeros(len(before))
         mean[told] = np.linalg.solve(before, (rows.T @ wanted)[told])
-        point = np.linalg.solve(after, rows.T @ wanted + full.T @ (s @ self.start - r))
-        left = float(np.sum((full @ point - (s @ self.start - r)) ** 2) + np.sum((rows @ point - wanted) ** 2))
+        point = np.linalg.solve(after, rows.T @ wanted + full.T @ target)
+        left = float(np.sum((full @ point - target) ** 2) + np.sum((rows @ point - wanted) ** 2))
         left -= float(np.sum((rows @ mean - wanted) ** 2))
         return -0.5 * (left + float(np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]))
 
     def held_out(self, samples: int) -> "Refitting":
         """Return the same without the last samples of the last window."""
         last = self.windows[-1]
-        kept = len(last.u) - samples
-        cut = last._replace(u=last.u[:kept], y=last.y[:kept], present=last.present[:kept])
-        return replace(self, windows=(*self.windows[:-1], cut))
+        shorter = Window(*(part[: len(last.u) - samples] for part in last[:4]), *last[4:])
+        return replace(self, windows=(*self.windows[:-1], shorter))
 
-    def information(self, theta: Array, sensitivities: Array) -> Array:
-        """Return the inverse covariance (q, q) of the unknowns: of the record and of what is believed beforehand.
+    def covariance(self, sensitivities: Array) -> Array:
+        """Return the covariance (q, q) of the unknowns, of the record and of what is believed beforehand.
 
-        Bounds are not part of it. Singular along what neither says anything of.
+        Bounds are not part of it; along what neither says anything of it is zero.
         """
-        found = sensitivities.T @ sensitivities
-        spread = self.spread()
-        believed = np.isfinite(spread) & (spread > 0)
-        found[believed, believed] += 1 / spread[believed] ** 2
-        for curve in self.curves:
-            start = self.slices[f"mu[{curve.name}]"].start
-            part = slice(start, start + curve.nodes.size)  # mu, then its constant
-            if curve.dead:
-                shape = np.arange(start, start + curve.basis.size)
-                found[shape, :], found[:, shape] = 0.0, 0.0
-                found[shape, shape] = HELD
-            bend = np.diff(np.eye(curve.nodes.size), n=2, axis=0) / (self.prior.curvature * curve.half_range)
-            gain = bend @ curve.healthy
-            if gain @ gain > 0:  # the share lost is free: curvature along that of the healthy one costs nothing
-                bend = bend - np.outer(gain, gain @ bend) / (gain @ gain)
-            rows = np.vstack([np.eye(curve.nodes.size) / (self.prior.damaged * curve.half_range), bend])
-            rows = rows @ curve.to_nodes
-            found[part, part] += rows.T @ rows
-        return found
+        rows, _ = self.believed()
+        rows = np.vstack([rows, np.pad(sensitivities, ((0, 0), (0, len(self.curves))))])
+        free = np.flatnonzero(np.append(~self.held, np.ones(len(self.curves), dtype=bool)))
+        found = np.zeros((rows.shape[1],) * 2)
+        found[np.ix_(free, free)] = np.linalg.pinv(rows[:, free].T @ rows[:, free], hermitian=True)
+        return found[: self.start.size, : self.start.size]
 
     def model_at(self, theta: Array) -> "HammersteinSS":
         """Return the model of a vector of unknowns; constants of damaged nonlinearities go to those of the model."""
         values = self.unpack(theta)
         changes: dict[str, Any] = {name: values[name] for name in MATRICES if self.whole}
         B, D = changes.get("B", self.model.B), changes.get("D", self.model.D)
-        functions = list(self.model.nonlinearities)
+        functions, constants = list(self.model.nonlinearities), np.zeros(B.shape[1])
         for i in self.others if self.whole else ():
             functions[i] = replace(functions[i], mu=values[f"mu {i + 1}"])
-        offset_x, offset_y = np.array(self.model.offset_x), np.array(self.model.offset_y)
         for curve in self.curves:
             functions[curve.column] = Nonlinearity(curve.basis, values[f"mu[{curve.name}]"])
-            constant = float(values[f"constant[{curve.name}]"][0])
-            offset_x += B[:, curve.column] * constant
-            offset_y += D[:, curve.column] * constant
-        return replace(
-            self.model, nonlinearities=tuple(functions), offset_x=offset_x, offset_y=offset_y, gauge="none", **changes
-        )
+            constants[curve.column] = values[f"constant[{curve.name}]"][0]
+        return replace(self.model, nonlinearities=tuple(functions), offset_x=self.model.offset_x + B @ constants,
+                       offset_y=self.model.offset_y + D @ constants, gauge="none", **changes)
 
     def linearised(self, theta: Array) -> tuple[Array, Array]:
         """Return the whitened innovations (M,) at a point and their sensitivities (M, q), those present."""
-        model = self.model_at(theta)
-        values = self.unpack(theta)
+        model, values = self.model_at(theta), self.unpack(theta)
         parts = [self._window(model, values, number) for number in range(len(self.windows))]
         return np.concatenate([r for r, _ in parts]), np.vstack([s for _, s in parts])
 
     def _window(self, model: "HammersteinSS", values: dict[str, Array], number: int) -> tuple[Array, Array]:
         w = self.windows[number]
         f = model.expanded(w.u)
-        drive = f @ model.B.T + model.offset_x + fed(model, w.y)
-        direct = f @ model.D.T + model.offset_y
+        drive, direct = f @ model.B.T + model.offset_x + w.fed, f @ model.D.T + model.offset_y
         for c in self.offsets:
             course = _course(c.kind, len(w.u), w.held)
             drive[:-1] += np.outer(course[1:], c.into_state @ values[f"size[{c.label}]"])
             direct += np.outer(course, c.into_output @ values[f"size[{c.label}]"])
-        x = values["x0"][number] if "x0" in values else w.x0
-        states, innovations = observed(
-            model, self.steady.K, (drive, direct), w.y, x, w.e0 if w.held else None
-        )
-        steady = replace(self.steady, A=model.A, C=model.C, L=np.zeros_like(model.L))
-        for curve in self.curves:  # its constant went to those of the model
-            f[:, curve.column] += values[f"constant[{curve.name}]"]
-        into_state, into_output = self._additions(model, w, f, states, number)
         shown = w.present.copy()
         shown[: int(w.held)] = False  # an innovation that is given does not depend on the parameters
-        response = steady.respond(into_state, into_output, shown)
-        r: Any = steady.whitened(innovations, shown)
-        s: Any = steady.whitened(response, shown)
-        return r[shown], -s[shown]
+        drive[0] += self.steady.K @ w.e0
+        x = values["x0"][number] if "x0" in values else w.x0
+        steady = replace(self.steady, A=model.A, C=model.C, L=np.zeros_like(model.L))
+        moved, seen = -np.vstack([x, drive[:-1]])[:, :, None], np.nan_to_num(w.y - direct)[:, :, None]
+        innovations = np.where(shown, steady.respond(moved, seen, shown)[..., 0], 0.0)
+        for curve in self.curves:  # its constant went to those of the model
+            f[:, curve.column] += values[f"constant[{curve.name}]"]
+        states = _states(steady, drive, innovations, x) if self.whole else np.zeros((0, model.nx))
+        into_state, into_output = self._additions(model, w, f, states)
+        if "x0" in self.slices:
+            first = self.slices["x0"].start + number * model.nx
+            into_state[0, :, first : first + model.nx] = np.eye(model.nx)
+        response = steady.whitened(steady.respond(into_state, into_output, shown), shown)
+        return steady.whitened(innovations, shown)[shown], -response[shown]
 
-    def _additions(self, model: "HammersteinSS", w: Window, f: Array, states: Array, number: int
-                   ) -> tuple[Array, Array]:
+    def _additions(self, model: "HammersteinSS", w: Window, f: Array, states: Array) -> tuple[Array, Array]:
         """What a unit of every unknown adds to the states (N, n, q) and to the outputs (N, l, q)."""
         count, n, l = len(w.u), model.nx, model.l  # noqa: E741
-        into_state, into_output = np.zeros((count, n, self.size)), np.zeros((count, l, self.size))
-
-        def add(name: str, signal: Array, B: Array, D: Array) -> None:
-            """A signal (N, k) through columns (n, k) and (l, k), or through one column."""
-            part = self.slices[name]
-            into_state[1:, :, part] += signal[:-1, None, :] * B
-            into_output[:, :, part] += signal[:, None, :] * D
-
-        for curve in self.curves:
-            b, d = model.B[:, [curve.column]], model.D[:, [curve.column]]
-            add(f"mu[{curve.name}]", curve.basis.values(w.u[:, model.input_of[curve.column]]), b, d)
-            add(f"constant[{curve.name}]", np.ones((count, 1)), b, d)
+        into_state, into_output = np.zeros((count, n, self.start.size)), np.zeros((count, l, self.start.size))
+        damaged = [(self.part(curve), curve.column) for curve in self.curves]
+        for part, i in [*damaged, *((self.slices[f"mu {i + 1}"], i) for i in self.others if self.whole)]:
+            signal = model.nonlinearities[i].basis.values(w.u[:, model.input_of[i]])
+            signal = np.column_stack([signal, np.ones((count, part.stop - part.start - signal.shape[1]))])
+            into_state[1:, :, part] = signal[:-1, None, :] * model.B[:, [i]]
+            into_output[:, :, part] = signal[:, None, :] * model.D[:, [i]]
         for c in self.offsets:
-            course, part = _course(c.kind, count, w.held), self.slices[f"size[{c.label}]"]
-            into_state[1:, :, part] += course[1:, None, None] * c.into_state
-            into_output[:, :, part] += course[:, None, None] * c.into_output
-        if self.whole:
-            for name, signal, rows in (("A", states, n), ("B", f, n), ("C", states, l), ("D", f, l)):
-                each = signal.shape[1]
-                for i in range(rows):
-                    first = self.slices[name].start + i * each
-                    if name in "AB":
-                        into_state[1:, i, first : first + each] += signal[:-1]
-                    else:
-                        into_output[:, i, first : first + each] += signal
-            for i in self.others:
-                values = model.nonlinearities[i].basis.values(w.u[:, model.input_of[i]])
-                add(f"mu {i + 1}", values, model.B[:, [i]], model.D[:, [i]])
-        if "x0" in self.slices:
-            first = self.slices["x0"].start + number * n
-            into_state[0, :, first : first + n] = np.eye(n)
+            course, part = _course(c.kind, count, w.held)[:, None, None], self.slices[f"size[{c.label}]"]
+            into_state[1:, :, part], into_output[:, :, part] = course[1:] * c.into_state, course * c.into_output
+        for name, signal in zip(MATRICES, (states, f, states, f)) if self.whole else ():
+            rows = np.einsum("ij,nk->nijk", np.eye(n if name in "AB" else l), signal)
+            rows = rows.reshape(count, len(rows[0]), -1)
+            if name in "AB":
+                into_state[1:, :, self.slices[name]] = rows[:-1]
+            else:
+                into_output[:, :, self.slices[name]] = rows
         return into_state, into_output
 
 
@@ -345,27 +328,60 @@ def refitting(
     Warns:
         DataWarning: a record that is longer than what is used.
     """
-    prior = Prior() if prior is None else prior
-    steady = predictor(model)
-    raw = in_units_of(model, data)
-    windows = []
-    for number, part in enumerate(raw.experiments):
-        first = onset if number == 0 else 0
-        if first >= len(part.y):
-            raise DataError(f"The onset {first} lies beyond the record of {len(part.y)} samples.")
-        windows.append(cut(model, steady, part.u, part.y, first, known_start))
+    steady, raw = predictor(model), in_units_of(model, data)
+    windows = tuple(_cut(model, steady, part.u, part.y, 0 if number else onset, known_start)
+                    for number, part in enumerate(raw.experiments))
     inputs = np.vstack([w.u[int(w.held) :] for w in windows])
-    curves = tuple(replace(curve_of(model, i, inputs, raw, nodes), dead=i in dead) for i in damaged)
-    found = Refitting(model, steady, tuple(windows), curves, tuple(offsets), whole, prior)
-    needed = sum(1 if curve.dead else curve.nodes.size for curve in curves)
-    needed += sum(c.into_state.shape[1] for c in offsets)
+    curves = tuple(curve_of(model, i, inputs, raw, nodes, i in dead) for i in damaged)
+    found = Refitting(model, steady, windows, curves, tuple(offsets), whole, prior or Prior())
+    needed = sum(curve.values_open for curve in curves) + sum(c.into_state.shape[1] for c in offsets)
     if found.readings < needed:
-        least = -(-needed // model.l)
         raise RankError(
-            f"{found.readings} readings after the fault, and {needed} values to estimate: at least {least} samples "
-            f"with every output are needed. Until then the healthy model stands as the prior."
+            f"{found.readings} readings after the fault, and {needed} values to estimate: at least "
+            f"{-(-needed // model.l)} samples with every output are needed. Until then the healthy model stands as "
+            "the prior."
         )
     return found
+
+
+def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> Window:
+    """Cut a record at the onset of a fault; before it the state is predicted from what the plant did."""
+    if onset >= len(y):
+        raise DataError(f"The onset {onset} lies beyond the record of {len(y)} samples.")
+    if len(y) - onset > LONGEST:
+        warnings.warn(f"Of {len(y) - onset} samples after the fault the last {LONGEST} are used.", DataWarning,
+                      stacklevel=4)
+        onset, known_start = len(y) - LONGEST, False
+    start, before = max(onset - 1, 0), slice(max(0, onset - 4 * steady.settling), onset)
+    missing = np.isnan(u[start:]).any(axis=1)
+    if missing.any():
+        raise DataError(f"Sample {start + int(np.argmax(missing))} lacks an input: a refit needs every input from the "
+                        "fault on.")
+    fed = np.zeros((len(y), model.nx))
+    if model.feedback or model.L.any():
+        filled = interpolated(y)
+        fed = filled @ model.L.T
+        for g, o, column in zip(model.feedback, model.output_of, model.E.T):
+            fed += np.outer(g(filled[:, o]), column)
+    x0, e0 = np.zeros(model.nx), np.zeros(model.l)
+    known = known_start and 3 * (before.stop - before.start) >= steady.settling  # 1e-2 of an error is left
+    held = known and not np.isnan(u[before]).any() and not np.isnan(y[before]).all()
+    if held:
+        part = Data(u[before], np.zeros(y[before].shape), model.dt, model.inputs, model.outputs)
+        part = part.mapped(lambda u: u, lambda _: y[before])  # a broken sensor has no reading at all
+        white = whiten(model, part, scale=steady)
+        x0, e0 = white.states[-1], np.nan_to_num(white.innovations[-1])
+    after = slice(start if held else onset, None)
+    return Window(u[after], y[after], ~np.isnan(y[after]), fed[after], x0, e0, held)
+
+
+def _states(steady: Predictor, drive: Array, innovations: Array, x0: Array) -> Array:
+    """States (N, n) of a predictor from its innovations."""
+    from optid.faults.kernels import propagate
+
+    states = np.empty(drive.shape)
+    propagate(np.ascontiguousarray(steady.A), drive + innovations @ steady.K.T, x0, states)
+    return states
 
 
 def _course(kind: str, count: int, held: bool) -> Array:

@@ -14,10 +14,9 @@ from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.records import record_of
-from optid.faults.repair.allocation import Allocation, Target, allocate
-from optid.faults.repair.ambiguity import Ambiguity, advise, robust_allocation
+from optid.faults.repair.allocation import Allocation, Target, allocate, robust_allocation
+from optid.faults.repair.ambiguity import Ambiguity, advise
 from optid.faults.repair.damage import Damage, check_answers, damages, merged
-from optid.faults.repair.inversion import inverse
 from optid.faults.repair.refitting import NODES, Prior
 from optid.faults.repair.schedule import Schedule, refit
 from optid.faults.repair.virtual_sensor import Observer, observer
@@ -183,7 +182,11 @@ def reformulate(
     if distrusted and not kept:
         notes.append("every sensor is suspected by some member: all are used until one is left")
     allocation, more = _allocated(model, bounds)
-    robust, why_not = _robust(model, broken, low, high, weights, solver)
+    robust, why_not = None, ""
+    try:
+        robust = robust_allocation(model, broken, low=low, high=high, weights=weights, solver=solver)
+    except StructureError as error:
+        why_not = str(error)
     u = None if data is None else np.asarray(data.raw().experiments[0].u)
     advice = advise(model, broken, u, robust, why_not, action=if_ambiguous, seed=seed)
     return Reformulation(
@@ -252,16 +255,3 @@ def _allocated(model: "HammersteinSS", bounds: dict[str, Any]) -> tuple[Allocati
         return None, [f"no allocation: input {unbounded[0]} has no range; give low= and high="]
     found = allocate(model, **bounds)
     return found, list(found.messages)
-
-
-def _robust(model: "HammersteinSS", broken: list[Damage], low: Any, high: Any, weights: Any, solver: Any
-            ) -> tuple[Any, str]:
-    from optid.faults.repair.allocation import _bounds
-
-    try:
-        least, most = _bounds(model, low, high)
-        w = np.ones(model.l) if weights is None else np.broadcast_to(np.asarray(weights, dtype=float), (model.l,))
-        inverses = tuple(inverse(f, least[c], most[c]) for f, c in zip(model.nonlinearities, model.input_of))
-        return robust_allocation(model, inverses, broken, least, most, np.array(w), solver), ""
-    except StructureError as error:
-        return None, str(error)

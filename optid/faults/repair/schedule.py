@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.record import Data
@@ -33,42 +32,7 @@ DRAWS = 100
 BENDS = (0.01, 0.03, 0.1, 0.2)
 """Curvatures of the prior that are tried."""
 
-STAGES = ("prior", "affected only", "all with prior")
-
-
-@dataclass(frozen=True, eq=False)
-class Values:
-    """A damaged nonlinearity after its refit.
-
-    Attributes:
-        name: the input.
-        u: (P + 1,) nodes.
-        healthy: (P + 1,) values before.
-        values: (P + 1,) values now, in the scale of the healthy one.
-        std: (P + 1,) their standard errors, bounds not counted.
-        prior_only: (P + 1,) whether the record says nothing of a value.
-        seen: smallest and largest input in the record.
-        excitation: smallest eigenvalue of what the record says of the values that it visits, in squared deviations
-            of the innovations per half of the healthy range.
-    """
-
-    name: str
-    u: Array
-    healthy: Array
-    values: Array
-    std: Array
-    prior_only: NDArray[np.bool_]
-    seen: tuple[float, float]
-    excitation: float
-
-    def __str__(self) -> str:
-        """Print the values as a table."""
-        head = f"  {'u':>9}{'before':>12}{'now':>12}{'+-':>10}"
-        rows = [
-            f"  {u:>9.3g}{old:>12.4g}{new:>12.4g}{std:>10.2g}{'  prior only' if unseen else ''}"
-            for u, old, new, std, unseen in zip(self.u, self.healthy, self.values, self.std, self.prior_only)
-        ]
-        return "\n".join([f"f of {self.name}", head, *rows])
+STAGES = ("affected only", "all with prior")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +56,7 @@ class Schedule:
     samples: int
     least: int
     held_out: dict[str, float]
-    values: tuple[Values, ...]
+    values: tuple[Curve, ...]
     offsets: dict[str, Array]
     fit_interval: tuple[float, float]
     active: tuple[str, ...]
@@ -103,7 +67,8 @@ class Schedule:
         """Say what was refitted from what, and why."""
         lines = [f"refit: {self.stage}, {self.samples} samples after the fault ({self.reason})"]
         if self.solution is not None:
-            lines.append(f"  {self.solution.solver}: {self.solution.status}, {self._proof()}")
+            proof = f"gap {self.solution.gap:.1e}" if self.solution.proof else "no proof of global optimality"
+            lines.append(f"  {self.solution.solver}: {self.solution.status}, {proof}")
         if self.active:
             lines.append(f"  binding: {', '.join(self.active)}")
         if np.isfinite(self.fit_interval[0]):
@@ -111,10 +76,6 @@ class Schedule:
             lines.append(f"  expected simulation fit {fit_words(low, high)}")
         lines += [f"  {name}: {np.array2string(size, precision=4)}" for name, size in self.offsets.items()]
         return "\n".join([*lines, *(str(values) for values in self.values)])
-
-    def _proof(self) -> str:
-        assert self.solution is not None
-        return f"gap {self.solution.gap:.1e}" if self.solution.proof else "no proof of global optimality"
 
 
 def fit_words(low: float, high: float) -> str:
@@ -164,46 +125,53 @@ def refit(
                         "too few for a refit: the model is what the diagnosis says")
         return damage.believed(model), none
     if prior is None and narrow.curves:
-        prior = likeliest(narrow)
-        how["prior"], narrow = prior, replace(narrow, prior=prior)
+        narrow = replace(narrow, prior=likeliest(narrow))
+        how["prior"] = narrow.prior
     scores: dict[str, float] = {}
     reason = "as asked for"
     if stage == "auto":
         stage, reason = "affected only", f"fewer than {FEWEST} samples: all parameters are not tried"
-        if narrow.samples >= FEWEST and not damage.dead:
-            wide = refitting(model, data, damage.onset, **how, whole=True)
-            scores = _scores(narrow, wide, constraints, solver)
-            better = scores["affected only"] - scores["all with prior"] > MARGIN / _held(narrow)[1]
-            stage = "all with prior" if better else "affected only"
-            reason = "by hold-out"
-        elif damage.dead:
-            reason = "a dead actuator has one value"
-    problem = narrow if stage == "affected only" else refitting(model, data, damage.onset, **how, whole=True)
+        if damage.dead:
+            reason = "a dead actuator has one value" if narrow.samples >= FEWEST else reason
+        elif narrow.samples >= FEWEST:
+            last = narrow.windows[-1]
+            samples = max(3, int(HELD_OUT * (len(last.u) - int(last.held))))
+            readings = max(1, int(last.present[-samples:].sum()))
+            for word in STAGES:
+                problem = replace(narrow, whole=word == "all with prior")
+                theta = _solved(problem.held_out(samples), constraints, solver).model.theta
+                scores[word] = float(np.sum(problem.linearised(theta)[0][-readings:] ** 2)) / readings
+            better = scores["affected only"] - scores["all with prior"] > MARGIN / readings
+            stage, reason = STAGES[int(better)], "by hold-out"
+    problem = replace(narrow, whole=stage == "all with prior")
     found = _solved(problem, constraints, solver)
-    least = -(-sum(1 if c.dead else c.nodes.size for c in problem.curves) // model.l)
-    return _told(problem, found, stage, least, scores, reason, seed)
+    theta, model = found.model.theta, found.model.model
+    sensitivities = problem.linearised(theta)[1]
+    covariance = problem.covariance(sensitivities)
+    curves = tuple(_estimated(problem, curve, theta, covariance, sensitivities) for curve in problem.curves)
+    for one in curves:
+        if one.prior_only.any() and not one.dead:
+            at = ", ".join(f"{u:.3g}" for u in one.nodes[one.prior_only])
+            warnings.warn(
+                f"{one.name}: no sample after the fault lies near {at} (inputs from {one.seen[0]:.3g} to "
+                f"{one.seen[1]:.3g}): the values there are prior only.", DataWarning, stacklevel=3,
+            )
+    offsets = {c.label: problem.unpack(theta)[f"size[{c.label}]"] for c in problem.offsets}
+    for c in problem.offsets:
+        last = 1.0 if c.kind != "drift" else float(len(problem.windows[0].u) - int(problem.windows[0].held))
+        model = replace(model, offset_x=model.offset_x + c.into_state @ (last * offsets[c.label]))
+    duals, objective = found.solution.duals, max(found.solution.objective, 1e-300)
+    active = tuple(name for name in found.program.user_constraints
+                   if np.max(np.abs(duals.get(name, 0.0)), initial=0.0) > 1e-6 * objective)
+    least = -(-sum(curve.values_open for curve in curves) // model.l)
+    return model, Schedule(stage, problem.samples, least, scores, curves, offsets,
+                           _fit_interval(problem, theta, covariance, seed), active, found.solution, reason)
 
 
 def likeliest(problem: Refitting) -> Prior:
     """Return the prior whose curvature makes the record most probable: how much a fault bends is not known before."""
-    priors = [Prior(problem.prior.damaged, curvature, problem.prior.healthy) for curvature in BENDS]
+    priors = [replace(problem.prior, curvature=curvature) for curvature in BENDS]
     return max(priors, key=lambda prior: replace(problem, prior=prior).evidence())
-
-
-def _held(problem: Refitting) -> tuple[int, int]:
-    """Samples held out of the last experiment, and their readings."""
-    last = problem.windows[-1]
-    samples = max(3, int(HELD_OUT * (len(last.u) - int(last.held))))
-    return samples, max(1, int(last.present[-samples:].sum()))
-
-
-def _scores(narrow: Refitting, wide: Refitting, constraints: Sequence[Any] | str, solver: Any) -> dict[str, float]:
-    samples, readings = _held(narrow)
-    scores = {}
-    for word, problem in (("affected only", narrow), ("all with prior", wide)):
-        theta = _solved(problem.held_out(samples), constraints, solver).model.theta
-        scores[word] = float(np.sum(problem.linearised(theta)[0][-readings:] ** 2)) / readings
-    return scores
 
 
 def _solved(problem: Refitting, constraints: Sequence[Any] | str, solver: Any) -> Any:
@@ -219,48 +187,13 @@ def _solved(problem: Refitting, constraints: Sequence[Any] | str, solver: Any) -
     return found
 
 
-def _told(problem: Refitting, found: Any, stage: str, least: int, scores: dict[str, float], reason: str, seed: int
-          ) -> tuple["HammersteinSS", Schedule]:
-    theta, model = found.model.theta, found.model.model
-    _, sensitivities = problem.linearised(theta)
-    covariance: Any = np.linalg.pinv(problem.information(theta, sensitivities), hermitian=True)
-    values = tuple(_values(problem, curve, theta, covariance, sensitivities) for curve in problem.curves)
-    for one, curve in zip(values, problem.curves):
-        if one.prior_only.any() and not curve.dead:
-            at = ", ".join(f"{u:.3g}" for u in one.u[one.prior_only])
-            warnings.warn(
-                f"{one.name}: no sample after the fault lies near {at} (inputs from {one.seen[0]:.3g} to "
-                f"{one.seen[1]:.3g}): the values there are prior only.", DataWarning, stacklevel=4,
-            )
-    unpacked = problem.unpack(theta)
-    offsets = {c.label: unpacked[f"size[{c.label}]"] for c in problem.offsets}
-    for c in problem.offsets:
-        last = 1.0 if c.kind != "drift" else float(len(problem.windows[0].u) - int(problem.windows[0].held))
-        size = last * offsets[c.label]
-        model = replace(model, offset_x=model.offset_x + c.into_state @ size)
-    duals = found.solution.duals
-    active = tuple(
-        name for name in found.program.user_constraints
-        if name in duals and np.max(np.abs(duals[name]), initial=0.0) > 1e-6 * max(found.solution.objective, 1e-300)
-    )
-    interval = _fit_interval(problem, theta, covariance, seed)
-    return model, Schedule(stage, problem.samples, least, scores, values, offsets, interval, active, found.solution,
-                           reason)
-
-
-def _values(problem: Refitting, curve: Curve, theta: Array, covariance: Array, sensitivities: Array) -> Values:
-    start = problem.slices[f"mu[{curve.name}]"].start
-    part = slice(start, start + curve.nodes.size)
-    values = curve.to_nodes @ theta[part]
+def _estimated(problem: Refitting, curve: Curve, theta: Array, covariance: Array, sensitivities: Array) -> Curve:
+    part, seen = problem.part(curve), ~curve.prior_only
     spread = curve.to_nodes @ covariance[part, part] @ curve.to_nodes.T
-    by_value: Any = sensitivities[:, part] @ np.linalg.inv(curve.to_nodes) * curve.half_range
-    seen = ~curve.prior_only
-    gram: Any = by_value[:, seen].T @ by_value[:, seen]
-    excitation = float(np.linalg.eigvalsh(gram)[0]) if seen.any() else 0.0
-    return Values(
-        curve.name, curve.nodes, curve.healthy, values, np.sqrt(np.maximum(np.diag(spread), 0.0)),
-        curve.prior_only, curve.seen, max(excitation, 0.0),
-    )
+    by_value: Any = sensitivities[:, part] @ np.linalg.inv(curve.to_nodes)[:, seen] * curve.half_range
+    excitation = float(np.linalg.eigvalsh(by_value.T @ by_value)[0]) if seen.any() else 0.0
+    return replace(curve, values=curve.to_nodes @ theta[part], excitation=max(excitation, 0.0),
+                   std=np.sqrt(np.maximum(np.diag(spread), 0.0)))
 
 
 def _fit_interval(problem: Refitting, theta: Array, covariance: Array, seed: int) -> tuple[float, float]:
