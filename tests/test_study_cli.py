@@ -193,7 +193,7 @@ def test_two_studies_of_one_database_are_never_one(folder):
 
 def test_reasons_that_differ_in_their_numbers_are_one(capsys):
     from optid.cli.study_summary import print_reasons
-    from optid.studies.verdicts.table import columns
+    from optid.studies.storage.rows import columns
 
     failed = [row("a", **FAILED | {"reason": f"no step after {k} iterations"}, repetition=k) for k in range(3)]
     print_reasons(columns([row("b"), row("b", **FAILED | {"reason": "it\nbroke"}), *failed]))

@@ -12,9 +12,9 @@ from optid.backends import Answer
 from optid.errors import DataError
 from optid.program.solution import Residuals, Status
 from optid.solving import solve as solving
+from optid.studies.storage.rows import columns
 from optid.studies.verdicts.comparison import compare
 from optid.studies.verdicts.outcomes import states_of_rows, tabulate
-from optid.studies.verdicts.table import columns
 from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")

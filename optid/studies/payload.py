@@ -1,6 +1,5 @@
 """What the scripts of a study page draw and list: the verdict and its rows as plain JSON values, kept small."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,8 +8,8 @@ from optid.program.solution import GRADIENT
 from optid.studies.storage.rows import BY_NAME, COLUMNS
 from optid.studies.verdicts.advice import carries_over, choice_of_solver
 from optid.studies.verdicts.agreement import Agreement
-from optid.studies.verdicts.outcomes import TIMES, seconds_of, states_of_rows, worst_residual
-from optid.studies.verdicts.profiles import Profile
+from optid.studies.verdicts.averages import Profile
+from optid.studies.verdicts.outcomes import TIMES, Table, seconds_of, states_of_rows, worst_residual
 from optid.studies.verdicts.standings import Section, Standing
 from optid.studies.verdicts.verdict import Verdict
 
@@ -68,7 +67,7 @@ def section_payload(section: Section) -> dict[str, Any]:
             "missing": ranking.missing, "left_out": list(ranking.left_out),
             "apart": bool(ranking.told and ranking.probability < ranking.level),
         },
-    }  # fmt: skip
+    }
 
 
 def _standing(s: Standing, section: Section) -> dict[str, Any]:
@@ -83,7 +82,7 @@ def _standing(s: Standing, section: Section) -> dict[str, Any]:
         "growth": {"slope": number(growth.slope), "low": number(growth.low), "high": number(growth.high),
                    "missing": growth.missing, "n": [number(v) for v in growth.lengths],
                    "t": [number(v) for v in growth.times]},
-    }  # fmt: skip
+    }
 
 
 def _profile(profile: Profile) -> list[list[float | None]]:
@@ -100,10 +99,10 @@ def _agreement(agreement: Agreement) -> dict[str, Any]:
         **{name: getattr(agreement, name).tolist() for name in ("common", "objective", "compared", "model")},
         **{name: [[number(v, 2) for v in row] for row in getattr(agreement, name)]
            for name in ("worst_objective", "worst_model")},
-    }  # fmt: skip
+    }
 
 
-def _columns(table: Mapping[str, np.ndarray], states: np.ndarray, time: str) -> list[dict[str, Any]]:
+def _columns(table: Table, states: np.ndarray, time: str) -> list[dict[str, Any]]:
     made = [
         _texts("state", "solved, or why it does not count", states),
         _numbers("time_s", "the time compared: " + " + ".join(TIMES[time]), "s", seconds_of(table, time), 5),
@@ -126,7 +125,7 @@ def _numbers(name: str, meaning: str, unit: str, values: np.ndarray, digits: int
     if not np.isfinite(values).any() and BY_NAME.get(name):
         return None
     return {"name": name, "kind": "number", "meaning": meaning, "unit": unit,
-            "values": [_whole(number(v, digits)) for v in values]}  # fmt: skip
+            "values": [_whole(number(v, digits)) for v in values]}
 
 
 def _whole(value: float | None) -> float | int | None:
@@ -143,4 +142,4 @@ def _texts(name: str, meaning: str, values: np.ndarray) -> dict[str, Any] | None
     code = {word: k for k, word in enumerate(words)}
     shown = [w if most is None or len(w) <= most else f"{w[:most]}… ({len(w) - most:,} more characters)" for w in words]
     return {"name": name, "kind": "text", "meaning": meaning, "unit": "", "words": shown,
-            "values": [code[value] for value in values]}  # fmt: skip
+            "values": [code[value] for value in values]}

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.errors import DatabaseError, LookupFailed, StudyError, nearest
-from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, complete
+from optid.errors import DatabaseError, DataError, LookupFailed, StudyError, nearest
+from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, columns, complete
 
 PATIENCE = 30.0  # seconds to wait for another writer
 LABELS = ("study", "data", "formulation", "solver", "file")
@@ -340,18 +340,6 @@ def _lives(machine: str, process: int, since: str, seen: str, now: datetime) -> 
         return False
 
 
-def _array(values: Sequence[Any], kind: str, always: bool) -> np.ndarray:
-    if kind in ("text", "json"):
-        return np.array(["" if value is None else value for value in values], dtype=object)
-    if kind == "flag":
-        return np.array([bool(value) for value in values], dtype=bool)
-    if kind == "time":
-        return np.array([value.partition("+")[0] for value in values], dtype="datetime64[us]")
-    if kind == "integer" and always:
-        return np.array(values, dtype=np.int64)
-    return np.array(values, dtype=float)  # None becomes NaN
-
-
 def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Append rows to a database, which is made when it is not there; see `Store.append`."""
     with Store(path, write=True) as store:
@@ -359,26 +347,25 @@ def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarray]:
-    """Return the rows of a database as one array per column, in the order in which the cells started.
+    """Return the rows of a database as `rows.columns` does, sorted by the moments their cells started.
+
+    These are datetime64[us], and repetitions int64.
 
     Args:
         path: the database; a run may be writing to it.
         study: only rows of this study.
 
-    Returns:
-        {column: (rows,) array} for every column of `rows.COLUMNS`: "number" float64, "integer" float64 (int64 for the
-        columns that every row has), both NaN where there is no value; "text" and "json" objects, "" where there is no
-        value; "flag" bool, False where there is none; "time" datetime64[us].
-
     Raises:
         DatabaseError: as for `Store`.
     """
     with Store(path) as store:
-        columns = list(zip(*store.values(study))) or [()] * len(COLUMNS)
-        try:
-            return {c.name: _array(values, c.kind, c.always) for c, values in zip(COLUMNS, columns)}
-        except (TypeError, ValueError, OverflowError) as error:
-            raise DatabaseError(f"{path} holds values that no run writes ({error}): take another copy") from None
+        values = dict(zip(NAMES, zip(*store.values(study))))
+    try:
+        starts = [text.partition("+")[0] for text in values.get("started", ())]
+        return columns(values) | {"started": np.array(starts, dtype="datetime64[us]"),
+                                  "repetition": np.array(values.get("repetition", ()), dtype=np.int64)}
+    except (DataError, AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise DatabaseError(f"{path} holds values that no run writes ({error}): take another copy") from None
 
 
 def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:
