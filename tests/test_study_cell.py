@@ -347,6 +347,6 @@ def test_a_seed_that_no_database_holds_is_refused():
 
 
 def test_the_row_of_a_cell_that_made_none():
-    row = lost_row(one(), "crashed", "the worker died: signal SIGSEGV", total_s=1.5, peak_mb=300.0)
+    row = lost_row(one(), "crashed", "the worker died: signal SIGSEGV", total_s=1.5)
     assert tuple(row) == NAMES and row["reason"].endswith("SIGSEGV") and row["n_estimation"] == 300
     assert row["key"] == run_cell(one())["key"]

@@ -51,26 +51,19 @@ def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
         raw: keys and values as in a study file.
         problems: collects what is wrong; what is returned is usable only if nothing is.
     """
-    for key in raw:
-        if key not in _TOP:
-            problems.add((key,), _unknown(key, _TOP))
-    found: dict[str, Any] = {}
-    if "name" in raw:
-        found["name"] = problems.text(("name",), raw["name"])
-    for key, what in (("time_limit", "a positive number of seconds"), ("memory_limit", "a positive number of MB")):
-        if key in raw:
-            found[key] = problems.number((key,), raw[key], what, 0.0)
-    if "holdout" in raw:
-        found["holdout"] = problems.number(("holdout",), raw["holdout"], "a share of at least 0 and below 1", 0.0, 1.0,
-                                           closed=True)
-    if "repetitions" in raw:
-        found["repetitions"] = problems.whole(("repetitions",), raw["repetitions"], 1)
-    if "warm" in raw:
-        found["warm"] = problems.flag(("warm",), raw["warm"])
-    if "accuracy" in raw:
-        found["accuracy"] = _accuracies(("accuracy",), raw["accuracy"], problems)
-    if "seeds" in raw:
-        found["seeds"] = _seeds(raw["seeds"], problems)
+    _check_known((), raw, _TOP, problems)
+    checks: dict[str, Callable[[Path, Any], Any]] = {
+        "name": problems.text,
+        "time_limit": lambda at, value: problems.number(at, value, "a positive number of seconds", 0.0),
+        "memory_limit": lambda at, value: problems.number(at, value, "a positive number of MB", 0.0),
+        "holdout": lambda at, value: problems.number(at, value, "a share of at least 0 and below 1", 0.0, 1.0,
+                                                     closed=True),
+        "repetitions": lambda at, value: problems.whole(at, value, 1),
+        "warm": problems.flag,
+        "accuracy": lambda at, value: _accuracies(at, value, problems),
+        "seeds": lambda at, value: _seeds(value, problems),
+    }
+    found: dict[str, Any] = {key: check((key,), raw[key]) for key, check in checks.items() if key in raw}
     data = tuple(_data(("data", i), entry, problems) for i, entry in enumerate(_tables("data", raw, problems)))
     found["data"] = data
     found["formulations"] = tuple(one for i, entry in enumerate(_tables("formulation", raw, problems))
@@ -84,7 +77,7 @@ def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
 def _tables(key: str, raw: Mapping[str, Any], problems: Problems) -> list[Mapping[str, Any]]:
     entries = raw.get(key, [])
     if not entries and key != "solver":
-        if not problems.concern(key):
+        if not any(problem.path[:1] == (key,) for problem in problems):
             problems.add((), f"there is no [[{key}]]: a study needs at least one")
         return []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
@@ -98,9 +91,7 @@ def _tables(key: str, raw: Mapping[str, Any], problems: Problems) -> list[Mappin
 def _data(path: Path, raw: Mapping[str, Any], problems: Problems) -> DataEntry:
     record = raw.get("record")
     in_memory = isinstance(record, Data)
-    for key in raw:
-        if key not in _DATA and not (key == "record" and in_memory):
-            problems.add((*path, key), _unknown(key, _DATA))
+    _check_known(path, raw, (*_DATA, *["record"] * in_memory), problems, _DATA)
     sources = [key for key in ("file", "system") if key in raw] + ["record"] * in_memory
     if len(sources) != 1:
         problems.add(path, f"[[data]] needs {'a file or a system' if not sources else 'only one of file and system'}")
@@ -291,16 +282,13 @@ def _solvers(raw: Mapping[str, Any], problems: Problems) -> list[SolverEntry]:
             found.append(SolverEntry(word, _solver(("solvers", i), word, problems, *[ALL] * (len(words) == 1))))
     for i, entry in enumerate(_tables("solver", raw, problems)):
         found.append(_solver_entry(("solver", i), entry, problems))
-    if "solvers" not in raw and not raw.get("solver") and not problems.concern("solver"):
+    if "solvers" not in raw and not raw.get("solver") and not any(p.path[:1] == ("solver",) for p in problems):
         problems.add((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")
     return found
 
 
 def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> SolverEntry:
-    for key in raw:
-        if key not in _SOLVER:
-            problems.add((*path, key), _unknown(key, _SOLVER) + " Native options of the solver go into "
-                         "options = { ... }.")
+    _check_known(path, raw, _SOLVER, problems, more=" Native options of the solver go into options = { ... }.")
     word = problems.text((*path, "solver"), raw["solver"]) if "solver" in raw else None
     if "solver" not in raw:
         problems.add(path, "[[solver]] needs solver = \"NAME\" (optid solvers lists them)")
@@ -362,5 +350,8 @@ def _distinct(key: str, entries: Sequence[Any], raw: Mapping[str, Any], problems
         seen.add(entry.name)
 
 
-def _unknown(key: str, known: Sequence[str]) -> str:
-    return f"unknown key {key!r}. {nearest(key, known)}"
+def _check_known(path: Path, raw: Mapping[str, Any], known: Sequence[str], problems: Problems,
+                 named: Sequence[str] | None = None, more: str = "") -> None:
+    for key in raw:
+        if key not in known:
+            problems.add((*path, key), f"unknown key {key!r}. {nearest(key, named or known)}{more}")

@@ -2,10 +2,9 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date
 from datetime import time as clock
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -24,8 +23,7 @@ T = TypeVar("T")
 LARGEST = 2**62  # whole numbers from here on have no place in the database
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """One thing that is wrong: the keys that lead to it, and what would be right."""
 
     path: Path
@@ -39,10 +37,6 @@ class Problems(list[Problem]):
         """Note one problem."""
         self.append(Problem(path, text))
 
-    def concern(self, key: str) -> bool:
-        """Return whether something is wrong below a key at the top."""
-        return any(problem.path[:1] == (key,) for problem in self)
-
     def told(self, label: str) -> None:
         """Raise what was found, what is wrong at several keys once with their number.
 
@@ -51,14 +45,12 @@ class Problems(list[Problem]):
         """
         if not self:
             return
-        places: dict[str, list[str]] = {}
+        places: dict[str, dict[str, None]] = {}
         for problem in self:
-            found = places.setdefault(problem.text, [])
-            if (place := written(problem.path)) not in found:
-                found.append(place)
+            places.setdefault(problem.text, {})[written(problem.path)] = None
         lines = []
-        for text, found in places.items():
-            where = found[0] + (f" and {len(found) - 1} more" if len(found) > 1 else "")
+        for text, (first, *others) in places.items():
+            where = first + (f" and {len(others)} more" if others else "")
             lines.append(f"{where}: {text}" if where else text)
         count = f"{len(lines)} problems" if len(lines) > 1 else "a problem"
         raise StudyError(f"{label} has {count}:" + "".join(f"\n  {line}" for line in lines))
@@ -69,24 +61,19 @@ class Problems(list[Problem]):
         """Return a text that is not empty, or note a problem."""
         if isinstance(value, str) and value.strip():
             return value
-        self.add(path, f"must be a text; {shown(value)} is not")
-        return None
+        return self._not(path, "a text", value)
 
     def texts(self, path: Path, value: Any) -> tuple[str, ...]:
         """Return a text or a list of texts as a tuple, or note a problem."""
-        if isinstance(value, str) and value.strip():
-            return (value,)
-        if isinstance(value, list | tuple) and all(isinstance(entry, str) and entry.strip() for entry in value):
-            return tuple(value)
-        self.add(path, f"must be a text or a list of texts; {shown(value)} is not")
+        listed = value if isinstance(value, list | tuple) else [value]
+        if all(isinstance(entry, str) and entry.strip() for entry in listed):
+            return tuple(listed)
+        self._not(path, "a text or a list of texts", value)
         return ()
 
     def flag(self, path: Path, value: Any) -> bool | None:
         """Return true or false, or note a problem."""
-        if isinstance(value, bool):
-            return value
-        self.add(path, f"must be true or false; {shown(value)} is not")
-        return None
+        return value if isinstance(value, bool) else self._not(path, "true or false", value)
 
     def number(self, path: Path, value: Any, what: str, low: float, high: float = np.inf, *, closed: bool = False
                ) -> float | None:
@@ -94,16 +81,15 @@ class Problems(list[Problem]):
         fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
         if fits and (low < value < high or (closed and value == low)):
             return float(value)
+        return self._not(path, what, value)
+
+    def _not(self, path: Path, what: str, value: Any) -> None:
         self.add(path, f"must be {what}; {shown(value)} is not")
-        return None
 
     def whole(self, path: Path, value: Any, low: int) -> int | None:
         """Return a whole number from low, or note a problem."""
         if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
-            if value < LARGEST:
-                return int(value)
-            self.add(path, f"must be below 2**62; {shown(value)} is not")
-            return None
+            return int(value) if value < LARGEST else self._not(path, "below 2**62", value)
         whole = isinstance(value, float) and value.is_integer() and value >= low
         what = "a positive integer" if low == 1 else f"an integer of at least {low}"
         self.add(path, f"must be {what}; "

@@ -8,7 +8,7 @@ from optid.errors import StudyError
 from optid.studies.definition.description import Study
 from optid.studies.definition.entries import read
 from optid.studies.definition.problems import Problems
-from optid.studies.definition.trial import Records, note_impossible, note_unreadable, note_wrong_options
+from optid.studies.definition.trial import note_all
 
 _PLACE = re.compile(r"(.*) \(at line (\d+), column (\d+)\)")
 _END = " (at end of document)"
@@ -59,12 +59,7 @@ def parse_study(text: str, folder: Path, label: str, title: str = "study") -> St
         raise StudyError(f"{label} has a problem:\n  {_syntax(str(error), text)}") from None
     problems = Problems()
     found = {"name": title, **read(raw, problems)}
-    records = Records(folder)
-    if "data" in raw:
-        note_unreadable(found["data"], records, problems, wrong={problem.path[:2] for problem in problems})
-    if not problems:
-        note_impossible(found["data"], found["formulations"], records, problems)
-        note_wrong_options(found["data"], found["formulations"], found["solvers"], records, problems)
+    note_all(folder, found["data"], found["formulations"], found["solvers"], problems)
     problems.told(label)
     study = Study(**found, folder=folder)
     object.__setattr__(study, "data_checked", True)
