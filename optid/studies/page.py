@@ -54,24 +54,20 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
         DatabaseError: the database cannot be read.
         OSError: the file cannot be written.
     """
-    given = isinstance(rows_or_db, Verdict)
-    verdict = rows_or_db if given else conclude(rows_or_db, study=study, accuracy=accuracy, time=time)
+    if not isinstance(rows_or_db, Verdict):
+        rows_or_db = conclude(rows_or_db, study=study, accuracy=accuracy, time=time)
     path = Path(path)
-    path.write_text(render(verdict, title=title, command=command), encoding="utf-8", errors="replace")
+    path.write_text(render(rows_or_db, title=title, command=command), encoding="utf-8", errors="replace")
     return path
 
 
 def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
     """Return the page that `write_page` writes."""
-    return template("study.html.j2").render(_content(verdict, title, command))
-
-
-def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
     head, templates = verdict.headline, files("optid") / "show" / "templates"
     studies = [name for name in dict.fromkeys(verdict.table["study"]) if name]
     script = "\n".join((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    return {
+    content = {
         "version": __version__,
         "title": title or " · ".join(_short(name) for name in studies[:3]) or "Study",
         "lead": _lead(verdict),
@@ -102,6 +98,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "sections": [("verdict", "Verdict"), ("solvers", "Solvers"), ("figures", "Figures"), ("failures", "Failures"),
                      ("agreement", "Agreement"), ("models", "Models"), ("runs", "Runs"), ("method", "Method")],
     }
+    return template("study.html.j2").render(content)
 
 
 def embedded(payload: Any) -> Markup:
@@ -163,14 +160,11 @@ def _picks(verdict: Verdict) -> list[dict[str, Any]]:
 
 def _claims(verdict: Verdict) -> Table | None:
     claims = verdict.false_claims
-    if not claims:
-        return None
-    rows = []
-    for c in claims[:LISTED]:
-        why = _short(c.reason, REASON) or "verified otherwise"
-        rows.append((_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-", why))
+    rows = [(_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-",
+             _short(c.reason, REASON) or "verified otherwise") for c in claims[:LISTED]]
     note = f"The {LISTED} most frequent kinds of {len(claims)}." if len(claims) > LISTED else ""
-    return Table("Claims that were false", ("solver", "formulation", "runs", "claimed", "but"), rows, note)
+    head = ("solver", "formulation", "runs", "claimed", "but")
+    return Table("Claims that were false", head, rows, note) if claims else None
 
 
 def quality_table(quality: Quality) -> Table:

@@ -31,16 +31,10 @@ _studies: dict[str, _Hands] = {}
 
 
 def run(study: str, function: bytes, packed: bytes, contents: Sequence[bytes] | None) -> dict[str, Any] | None:
-    """Run a cell in a local worker process and return its row.
+    """Run a pickled cell in a local worker process, kept for a run of a study, and return its row.
 
-    Args:
-        study: name of the run of a study, for which worker processes are kept.
-        function: what makes a row of a cell, pickled.
-        packed: the cell, pickled.
-        contents: what is in its data files, or None.
-
-    Returns:
-        The row; None when this machine does not have the content of the data files.
+    The function makes a row of a cell, pickled; the contents are what is in the cell's data files, or None. None is
+    returned when this machine does not have the content of the data files.
 
     Raises:
         StudyError: worker processes do not start.

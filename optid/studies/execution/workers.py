@@ -59,8 +59,7 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
         workers: number of processes; one per core when not given.
 
     Raises:
-        StudyError: not a positive number of workers, a function that has no name to import, workers that do not start
-            (with their last words), or pebble is missing (with the pip line).
+        StudyError: no positive number, or workers that do not start (with their last words); as for `Pool`.
     """
     todo = deque(cells)
     check_number(workers)

@@ -152,7 +152,7 @@ def _pendulum(samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
     u = plants.pendulum_input("levels", samples, seed)
     plant = plants.ReactionWheelPendulum()
     size = noise * float(np.std(plant.states(u)[:, 2]))
-    perfect = {} if noise else {"quantum": 0.0}  # a perfect encoder, too
+    perfect: dict[str, Any] = {} if noise else {"quantum": 0.0}  # a perfect encoder, too
     data = plants.pendulum(u, seed, measurement=size, **perfect)
     return data, Truth((plant.torque,), ((-8.0, 8.0),))
 

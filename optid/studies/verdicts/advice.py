@@ -148,7 +148,7 @@ def _runner_up(section: Section) -> str:
 def _whole_fit(section: Section, name: str) -> Paired | None:
     """What is left of the ratio of times in the whole fit, where the solver's share of it is compared."""
     found = section.found
-    pair = paired(*(found.fit[:, found.solvers.index(solver)] for solver in (name, section.choice.first)))
+    pair = paired(found.fit[:, found.solvers.index(name)], found.fit[:, found.solvers.index(section.choice.first)])
     return pair if pair.enough and found.measure == "solve" else None
 
 
