@@ -210,14 +210,6 @@ def test_studies_of_one_database_are_kept_apart():
     assert len(verdict.found.data) == 8 and verdict.found.solved.all() and verdict.overall.ranking.n == 2
 
 
-def test_a_database_is_read(tmp_path):
-    from optid.studies.storage.store import append
-
-    rows = synthetic(300, 2)
-    append(tmp_path / "s.sqlite", rows)
-    assert conclude(tmp_path / "s.sqlite").headline == conclude(rows).headline
-
-
 @pytest.mark.parametrize(
     ("given_rows", "message"),
     [

@@ -60,9 +60,6 @@ def cells(study: Study) -> list[Cell]:
     A solver that is not installed gives cells that are refused with the reason, and a pair of solver and formulation
     that do not fit is found out when the cell is run: what a study names always has a row.
 
-    Args:
-        study: what to expand.
-
     Raises:
         StudyError: more cells than `MOST`, data files that cannot be read, or entries that differ in nothing but their
             labels.
@@ -101,14 +98,9 @@ def number_of_cells(study: Study) -> int:
 
 
 def check_unchanged(all_cells: Iterable[Cell], hashes: Mapping[tuple[str, str], Collection[str]]) -> None:
-    """Refuse a study whose data files are not those of the rows there are.
+    """Raise StudyError, with their names, where data files are not those of the rows there are.
 
-    Args:
-        all_cells: of the study.
-        hashes: of the data behind the rows there are, by (study, data label).
-
-    Raises:
-        StudyError: names the files that changed.
+    These have hashes by (study, data label).
     """
     changed = {}
     for cell in all_cells:

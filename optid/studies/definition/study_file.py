@@ -42,14 +42,7 @@ def read_study(path: Path) -> Study:
 
 
 def parse_study(text: str, folder: Path, label: str, title: str = "study") -> Study:
-    """Read the text of a study file; see `Study.from_text`.
-
-    Args:
-        text: TOML.
-        folder: where relative data files are looked for.
-        label: what the text is called in messages.
-        title: title of a study that has none.
-    """
+    """Read the text of a study file; see `Study.from_text`. The title is that of a study that has none."""
     text = text.replace("\r\n", "\n")
     try:
         raw = tomllib.loads(text)

@@ -25,14 +25,9 @@ LONGEST = 300  # characters of the words of a solver that fails
 
 def note_all(folder: Path, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry],
              solvers: Sequence[SolverEntry], problems: Problems) -> None:
-    """Note the data that cannot be read and, where nothing is wrong, impossible formulations and wrong options.
+    """Note data that cannot be read and, where nothing is wrong, impossible formulations and wrong options.
 
-    Args:
-        folder: of the study.
-        data: entries of the study; one at whose keys a problem is noted already is left alone.
-        formulations: entries of the study.
-        solvers: entries of the study.
-        problems: collects what is wrong.
+    Relative files are in the folder; data at whose keys a problem is noted already are left alone.
     """
     records, wrong = _Records(folder), {problem.path[:2] for problem in problems}
     for i, entry in enumerate(data):

@@ -34,9 +34,7 @@ _AXES = {  # key in a file: argument of a Study, keys that tell an entry from la
 def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
     """Return the keys and values of a study file for the arguments of a `Study`, however simply they were written.
 
-    Args:
-        given: the arguments by name.
-        problems: collects what cannot be read at all.
+    What cannot be read at all is noted.
     """
     raw: dict[str, Any] = {"name": given["name"], **{key: plain(given[key]) for key in _ALONE}}
     for key, (axis, marks, takes) in _AXES.items():

@@ -42,9 +42,6 @@ def run_cell(cell: Cell) -> dict[str, Any]:
 
     The solver's own clock is set to what loading the record left of the time limit, and it runs in this process:
     whoever calls this stops a process that does not keep its limits.
-
-    Args:
-        cell: what to run.
     """
     clock = time.perf_counter()
     row = _run(cell, clock)
@@ -106,15 +103,7 @@ def prepare() -> None:
 
 def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None = None, total_s: float | None = None
              ) -> dict[str, Any]:
-    """Return the row of a cell that made none itself.
-
-    Args:
-        cell: which.
-        outcome: one of `rows.OUTCOMES`.
-        reason: one sentence.
-        started: when it was started; now when not given.
-        total_s: seconds until it was stopped.
-    """
+    """Return the row of a cell that made none itself: why, when it was started (by default now) and stopped."""
     return complete({**known(cell), "outcome": outcome, "reason": reason, "total_s": total_s,
                      "started": (started or datetime.now(UTC)).isoformat()})
 
@@ -145,8 +134,8 @@ def known(cell: Cell) -> dict[str, Any]:
 def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit | None]:
     """What a fit comes to, and the fit where it is to be solved once more; ``limit``: seconds for each programme."""
     data = record.data
-    held = 0 if record.holdout is None else _length(record.holdout)
-    row: dict[str, Any] = {"n_samples": _length(data) + held, "n_estimation": _length(data), "n_inputs": data.m,
+    held = 0 if record.holdout is None else record.holdout.n_samples
+    row: dict[str, Any] = {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
                            "n_outputs": data.l}
     fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy, time_limit=limit,
                  isolate=False, constraints=cell.constraints, solver_options=dict(cell.solver_options), raises=False,
@@ -174,10 +163,6 @@ def _loaded(cell: Cell) -> Record:
             _records.popitem(last=False)
     _records.move_to_end(identity)
     return _records[identity]
-
-
-def _length(data: Any) -> int:
-    return sum(experiment.n_samples for experiment in data.experiments)
 
 
 def _verdict(fitted: Fit) -> dict[str, Any]:

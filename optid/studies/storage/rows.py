@@ -145,7 +145,7 @@ NAMES: tuple[str, ...] = tuple(column.name for column in COLUMNS)
 BY_NAME: Mapping[str, Column] = {column.name: column for column in COLUMNS}
 
 LARGEST = 2**63  # what a whole number in the database is below
-LABELS, LONGEST_LABEL = ("data", "formulation", "solver"), 80
+LONGEST_LABEL = 80  # characters of the labels of data, formulations and solvers in a table
 REQUIRED = ("data", "formulation", "solver", "outcome", "status_verified", "objective", "solve_s")
 """Columns without which rows say nothing."""
 
@@ -237,7 +237,7 @@ def columns(rows: Any) -> dict[str, np.ndarray]:
     if missing:
         raise DataError(f"the rows have no column {', '.join(missing)}: this is not a table of study rows")
     table = {column.name: _array(column, given.get(column.name, [None] * n)) for column in COLUMNS}
-    for name in LABELS:
+    for name in ("data", "formulation", "solver"):
         table[name] = _objects([_label(text) for text in table[name]])
     return table
 

@@ -199,10 +199,7 @@ def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
 def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) -> Statement:
     """Say the verdict in one line: one solver for everything, or that it depends on the formulation.
 
-    Args:
-        overall: all problems.
-        sections: those of every formulation.
-        quality: the formulations by their models, which is what a study of a single solver is about.
+    A study of a single solver is about the formulations by their models.
     """
     choice, n, count = overall.choice, len(overall.found.data), len(sections)
     if len(overall.standings) == 1:

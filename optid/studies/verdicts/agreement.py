@@ -26,12 +26,7 @@ class Agreement:
 
 
 def agreement_matrix(found: Results, table: Table) -> Agreement:
-    """Compare every pair of solvers on the problems where both reached the verified accuracy.
-
-    Args:
-        found: problems and solvers.
-        table: the rows they come from.
-    """
+    """Compare every pair of solvers, of results and their rows, where both reached the verified accuracy."""
     s, read = len(found.solvers), {}
     common, objective, compared, model = np.zeros((4, s, s), dtype=int)
     worst_objective, worst_model = np.full((2, s, s), np.nan)
@@ -53,14 +48,8 @@ def agreement_matrix(found: Results, table: Table) -> Agreement:
 def model_distance(table: Table, i: int, j: int, read: dict[int, np.ndarray | None] | None = None) -> float:
     """Return the larger of the distance between poles (best matching) and between fits (as a share of 100 points).
 
-    Args:
-        table: rows.
-        i: number of a row.
-        j: number of another.
-        read: poles read so far, by row.
-
-    Returns:
-        The distance; ``nan`` where neither poles nor fits are known on both sides, ``inf`` for different orders.
+    It is that of the rows i and j of a table, ``nan`` where neither poles nor fits are known on both sides and ``inf``
+    for different orders; poles that were read are kept by row.
     """
     read = {} if read is None else read
     for k in (i, j):

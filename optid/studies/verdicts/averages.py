@@ -52,12 +52,12 @@ class Paired:
     @property
     def behind(self) -> bool:
         """Whether one is worse than the other, for sure and by more than a trifle."""
-        return self.enough and self.low > self.ratio and self.notable
+        return self.enough and self.low > self._around(0.0)[1] and self.notable
 
     @property
     def ahead(self) -> bool:
         """Whether one is better than the other, for sure and by more than a trifle."""
-        return self.enough and self.high < self.ratio and self.value < self._around(MINOR)[0]
+        return self.enough and self.high < self._around(0.0)[0] and self.value < self._around(MINOR)[0]
 
     @property
     def vague(self) -> bool:
@@ -66,6 +66,7 @@ class Paired:
         return self.low < low or self.high > high
 
     def _around(self, slack: float) -> tuple[float, float]:
+        """Values so close to equality, to both sides."""
         return (1 / (1 + slack), 1 + slack) if self.ratio else (-slack, slack)
 
 

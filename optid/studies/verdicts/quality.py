@@ -62,14 +62,8 @@ class Quality(DataSet):
         return self.measure == "parameter_error"
 
 
-def compare_formulations(found: Results, table: Table, level: float = 0.05) -> Quality:
-    """Compare the models of the formulations record by record.
-
-    Args:
-        found: problems and solvers.
-        table: the rows they come from.
-        level: significance level of the test over data sets.
-    """
+def compare_formulations(found: Results, table: Table) -> Quality:
+    """Compare the models of the formulations, of results and the rows they come from, record by record."""
     names, number = np.unique(found.formulation, return_inverse=True)
     names, case, shape = tuple(names), found.case, (int(found.case.max(initial=-1)) + 1, len(names))
     row, tried = np.full(shape, -1), np.zeros(shape, dtype=bool)
@@ -98,7 +92,7 @@ def compare_formulations(found: Results, table: Table, level: float = 0.05) -> Q
     if 1 < len(sets) < FEW:
         whole = replace(whole, choice=_of_few(sets, whole.choice, losses, names, data, errors))
     return Quality(**vars(whole), formulations=names, measure=measure, sets=sets,
-                   ranking=rank(losses, tried, names, data, level, "formulation"),
+                   ranking=rank(losses, tried, names, data, "formulation"),
                    truth=bool(np.isfinite(values["parameter_error"]).any()))
 
 

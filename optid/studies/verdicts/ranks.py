@@ -47,8 +47,8 @@ class Ranking:
         return bool(abs(a - b) > self.difference)
 
 
-def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.ndarray, level: float,
-         noun: str = "solver") -> Ranking:
+def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.ndarray, noun: str = "solver"
+         ) -> Ranking:
     """Rank those that were tried on every data set; a failure on a problem ranks last there, failures tied.
 
     Args:
@@ -56,14 +56,13 @@ def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.
         tried: (P, k) where somebody was run.
         names: the k names.
         data: (P,) labels of the data sets.
-        level: significance level.
         noun: what is ranked.
     """
     everywhere = [bool(len(data)) and all(column[data == label].any() for label in dict.fromkeys(data))
                   for column in tried.T]
     kept, out = (tuple(name for name, there in zip(names, everywhere) if there == keep) for keep in (True, False))
     scores = means_of_groups(ranks_of_problems(costs[:, everywhere]), data)
-    return rank_over_data_sets(scores, kept, out, level, noun)
+    return rank_over_data_sets(scores, kept, out, noun)
 
 
 def ranks_of_problems(costs: np.ndarray) -> np.ndarray:
@@ -117,7 +116,7 @@ def signed_ranks(differences: np.ndarray) -> float:
 
 
 def rank_over_data_sets(scores: np.ndarray, names: tuple[str, ...], left_out: tuple[str, ...] = (),
-                        level: float = 0.05, noun: str = "solver") -> Ranking:
+                        noun: str = "solver", level: float = 0.05) -> Ranking:
     """Rank over data sets and test the differences: Wilcoxon's signed ranks for two, Friedman and Nemenyi for more.
 
     Args:
@@ -125,8 +124,8 @@ def rank_over_data_sets(scores: np.ndarray, names: tuple[str, ...], left_out: tu
             columns give no test, and `Ranking.missing` says so.
         names: the k names.
         left_out: who could not take part, for the record.
-        level: significance level.
         noun: what is ranked.
+        level: significance level.
     """
     n, k = len(scores), len(names)
     means = np.mean(rankdata(scores, axis=1), axis=0) if n and k else np.full(k, np.nan)

@@ -70,14 +70,8 @@ class Section:
         return next(s for s in self.standings if s.solver == solver)
 
 
-def compare_solvers(found: Results, name: str = "", level: float = 0.05) -> Section:
-    """Compare the solvers on the problems of a table.
-
-    Args:
-        found: problems and solvers.
-        name: label of the section.
-        level: significance level of the test over data sets.
-    """
+def compare_solvers(found: Results, name: str = "") -> Section:
+    """Compare the solvers on the problems of a table; the name is that of the section."""
     gone: np.ndarray = agreed_infeasible(found)
     run: np.ndarray = np.any(found.ran, axis=0)
     idle = tuple(s for s, there in zip(found.solvers, run) if not there)
@@ -98,7 +92,7 @@ def compare_solvers(found: Results, name: str = "", level: float = 0.05) -> Sect
     return Section(
         name, kept, int(gone.sum()), (int(says.any(axis=0).sum()), int(found.ran[gone].any(axis=0).sum())),
         tuple(sorted(_standings(found, counted, choice), key=order)), idle, choice,
-        rank(kept.time, tried, kept.solvers, kept.data_set, level),
+        rank(kept.time, tried, kept.solvers, kept.data_set),
         dict(zip(kept.solvers, performance_profiles(kept.time))))
 
 

@@ -78,8 +78,7 @@ class Verdict:
         return "\n".join(f"{s.word}: {s.text}" for s in (self.headline, *self.statements))
 
 
-def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = None, time: str = "solve",
-             level: float = 0.05) -> Verdict:
+def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = None, time: str = "solve") -> Verdict:
     """Draw the conclusions from the rows of a study.
 
     Args:
@@ -87,7 +86,6 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
         study: its title, for a database that holds several.
         accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
         time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
-        level: significance level of the test over data sets.
 
     Returns:
         The verdict. A solver counts only where our residuals verified the accuracy; what the data cannot tell is said.
@@ -106,10 +104,9 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
     table = columns(rows)
     at = usual_accuracy(table) if accuracy is None else accuracy
     found = tabulate(table, at, time)
-    overall = compare_solvers(found, "", level)
-    sections = tuple(compare_solvers(found.where(found.formulation == f), f, level)
-                     for f in sorted(set(found.formulation)))
-    quality = compare_formulations(found, table, level)
+    overall = compare_solvers(found)
+    sections = tuple(compare_solvers(found.where(found.formulation == f), f) for f in sorted(set(found.formulation)))
+    quality = compare_formulations(found, table)
     head = headline(overall, sections, quality)
     return Verdict(table, found, at, time, overall, sections, quality, agreement_matrix(found, table),
                    _false_claims(table, found), _failures(found), head,
