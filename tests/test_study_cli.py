@@ -105,21 +105,6 @@ def test_a_study_from_run_to_page(folder):
     assert run("study", "export", "rigs.sqlite", "rows.parquet").stdout == "24 rows written to rows.parquet\n"
 
 
-def test_data_that_changed_are_refused_until_accepted(folder):
-    Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]'))
-    assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 0
-    before = read_rows("rigs.sqlite")
-    write_rig(folder / "rig.csv", seed=1)
-    refused = run("study", "run", "rigs.toml", "-w", 1)
-    assert refused.exit_code == 2 and "rig.csv" in refused.stderr and "--accept-changed-data" in refused.stderr
-    assert len(read_rows("rigs.sqlite")["key"]) == len(before["key"]) == 6
-    accepted = run("study", "run", "rigs.toml", "-w", 1, "--accept-changed-data")
-    assert accepted.exit_code == 0 and "4 of 6 cells are in rigs.sqlite already; 2 to run" in accepted.stdout
-    after = read_rows("rigs.sqlite")
-    assert len(after["key"]) == 6 and len(set(after["key"]) & set(before["key"])) == 4
-    assert run("study", "run", "rigs.toml").exit_code == 0  # and is now what the database knows
-
-
 def test_a_dry_run_counts_what_the_run_would_run(folder):
     Path("rigs.toml").write_text(STUDY.format(solvers='["auto"]').replace("seeds = 2", "seeds = 2\nmemory_limit = 1.0"))
     assert run("study", "run", "rigs.toml", "-w", 1).exit_code == 4
@@ -193,7 +178,7 @@ def test_two_studies_of_one_database_are_never_one(folder):
 
 def test_reasons_that_differ_in_their_numbers_are_one(capsys):
     from optid.cli.study_summary import print_reasons
-    from optid.studies.verdicts.table import columns
+    from optid.studies.storage.rows import columns
 
     failed = [row("a", **FAILED | {"reason": f"no step after {k} iterations"}, repetition=k) for k in range(3)]
     print_reasons(columns([row("b"), row("b", **FAILED | {"reason": "it\nbroke"}), *failed]))

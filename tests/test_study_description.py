@@ -13,7 +13,7 @@ import optid
 from optid.errors import LookupFailed, StudyError
 from optid.examples import EXAMPLES
 from optid.studies import grid
-from optid.studies.definition import entries, study_file
+from optid.studies.definition import entries, trial
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.sources.records import load
 from optid.studies.sources.systems import SYSTEMS, simulate
@@ -385,7 +385,7 @@ def test_round_trip_of_any_study(name, labels, accuracy, seeds, noise, warm, opt
         formulations={"formulation": "arx", "na": 1, "nb": [1], "ridge": accuracy[0]}, accuracy=accuracy, seeds=seeds,
         solvers={"solver": "clarabel", "name": labels[0], "options": options}, warm=warm, holdout=accuracy[0])
     with pytest.MonkeyPatch.context() as patch:  # no solver takes options of any name, which would be told here
-        patch.setattr(study_file, "note_wrong_options", lambda *_: None)
+        patch.setattr(trial, "note_wrong_options", lambda *_: None)
         assert Study.from_text(study.to_toml()) == study
 
 
@@ -468,8 +468,6 @@ def test_the_grid_has_every_combination_once():
         (s, n, e, f, v, a, r) for s in (100, 200) for n in (0.0, 0.1) for e in (0, 1) for f in ("arx", "monotone")
         for v in ("clarabel", "gauss_newton") for a in (1e-4, 1e-8) for r in (0, 1)}
     assert pickle.loads(pickle.dumps(cells)) == cells
-    done = {(cell.key, cell.repetition) for cell in cells[::2]}
-    assert grid.left(cells, done) == cells[1::2]
 
 
 def test_cells_are_counted_without_being_made(rig):

@@ -14,9 +14,8 @@ from optid.errors import DataError
 from optid.program.solution import Status
 from optid.studies.page import embedded, render, write_page
 from optid.studies.payload import page_payload
-from optid.studies.storage.rows import SUCCESS
+from optid.studies.storage.rows import SUCCESS, columns
 from optid.studies.verdicts.outcomes import states_of_rows, tabulate
-from optid.studies.verdicts.table import columns
 from optid.studies.verdicts.verdict import conclude
 
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)

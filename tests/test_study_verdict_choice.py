@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from study_rows import run, table_of, times_of
 
 from optid.studies.verdicts.advice import evidence
-from optid.studies.verdicts.averages import paired_ratio
+from optid.studies.verdicts.averages import paired, time_ratios
 from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE, choose, listed
-from optid.studies.verdicts.profiles import time_ratios
 from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")
@@ -59,7 +58,7 @@ def test_failures_by_chance_do_not_decide_and_those_beyond_it_do():
     def first(fail_slow, fail_fast):
         times = np.exp(0.1 * rng.normal(size=(40, 2))) * [5.0, 0.1]
         times[rng.random((40, 2)) < [fail_slow, fail_fast]] = NAN
-        return choose(times, ("slow", "fast"), 0.1, paired_ratio, none=1.0).first
+        return choose(times, ("slow", "fast")).first
 
     assert sum(first(0.05, 0.05) == "slow" for _ in range(300)) / 300 <= 0.05
     assert sum(first(0.02, 0.35) == "slow" for _ in range(100)) / 100 >= 0.95
@@ -73,8 +72,8 @@ def test_who_is_faster_than_the_leader_of_the_common_problems_is_not_called_tied
     times[:10, 1], times[10:50, 1], times[50:60, 1] = 1.2, 0.6, 1.2
     times[:10, 2] = times[52:100, 2] = 3.0
     times *= np.exp(0.05 * rng.normal(size=times.shape))
-    choice = choose(times, ("a", "b", "c"), 0.1, paired_ratio, none=1.0)
-    assert paired_ratio(times[:, 1], times[:, 0]).high < 0.9
+    choice = choose(times, ("a", "b", "c"))
+    assert paired(times[:, 1], times[:, 0]).high < 0.9
     assert (choice.kind, choice.first, choice.tied) == (FIRST, "b", ())
 
 
@@ -93,7 +92,7 @@ def test_nobody_is_ahead_of_the_first(seed):
     rng = np.random.default_rng(seed)
     times = np.exp(rng.normal(size=(40, 4)) * 0.2 + rng.normal(size=4) * 0.3)
     times[rng.random(times.shape) < rng.choice([0.02, 0.2, 0.5])] = NAN
-    choice = choose(times, tuple("abcd"), 0.1, paired_ratio, none=1.0)
+    choice = choose(times, tuple("abcd"))
     for name in choice.candidates:
         if choice.first and name != choice.first:
             pair = choice.against[name]
@@ -275,7 +274,7 @@ def test_equal_solvers_are_seldom_told_apart(problems):
     kinds = []
     for _ in range(400):
         times = np.exp(rng.normal(size=(problems, 1)) + 0.4 * rng.normal(size=(problems, 2)))
-        kinds.append(choose(times, ("a", "b"), 0.1, paired_ratio, none=1.0).kind)
+        kinds.append(choose(times, ("a", "b")).kind)
     assert kinds.count(FIRST) / 400 <= 0.075
     assert kinds.count(TIE) / 400 >= {6: 0.35, 12: 0.85, 60: 0.925}[problems]  # of few problems some cannot be told
     assert kinds.count(FIRST) + kinds.count(TIE) + kinds.count(CANNOT_TELL) == 400
@@ -283,7 +282,7 @@ def test_equal_solvers_are_seldom_told_apart(problems):
 
 def test_solvers_that_differ_are_told_apart():
     rng = np.random.default_rng(1)
-    first = [choose(np.exp(0.4 * rng.normal(size=(30, 2)) + [0.0, 0.5]), ("a", "b"), 0.1, paired_ratio, none=1.0)
+    first = [choose(np.exp(0.4 * rng.normal(size=(30, 2)) + [0.0, 0.5]), ("a", "b"))
              for _ in range(200)]  # fmt: skip
     assert sum(c.kind == FIRST and c.first == "a" for c in first) / 200 > 0.9
     assert not any(c.kind == FIRST and c.first == "b" for c in first)
@@ -303,5 +302,5 @@ def test_names_are_listed_as_in_a_sentence():
 
 
 def test_choose_alone_has_nothing_to_choose_from_nothing():
-    assert choose(np.zeros((0, 0)), (), 0.1, paired_ratio, none=1.0).kind == NOBODY
+    assert choose(np.zeros((0, 0)), ()).kind == NOBODY
     np.testing.assert_array_equal(time_ratios(np.array([[NAN, NAN]])), [[np.inf, np.inf]])

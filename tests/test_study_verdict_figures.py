@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from study_rows import run
 
+from optid.studies.storage.rows import columns
 from optid.studies.verdicts.agreement import agreement_matrix, model_distance
-from optid.studies.verdicts.averages import paired_difference, paired_ratio, shifted_geometric_mean
-from optid.studies.verdicts.growth import time_growth
+from optid.studies.verdicts.averages import paired, performance_profiles, shifted_geometric_mean, time_growth
 from optid.studies.verdicts.outcomes import tabulate
-from optid.studies.verdicts.profiles import performance_profiles
 from optid.studies.verdicts.ranks import (
     MINIMUM_DATA_SETS,
     critical_difference,
@@ -23,7 +22,6 @@ from optid.studies.verdicts.ranks import (
     ranks_of_problems,
     signed_ranks,
 )
-from optid.studies.verdicts.table import columns
 from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")
@@ -85,19 +83,19 @@ def test_paired_ratio_against_scipy_and_its_reciprocal():
     a, b = np.exp(rng.normal(size=(2, 30)))
     a[3] = b[7] = NAN
     both = np.isfinite(a) & np.isfinite(b)
-    ratio, back = paired_ratio(a, b), paired_ratio(b, a)
+    ratio, back = paired(a, b), paired(b, a)
     interval = scipy.stats.ttest_rel(np.log(a[both]), np.log(b[both])).confidence_interval()
     assert (ratio.low, ratio.high) == pytest.approx(tuple(np.exp(interval)))
     assert ratio.value == pytest.approx(1 / back.value) and ratio.low == pytest.approx(1 / back.high)
     assert ratio.n == 28
-    assert paired_ratio(a[:1], b[:1]).high == np.inf and paired_ratio(a[3:4], b[3:4]).n == 0
+    assert paired(a[:1], b[:1]).high == np.inf and paired(a[3:4], b[3:4]).n == 0
 
 
 def test_the_interval_of_a_paired_difference_covers_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0
     for _ in range(2000):
-        pair = paired_difference(1.0 + rng.normal(size=8), np.zeros(8))
+        pair = paired(1.0 + rng.normal(size=8), np.zeros(8), ratio=False)
         hits += pair.low <= 1.0 <= pair.high
     assert hits / 2000 == pytest.approx(0.95, abs=0.015)
 

@@ -12,9 +12,9 @@ from optid.backends import Answer
 from optid.errors import DataError
 from optid.program.solution import Residuals, Status
 from optid.solving import solve as solving
+from optid.studies.storage.rows import columns
 from optid.studies.verdicts.comparison import compare
 from optid.studies.verdicts.outcomes import states_of_rows, tabulate
-from optid.studies.verdicts.table import columns
 from optid.studies.verdicts.verdict import conclude
 
 NAN = float("nan")
@@ -208,14 +208,6 @@ def test_studies_of_one_database_are_kept_apart():
         {**row, "study": "other", "objective": 2.0} for row in table_of(times_of(1.0, 3.0, problems=4, seed=1))]
     verdict = conclude(rows)
     assert len(verdict.found.data) == 8 and verdict.found.solved.all() and verdict.overall.ranking.n == 2
-
-
-def test_a_database_is_read(tmp_path):
-    from optid.studies.storage.store import append
-
-    rows = synthetic(300, 2)
-    append(tmp_path / "s.sqlite", rows)
-    assert conclude(tmp_path / "s.sqlite").headline == conclude(rows).headline
 
 
 @pytest.mark.parametrize(

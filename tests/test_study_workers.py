@@ -204,12 +204,6 @@ print("once", [row["outcome"] for row in execute([cell(0)], behave)])
     assert done.stdout == "once ['done']\n", done.stderr
 
 
-@pytest.mark.parametrize("number", [0, -2])
-def test_no_workers_are_refused(number):
-    with pytest.raises(StudyError, match="must be a positive integer"):
-        list(execute([cell(0)], behave, workers=number))
-
-
 def test_a_function_without_a_name_is_refused():
     with pytest.raises(StudyError, match="workers cannot import"):
         list(execute([cell(0)], lambda cell: {}))

@@ -20,7 +20,7 @@ from optid.studies.verdicts.choice import CANNOT_TELL
 from optid.studies.verdicts.model_advice import model_evidence
 from optid.studies.verdicts.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
 from optid.studies.verdicts.quality import FIGURES, DataSet, Quality
-from optid.studies.verdicts.statement import Statement, counting, plural
+from optid.studies.verdicts.statement import FAIR, GOOD, counting, plural
 from optid.studies.verdicts.verdict import Verdict, conclude
 
 SCRIPTS = ("plot.js", "grid.js", "study.js")
@@ -53,26 +53,21 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
         StudyError: the database holds several studies, and none is named.
         DatabaseError: the database cannot be read.
         OSError: the file cannot be written.
-    """  # fmt: skip
-    given = isinstance(rows_or_db, Verdict)
-    verdict = rows_or_db if given else conclude(rows_or_db, study=study, accuracy=accuracy, time=time)
+    """
+    if not isinstance(rows_or_db, Verdict):
+        rows_or_db = conclude(rows_or_db, study=study, accuracy=accuracy, time=time)
     path = Path(path)
-    path.write_text(render(verdict, title=title, command=command), encoding="utf-8", errors="replace")
+    path.write_text(render(rows_or_db, title=title, command=command), encoding="utf-8", errors="replace")
     return path
 
 
 def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
     """Return the page that `write_page` writes."""
-    return template("study.html.j2").render(_content(verdict, title, command))
-
-
-def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
-    head = verdict.headline
+    head, templates = verdict.headline, files("optid") / "show" / "templates"
     studies = [name for name in dict.fromkeys(verdict.table["study"]) if name]
-    script = "\n".join((files("optid") / "show" / "templates" / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    script = "\n".join((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    several = len(verdict.sections) > 1
-    return {
+    content = {
         "version": __version__,
         "title": title or " · ".join(_short(name) for name in studies[:3]) or "Study",
         "lead": _lead(verdict),
@@ -80,7 +75,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "word": head.word,
         "sentence": head.text,
         "cards": _cards(verdict),
-        "picks": _picks(verdict) if several else None,
+        "picks": _picks(verdict) if len(verdict.sections) > 1 else None,
         "folded": len(verdict.sections) > FOLDED,
         "statements": verdict.statements,
         "claims": _claims(verdict),
@@ -94,7 +89,7 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "call": command or "optid study report STUDY.sqlite -o study.html",
         "versions": [*versions(), *_machines(verdict)],
         "text": str(verdict),
-        "style": Markup((files("optid") / "show" / "templates" / "study.css").read_text(encoding="utf-8")),
+        "style": Markup((templates / "study.css").read_text(encoding="utf-8")),
         "script": Markup(script),
         "digest": digest,
         "payload": embedded(page_payload(verdict)),
@@ -102,14 +97,15 @@ def _content(verdict: Verdict, title: str, command: str) -> dict[str, Any]:
         "measure": verdict.quality.measure.replace("_", " "),
         "sections": [("verdict", "Verdict"), ("solvers", "Solvers"), ("figures", "Figures"), ("failures", "Failures"),
                      ("agreement", "Agreement"), ("models", "Models"), ("runs", "Runs"), ("method", "Method")],
-    }  # fmt: skip
+    }
+    return template("study.html.j2").render(content)
 
 
 def embedded(payload: Any) -> Markup:
     """Return a value as JSON that can stand inside a script element: no text in it can end the element."""
     text = json.dumps(payload, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-                  .replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))  # fmt: skip
+                  .replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
 
 
 def _short(text: str, most: int = WIDEST) -> str:
@@ -119,7 +115,7 @@ def _short(text: str, most: int = WIDEST) -> str:
 def _lead(verdict: Verdict) -> str:
     runs, found = len(verdict.table["solver"]), verdict.found
     parts = [(runs, "run"), (len(found.data), "problem"), (len(found.solvers), "solver"),
-             (len(verdict.sections), "formulation"), (len(set(zip(found.study, found.data))), "data set")]  # fmt: skip
+             (len(verdict.sections), "formulation"), (len(set(zip(found.study, found.data))), "data set")]
     counts = [plural(count, noun) for count, noun in parts]
     return " · ".join([*counts, f"accuracy {found.accuracy:.0e}: {counting(found.accuracy)}"])
 
@@ -127,55 +123,48 @@ def _lead(verdict: Verdict) -> str:
 def _cards(verdict: Verdict) -> list[dict[str, str]]:
     """The figures of the first glance."""
     section, table = verdict.overall, verdict.table
-    runs = sum(s.problems for s in section.standings)
-    solved = sum(s.solved for s in section.standings)
+    runs, solved = (sum(getattr(s, name) for s in section.standings) for name in ("problems", "solved"))
     by_anyone = int(section.found.solved.any(axis=1).sum()) if len(section.found.data) else 0
-    false = sum(claim.count for claim in verdict.false_claims)
     proved = int((table["proved"] & (states_of_rows(table, verdict.found) == SOLVED)).sum())
-    cards = [
-        (f"{by_anyone:,} of {len(section.found.data):,}", "problems that some solver solved"),
-        (f"{100 * solved / runs:.1f} %" if runs else "none", f"of {runs:,} attempts reached the accuracy"),
-        (f"{proved:,}", "runs proved globally optimal"),
-        (f"{false:,}", "claims that were false"),
-    ]
-    return [{"value": value, "label": label} for value, label in cards]
+    cards = {
+        "problems that some solver solved": f"{by_anyone:,} of {len(section.found.data):,}",
+        f"of {runs:,} attempts reached the accuracy": f"{100 * solved / runs:.1f} %" if runs else "none",
+        "runs proved globally optimal": f"{proved:,}",
+        "claims that were false": f"{sum(claim.count for claim in verdict.false_claims):,}",
+    }
+    return [{"value": value, "label": label} for label, value in cards.items()]
 
 
 def _picks(verdict: Verdict) -> list[dict[str, Any]]:
     """One line per formulation: who to use there, and why; of a single solver how good the models are, and why."""
-    lines, single = [], len(verdict.overall.standings) < 2
+    lines, quality = [], verdict.quality
     for section in verdict.sections:
-        said: Statement = choice_of_solver(section)
-        first = section.choice.first
+        said, first = choice_of_solver(section), section.choice.first
         lead = section.standing(first) if first else None
-        if single:
-            mean = verdict.quality.figures[verdict.quality.measure][section.name].mean
-            shown = f"{100 * mean:.3g} %" if verdict.quality.measure == "parameter_error" else f"{mean:.2f} %"
+        if len(verdict.overall.standings) < 2:
+            mean = quality.figures[quality.measure][section.name]
+            shown = f"{100 * mean:.3g} %" if quality.errors else f"{mean:.2f} %"
             word = shown if np.isfinite(mean) else "-"
-            best = section.name in (verdict.quality.choice.first, *verdict.quality.choice.tied)
-            tone, why = "good" if best else "fair", model_evidence(verdict.quality, section.name)
+            tone = GOOD if section.name in quality.choice.leaders else FAIR
+            why = model_evidence(quality, section.name)
         else:
             so_far = first and section.choice.kind == CANNOT_TELL
             word, tone, why = f"{first}, so far" if so_far else said.word, said.tone, evidence(section)
         lines.append({
-            "name": section.name, "tone": tone, "word": word,
+            "name": section.name, "tone": tone, "word": word, "evidence": why,
             "solved": f"{lead.solved:,} of {len(section.found.data):,}" if lead else "-",
             "time": seconds(lead.time) if lead and np.isfinite(lead.time) else "-",
-            "evidence": why,
-        })  # fmt: skip
+        })
     return lines
 
 
 def _claims(verdict: Verdict) -> Table | None:
     claims = verdict.false_claims
-    if not claims:
-        return None
-    rows = []
-    for c in claims[:LISTED]:
-        why = _short(c.reason, REASON) or "verified otherwise"
-        rows.append((_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-", why))
+    rows = [(_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-",
+             _short(c.reason, REASON) or "verified otherwise") for c in claims[:LISTED]]
     note = f"The {LISTED} most frequent kinds of {len(claims)}." if len(claims) > LISTED else ""
-    return Table("Claims that were false", ("solver", "formulation", "runs", "claimed", "but"), rows, note)
+    head = ("solver", "formulation", "runs", "claimed", "but")
+    return Table("Claims that were false", head, rows, note) if claims else None
 
 
 def quality_table(quality: Quality) -> Table:
@@ -190,13 +179,13 @@ def quality_table(quality: Quality) -> Table:
             rows += [(_short(name), _short(one.name), *_models(one, name)) for one in quality.sets]
     note = ("Means over the records that the formulation solved, and of those over the data sets, of the model with "
             "the best verified objective; fits on samples the fit did not see. Means over different records do not "
-            "compare: the verdict pairs them.")  # fmt: skip
+            "compare: the verdict pairs them.")
     return Table("Models", ("formulation", "data set", *head), rows, note)
 
 
 def _models(quality: Quality | DataSet, name: str) -> tuple[str, ...]:
     """The figures of one formulation as words."""
-    figures = [quality.figures[c][name].mean for c in FIGURES]
+    figures = [quality.figures[c][name] for c in FIGURES]
     fits = [f"{number(v, 4)} %" if np.isfinite(v) else "-" for v in figures[:2]]
     errors = [f"{100 * v:.3g} %" if np.isfinite(v) else "truth unknown" for v in figures[2:]]
     return (f"{quality.solved[name]:,} of {quality.records:,}", *fits, *errors)

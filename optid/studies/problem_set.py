@@ -6,9 +6,7 @@ off-diagonal entries times sqrt(2), as Clarabel takes them. Linear and quadratic
 """
 
 import csv
-import shutil
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -20,36 +18,26 @@ import scipy.sparse as sp
 from optid.errors import OptidError, StudyError
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
-from optid.registry import formulation, named_constraint
 from optid.solving.solve import run
 from optid.studies.definition.description import Study
+from optid.studies.definition.trial import posed
 from optid.studies.grid import Cell, cells
 from optid.studies.sources.records import load
 from optid.studies.storage.store import Store
 
-ACCURACY = 1e-9
-"""At which objectives are verified."""
+ACCURACY = 1e-9  # at which objectives are verified
 
 
 @dataclass(frozen=True, eq=False)
 class StandardForm:
-    """One programme; see the module for its meaning.
+    """One programme; see the module for its meaning."""
 
-    Attributes:
-        P: (n, n) upper triangle, sparse.
-        q: (n,).
-        A: (m, n), sparse.
-        b: (m,).
-        cones: numbers of rows of zero and non-negative cones, sizes of second-order cones, orders of semidefinite ones.
-        offset: constant of the objective.
-    """
-
-    P: Any
-    q: np.ndarray
-    A: Any
-    b: np.ndarray
-    cones: tuple[int, int, tuple[int, ...], tuple[int, ...]]
-    offset: float
+    P: Any  # (n, n) upper triangle, sparse
+    q: np.ndarray  # (n,)
+    A: Any  # (m, n), sparse
+    b: np.ndarray  # (m,)
+    cones: tuple[int, int, tuple[int, ...], tuple[int, ...]]  # rows of zero and non-negative cones, sizes of the others
+    offset: float  # constant of the objective
 
     @property
     def kind(self) -> str:
@@ -84,7 +72,10 @@ def write_problems(database: str | Path, folder: str | Path, study: str | None =
     folder.mkdir(parents=True, exist_ok=True)
     lines: list[dict[str, Any]] = []
     for text in filter(None, texts.values()):
-        for cell in _problems(Study.from_text(text)):
+        problems: dict[tuple[Any, ...], Cell] = {}  # one cell of every record and formulation
+        for cell in cells(Study.from_text(text)):
+            problems.setdefault((cell.data, cell.samples, cell.noise, cell.seed, cell.formulation), cell)
+        for cell in problems.values():
             for program, solution in _programmes(cell):
                 if line := _written(folder, len(lines), cell, program, solution):
                     lines.append(line)
@@ -92,20 +83,9 @@ def write_problems(database: str | Path, folder: str | Path, study: str | None =
         table = csv.DictWriter(file, ["name", "kind", "variables", "rows", "objective", "data", "formulation"])
         table.writeheader()
         table.writerows(lines)
-    with files("optid.studies").joinpath("solve_problems.py").open("rb") as source, \
-            (folder / "solve_problems.py").open("wb") as target:
-        shutil.copyfileobj(source, target)
+    script = "solve_problems.py"
+    (folder / script).write_bytes(files("optid.studies").joinpath(script).read_bytes())
     return lines
-
-
-def _problems(study: Study) -> Iterator[Cell]:
-    """One cell of every record and formulation."""
-    seen = set()
-    for cell in cells(study):
-        problem = (cell.data, cell.samples, cell.noise, cell.seed, cell.formulation)
-        if problem not in seen:
-            seen.add(problem)
-            yield cell
 
 
 def _programmes(cell: Cell) -> list[tuple[Program, Solution]]:
@@ -122,13 +102,11 @@ def _programmes(cell: Cell) -> list[tuple[Program, Solution]]:
             answer = yield program
             found.append((program, answer))
 
-    constraints = tuple(named_constraint(text) for text in cell.constraints)
-    more = {"constraints": constraints} if constraints else {}
     settings = {"accuracy": ACCURACY, "time_limit": cell.time_limit, "prove": False}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            problem = formulation(cell.formulation_name)[1](load(cell).data, **cell.options, **more)
+            problem = posed(cell.formulation_name, load(cell).data, cell.constraints, cell.options)
             if not isinstance(problem, Program):
                 run(recorded(problem), **settings)
             else:

@@ -8,19 +8,15 @@ from importlib.metadata import PackageNotFoundError, packages_distributions, ver
 from optid.backends.choice import AUTO, back_ends
 from optid.registry import FORMULATIONS, registered
 
-ALWAYS = ("optid", "numpy", "scipy", "cvxpy")
-"""Distributions behind every result."""
+ALWAYS = ("optid", "numpy", "scipy", "cvxpy")  # distributions behind every result
 
 
 @cache
 def determining(formulation: str, solver: str, simulated: bool = False) -> dict[str, str]:
     """Return the versions that determine a result, by name.
 
-    Args:
-        formulation: registered name; the distribution that it comes from and its source file are looked at.
-        solver: word of the back end; the distributions that it needs are looked at, for "auto" those of the back ends
-            it chooses from.
-        simulated: whether the record is simulated: the source of the systems counts then.
+    They are those of a registered formulation (its distribution and source), of a back end (for "auto" those that it
+    chooses from) and, for a simulated record, the source of the systems.
     """
     found = {name: installed(name) for name in ALWAYS}
     point = registered(FORMULATIONS)[formulation]

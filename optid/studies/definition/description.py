@@ -10,61 +10,40 @@ from optid.data.record import Data
 
 @dataclass(frozen=True)
 class DataEntry:
-    """One entry of the data axis: files, a record in memory, or a simulated system at several lengths and noises.
+    """One entry of the data axis: files, a record in memory, or a simulated system at several lengths and noises."""
 
-    Attributes:
-        name: its label.
-        files: data files, one experiment each, relative to the folder of the study.
-        system: name of a simulated system (`optid.studies.sources.systems`).
-        record: a record in memory, from Python only.
-        samples: lengths of the simulated records; empty for the system's own.
-        noise: standard deviations of the noise relative to the noise-free output; empty for the system's own.
-        options: how the files are read: inputs, outputs, dt, time, experiment, columns, delimiter, decimal.
-    """
-
-    name: str
-    files: tuple[str, ...] = ()
-    system: str | None = None
-    record: Data | None = field(default=None, repr=False)
-    samples: tuple[int, ...] = ()
-    noise: tuple[float, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # its label
+    files: tuple[str, ...] = ()  # one experiment each, relative to the folder of the study
+    system: str | None = None  # name of a simulated system (`optid.studies.sources.systems`)
+    record: Data | None = field(default=None, repr=False)  # in memory, from Python only
+    samples: tuple[int, ...] = ()  # lengths of the simulated records; empty for the system's own
+    noise: tuple[float, ...] = ()  # standard deviations relative to the noise-free output; empty for the system's own
+    options: Mapping[str, Any] = field(default_factory=dict)  # how the files are read: `entries.READING`
 
 
 @dataclass(frozen=True)
 class FormulationEntry:
-    """One entry of the formulation axis.
+    """One entry of the formulation axis."""
 
-    Attributes:
-        name: its label.
-        formulation: registered name.
-        constraints: named constraints as texts, such as "monotone:increasing".
-        options: arguments of the formulation in the words of the command line, such as basis = "triangular:8".
-        data: labels of the data entries it is for; empty for all.
-    """
+    name: str  # its label
+    formulation: str  # registered name
+    constraints: tuple[str, ...] = ()  # named constraints as texts, such as "monotone:increasing"
+    options: Mapping[str, Any] = field(default_factory=dict)  # arguments in the words of the command line
+    data: tuple[str, ...] = ()  # labels of the data entries it is for; empty for all
 
-    name: str
-    formulation: str
-    constraints: tuple[str, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
-    data: tuple[str, ...] = ()
+    def is_for(self, entry: DataEntry) -> bool:
+        """Whether it is run on a data entry."""
+        return not self.data or entry.name in self.data
 
 
 @dataclass(frozen=True)
 class SolverEntry:
-    """One entry of the solver axis.
+    """One entry of the solver axis."""
 
-    Attributes:
-        name: its label.
-        solver: word of the back end, or "auto".
-        accuracy: requested accuracies in place of those of the study.
-        options: native options of the solver.
-    """
-
-    name: str
-    solver: str
-    accuracy: tuple[float, ...] = ()
-    options: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # its label
+    solver: str  # word of the back end, or "auto"
+    accuracy: tuple[float, ...] = ()  # requested accuracies in place of those of the study
+    options: Mapping[str, Any] = field(default_factory=dict)  # native options of the solver
 
 
 @dataclass(frozen=True)
@@ -124,10 +103,7 @@ class Study:
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Study":
-        """Read a study file.
-
-        Args:
-            path: of the file; relative data files are looked for beside it.
+        """Read a study file; relative data files are looked for beside it.
 
         Raises:
             StudyError: every problem with its key; data that cannot be read count as such.
@@ -171,17 +147,13 @@ class Study:
                 solver fails where it succeeds without.
         """
         from optid.studies.definition.problems import Problems
-        from optid.studies.definition.trial import Records, note_impossible, note_unreadable, note_wrong_options
+        from optid.studies.definition.trial import note_all
 
-        if self.data_checked:
-            return
-        problems, records = Problems(), Records(self.folder)
-        note_unreadable(self.data, records, problems)
-        if not problems:
-            note_impossible(self.data, self.formulations, records, problems)
-            note_wrong_options(self.data, self.formulations, self.solvers, records, problems)
-        problems.told(f"study {self.name!r}")
-        object.__setattr__(self, "data_checked", True)
+        if not self.data_checked:
+            problems = Problems()
+            note_all(self.folder, self.data, self.formulations, self.solvers, problems)
+            problems.told(f"study {self.name!r}")
+            object.__setattr__(self, "data_checked", True)
 
     def run(self, db: str | Path | None = None, **settings: Any) -> Any:
         """Run what is left of the study and return its rows.
@@ -198,4 +170,3 @@ class Study:
         from optid.studies.execution.running import run_to_frame
 
         return run_to_frame(self, db, **settings)
-

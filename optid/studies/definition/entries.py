@@ -16,12 +16,11 @@ from optid.errors import OptidError, nearest
 from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
-from optid.studies.definition.problems import Path, Problems, items, one_or_several, shown
+from optid.studies.definition.problems import Path, Place, Problems, shown
 from optid.studies.sources.systems import SYSTEMS, simulate
 
 AUTO, ALL = "auto", "all"
-MOST_SEEDS, MOST_FORMULATIONS = 1_000_000, 10_000
-"""A study has no more cells than that."""
+MOST_SEEDS, MOST_FORMULATIONS = 1_000_000, 10_000  # a study has no more cells than that
 
 READING = ("inputs", "outputs", "dt", "time", "experiment", "columns", "delimiter", "decimal")
 """Keys of a data entry that say how its files are read."""
@@ -51,118 +50,107 @@ def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
         raw: keys and values as in a study file.
         problems: collects what is wrong; what is returned is usable only if nothing is.
     """
-    for key in raw:
-        if key not in _TOP:
-            problems.add((key,), _unknown(key, _TOP))
-    found: dict[str, Any] = {}
-    if "name" in raw:
-        found["name"] = problems.text(("name",), raw["name"])
-    for key, what in (("time_limit", "a positive number of seconds"), ("memory_limit", "a positive number of MB")):
-        if key in raw:
-            found[key] = problems.number((key,), raw[key], what, 0.0)
-    if "holdout" in raw:
-        found["holdout"] = problems.number(("holdout",), raw["holdout"], "a share of at least 0 and below 1", 0.0, 1.0,
-                                           closed=True)
-    if "repetitions" in raw:
-        found["repetitions"] = problems.whole(("repetitions",), raw["repetitions"], 1)
-    if "warm" in raw:
-        found["warm"] = problems.flag(("warm",), raw["warm"])
-    if "accuracy" in raw:
-        found["accuracy"] = _accuracies(("accuracy",), raw["accuracy"], problems)
-    if "seeds" in raw:
-        found["seeds"] = _seeds(raw["seeds"], problems)
-    data = tuple(_data(("data", i), entry, problems) for i, entry in enumerate(_tables("data", raw, problems)))
-    found["data"] = data
-    found["formulations"] = tuple(one for i, entry in enumerate(_tables("formulation", raw, problems))
-                                  for one in _formulations(("formulation", i), entry, data, problems))
-    found["solvers"] = tuple(_solvers(raw, problems))
+    top = Place(raw, problems)
+    top.check_keys(_TOP)
+    checks: dict[str, Callable[[Place], Any]] = {
+        "name": Place.text,
+        "time_limit": lambda at: at.number("a positive number of seconds", 0.0),
+        "memory_limit": lambda at: at.number("a positive number of MB", 0.0),
+        "holdout": lambda at: at.number("a share of at least 0 and below 1", 0.0, 1.0, closed=True),
+        "repetitions": lambda at: at.whole(1),
+        "warm": Place.flag,
+        "accuracy": _accuracies,
+        "seeds": _seeds,
+    }
+    found: dict[str, Any] = {key: check(top[key]) for key, check in checks.items() if key in raw}
+    data = found["data"] = tuple(_data(entry) for entry in _tables("data", top))
+    found["formulations"] = tuple(one for entry in _tables("formulation", top) for one in _formulations(entry, data))
+    found["solvers"] = tuple(_solvers(top))
     for axis, key in (("data", "data"), ("formulations", "formulation"), ("solvers", "solver")):
-        _distinct(key, found[axis], raw, problems)
+        _distinct(key, found[axis], top)
     return found
 
 
-def _tables(key: str, raw: Mapping[str, Any], problems: Problems) -> list[Mapping[str, Any]]:
-    entries = raw.get(key, [])
+def _tables(key: str, top: Place) -> list[Place]:
+    entries = top.value.get(key, [])
     if not entries and key != "solver":
-        if not problems.concern(key):
-            problems.add((), f"there is no [[{key}]]: a study needs at least one")
+        if not top.problems.concern(key):
+            top.note(f"there is no [[{key}]]: a study needs at least one")
         return []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table of its own, [[{key}]]"
         listed = ", or at the top solvers = \"auto\"" if key == "solver" else ""
-        problems.add((key,), f"{key} is written as {how}{listed}")
+        top.note(f"{key} is written as {how}{listed}", key)
         return []
-    return entries
+    return top[key].items() if entries else []
 
 
-def _data(path: Path, raw: Mapping[str, Any], problems: Problems) -> DataEntry:
-    record = raw.get("record")
+def _data(entry: Place) -> DataEntry:
+    record = entry.value.get("record")
     in_memory = isinstance(record, Data)
-    for key in raw:
+    for key in entry.value:
         if key not in _DATA and not (key == "record" and in_memory):
-            problems.add((*path, key), _unknown(key, _DATA))
-    sources = [key for key in ("file", "system") if key in raw] + ["record"] * in_memory
+            entry.note(f"unknown key {key!r}. {nearest(key, _DATA)}", key)
+    sources = [key for key in ("file", "system") if key in entry] + ["record"] * in_memory
     if len(sources) != 1:
-        problems.add(path, f"[[data]] needs {'a file or a system' if not sources else 'only one of file and system'}")
-    files = problems.texts((*path, "file"), raw["file"]) if "file" in raw else ()
-    system = problems.text((*path, "system"), raw["system"]) if "system" in raw else None
+        entry.note(f"[[data]] needs {'a file or a system' if not sources else 'only one of file and system'}")
+    files, system = entry.take("file", Place.texts, ()), entry.take("system", Place.text)
     if system is not None and system not in SYSTEMS:
-        problems.add((*path, "system"), f"no system is called {system!r}. {nearest(system, SYSTEMS)}")
-    for key in ("samples", "noise") if system is None and sources else READING if "file" not in raw else ():
-        if key in raw:
+        entry.note(f"no system is called {system!r}. {nearest(system, SYSTEMS)}", "system")
+    for key in ("samples", "noise") if system is None and sources else READING if "file" not in entry else ():
+        if key in entry:
             which = "a simulated system" if key in ("samples", "noise") else "a file"
-            problems.add((*path, key), f"{key} is for {which}, which this entry is not")
-    samples = [problems.whole(at, value, 1) for at, value in items((*path, "samples"), raw.get("samples", []))]
-    noise = [problems.number(at, value, "a number of at least 0, relative to the noise-free output", 0.0, closed=True)
-             for at, value in items((*path, "noise"), raw.get("noise", []))]
+            entry.note(f"{key} is for {which}, which this entry is not", key)
     default = system or (PurePath(files[0]).stem if files else getattr(record, "name", "") or "record")
     return DataEntry(
-        _label(path, raw, default, problems), files, system, record if in_memory else None,
-        problems.once((*path, "samples"), samples), problems.once((*path, "noise"), noise),
-        {key: _reading((*path, key), raw[key], problems) for key in READING if key in raw},
+        _label(entry, default), files, system, record if in_memory else None,
+        entry.take("samples", lambda at: at.each(lambda one: one.whole(1)), ()),
+        entry.take("noise", lambda at: at.each(lambda one: one.number(
+            "a number of at least 0, relative to the noise-free output", 0.0, closed=True)), ()),
+        {key: _reading(entry[key]) for key in READING if key in entry},
     )
 
 
-def _reading(path: Path, value: Any, problems: Problems) -> Any:
+def _reading(at: Place) -> Any:
     """Check one key that says how a file is read."""
-    key = path[-1]
+    key, value = at.name, at.value
     if key == "dt":
-        return problems.number(path, value, "a positive number", 0.0)
+        return at.number("a positive number", 0.0)
     if key in ("inputs", "outputs", "columns"):
         if isinstance(value, Mapping) and key != "columns":
-            return {str(name): problems.text((*path, name), column) for name, column in value.items()}
-        return list(problems.texts(path, value))
-    if key == "time" and value is False:
+            return {str(name): at[name].text() for name in value}
+        return list(at.texts())
+    if (key == "time" and value is False) or (key in ("delimiter", "decimal") and isinstance(value, str)
+                                              and len(value) == 1):
         return value
-    if key in ("delimiter", "decimal") and isinstance(value, str) and len(value) == 1:
-        return value
-    return problems.text(path, value)
+    return at.text()
 
 
-def _formulations(path: Path, raw: Mapping[str, Any], data: Sequence[DataEntry], problems: Problems
-                  ) -> list[FormulationEntry]:
+def _formulations(entry: Place, data: Sequence[DataEntry]) -> list[FormulationEntry]:
     """The formulations of one entry: one, or the grid over its arguments that are lists of values."""
-    known, name, names = registered(FORMULATIONS), raw.get("formulation"), [entry.name for entry in data]
+    known, name, raw = registered(FORMULATIONS), entry.value.get("formulation"), entry.value
+    names = [one.name for one in data]
     axes: dict[str, list[Any]] = {}
     if isinstance(name, str) and name in known:
         try:
             parameters = inspect.signature(known[name].load(), eval_str=True).parameters
         except Exception:  # told below
             parameters = {}
-        used = [entry for entry in data if entry.name in one_or_several(raw.get("data", names))]
+        wanted = [at.value for at in entry["data"].items()] if "data" in entry else names
+        used = [one for one in data if one.name in wanted]
         axes = {key: list(value) for key, value in raw.items()
                 if key in parameters and isinstance(value, list | tuple) and value
                 and _is_axis(parameters[key].annotation, value, used)}
     if (count := math.prod(map(len, axes.values()))) > MOST_FORMULATIONS:
-        problems.add(path, f"{', '.join(axes)} form a grid of {count:,} formulations; at most {MOST_FORMULATIONS:,} "
-                     "are taken")
+        entry.note(f"{', '.join(axes)} form a grid of {count:,} formulations; at most {MOST_FORMULATIONS:,} are taken")
         return []
     found = []
     for values in product(*axes.values()):
         point = dict(zip(axes, values))
-        one = _formulation(path, {**raw, **point}, names, problems)
+        one = _formulation(Place({**raw, **point}, entry.problems, entry.path), names)
+        chosen = {key: value if isinstance(value, list | tuple) else [value] for key, value in point.items()}
         found.append(replace(one, name=", ".join([one.name, *(
-            f"{key} = {'+'.join(map(str, one_or_several(value))) or 'none'}" for key, value in point.items())])))
+            f"{key} = {'+'.join(map(str, value)) or 'none'}" for key, value in chosen.items())])))
     return found
 
 
@@ -175,7 +163,7 @@ def _is_axis(annotation: Any, value: Sequence[Any], data: Sequence[DataEntry]) -
         return True
     text = annotation if isinstance(annotation, str) else str(annotation)
     outside = set(re.findall(r"\w+", re.sub(r"\[[^]]*]", "", getattr(annotation, "__name__", "") or text)))
-    if "Sequence" in outside or outside & {"list", "tuple", "Any"}:
+    if outside & {"Sequence", "list", "tuple", "Any"}:
         scalar = bool(outside & {"int", "float", "str"})
         return scalar and len(value) > 1 and bool(data) and all(_has_one_input(entry) for entry in data)
     return bool(outside & {"int", "float", "str", "bool"})
@@ -187,70 +175,64 @@ def _has_one_input(entry: DataEntry) -> bool:
         return entry.record.m == 1
     if entry.system is not None:
         return entry.system in SYSTEMS and simulate(entry.system, 10)[0].m == 1
-    return "inputs" in entry.options and len(entry.options["inputs"]) == 1
+    return len(entry.options.get("inputs", ())) == 1
 
 
-def _formulation(path: Path, raw: Mapping[str, Any], data: Sequence[str], problems: Problems) -> FormulationEntry:
-    name = problems.text((*path, "formulation"), raw["formulation"]) if "formulation" in raw else None
-    known = registered(FORMULATIONS)
-    options = {key: value for key, value in raw.items() if key not in _FORMULATION}
-    if "formulation" not in raw:
-        problems.add(path, "[[formulation]] needs formulation = \"NAME\" (optid formulations lists them)")
+def _formulation(entry: Place, data: Sequence[str]) -> FormulationEntry:
+    name, known = entry.take("formulation", Place.text), registered(FORMULATIONS)
+    options = {key: value for key, value in entry.value.items() if key not in _FORMULATION}
+    if "formulation" not in entry:
+        entry.note("[[formulation]] needs formulation = \"NAME\" (optid formulations lists them)")
     elif name is not None and name not in known:
-        problems.add((*path, "formulation"), f"no formulation is called {name!r}. {nearest(name, known)}")
+        entry.note(f"no formulation is called {name!r}. {nearest(name, known)}", "formulation")
     elif name is not None:
         try:
-            _arguments(path, name, known[name].load(), options, "constraints" in raw, problems)
+            _check_arguments(entry, name, known[name].load(), options)
         except Exception as error:  # a broken plug-in is told like everything else
-            problems.add((*path, "formulation"),
-                         f"formulation {name!r} cannot be loaded: {type(error).__name__}: {error}")
-    for key, value in options.items():
-        problems.writable((*path, key), value)
-    constraints = problems.texts((*path, "constraints"), raw["constraints"]) if "constraints" in raw else ()
+            entry.note(f"formulation {name!r} cannot be loaded: {type(error).__name__}: {error}", "formulation")
+    for key in options:
+        entry[key].check_writable()
+    constraints, only = (entry.take(key, Place.texts, ()) for key in ("constraints", "data"))
     for i, text in enumerate(constraints):
-        _constraint((*path, "constraints", i), text, problems)
-    only = problems.texts((*path, "data"), raw["data"]) if "data" in raw else ()
+        _check_constraint(entry, ("constraints", i), text)
     for i, label in enumerate(only):
         if label not in data:
-            problems.add((*path, "data", i), f"no [[data]] is called {label!r}. {nearest(label, data)}")
+            entry.note(f"no [[data]] is called {label!r}. {nearest(label, data)}", "data", i)
     default = " + ".join([name or "formulation", *constraints])
-    return FormulationEntry(_label(path, raw, default, problems), name or "", constraints, options, only)
+    return FormulationEntry(_label(entry, default), name or "", constraints, options, only)
 
 
-def _constraint(path: Path, text: str, problems: Problems) -> None:
-    word = text.partition(":")[0]
-    known = registered(CONSTRAINTS)
+def _check_constraint(entry: Place, keys: Path, text: str) -> None:
+    word, known = text.partition(":")[0], registered(CONSTRAINTS)
     if word not in known:
-        problems.add(path, f"no constraint is called {word!r}. {nearest(word, known)}")
+        entry.note(f"no constraint is called {word!r}. {nearest(word, known)}", *keys)
         return
     try:
         named_constraint(text)
     except Exception as error:  # whatever a builder of a third party raises
-        problems.add(path, f"{error}" if "constraint" in str(error) else f"constraint {text!r}: {error}")
+        entry.note(f"{error}" if "constraint" in str(error) else f"constraint {text!r}: {error}", *keys)
 
 
-def _arguments(path: Path, name: str, function: Callable[..., Any], options: Mapping[str, Any], constrained: bool,
-               problems: Problems) -> None:
+def _check_arguments(entry: Place, name: str, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
     """Check the options of a formulation by its signature, and bases by their names."""
     parameters = inspect.signature(function).parameters
     takes = {key: p for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY}
     if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
         return
-    if constrained and "constraints" not in takes:
-        problems.add((*path, "constraints"), f"formulation {name!r} takes no constraints")
+    if "constraints" in entry and "constraints" not in takes:
+        entry.note(f"formulation {name!r} takes no constraints", "constraints")
     for key, value in options.items():
         if key not in takes:
             known = [*takes, *_FORMULATION]
-            problems.add((*path, key), f"formulation {name!r} takes no argument {key!r}. {nearest(key, known)}")
-            continue
-        if (wanted := _misfit(takes[key].annotation, value)) is not None:
-            problems.add((*path, key), f"must be {wanted}; {shown(value)} is not")
+            entry.note(f"formulation {name!r} takes no argument {key!r}. {nearest(key, known)}", key)
+        elif (wanted := _misfit(takes[key].annotation, value)) is not None:
+            entry[key].must_be(wanted)
         elif "basis" in key:
-            for at, text in items((*path, key), value):
-                _basis(at, text, problems)
+            for at in entry[key].items():
+                _check_basis(at)
     missing = [key for key, p in takes.items() if p.default is p.empty and key not in options]
     if missing:
-        problems.add(path, f"formulation {name!r} needs {', '.join(missing)}")
+        entry.note(f"formulation {name!r} needs {', '.join(missing)}")
 
 
 def _misfit(annotation: Any, value: Any) -> str | None:
@@ -259,108 +241,93 @@ def _misfit(annotation: Any, value: Any) -> str | None:
                            annotation.__name__ if isinstance(annotation, type) else str(annotation)))
     if annotation is inspect.Parameter.empty or "Any" in words or not words & {"bool", "int", "float", "str"}:
         return None
-    for kind, takers, _ in _KINDS:
-        if isinstance(value, kind):
-            if words & set(takers.split()):
-                return None
-            break
-    else:
-        return None  # a table or a date: the formulation says
+    takers = next((takers for kind, takers, _ in _KINDS if isinstance(value, kind)), None)
+    if takers is None or words & set(takers.split()):  # of a table or a date the formulation says
+        return None
     return " or ".join(word for _, takers, word in _KINDS if words & {takers.split()[0]})
 
 
-def _basis(path: Path, text: Any, problems: Problems) -> None:
-    if not isinstance(text, str):
-        problems.add(path, f"must be a text such as \"triangular:10\"; {shown(text)} is not")
-        return
-    if text == "none":  # an output that is not fed back
-        return
-    try:
-        parse(text)
-    except OptidError as error:
-        problems.add(path, str(error))
+def _check_basis(at: Place) -> None:
+    if not isinstance(at.value, str):
+        at.must_be("a text such as \"triangular:10\"")
+    elif at.value != "none":  # an output that is not fed back
+        try:
+            parse(at.value)
+        except OptidError as error:
+            at.note(str(error))
 
 
-def _solvers(raw: Mapping[str, Any], problems: Problems) -> list[SolverEntry]:
+def _solvers(top: Place) -> list[SolverEntry]:
     found = []
-    if "solvers" in raw:
-        words = problems.texts(("solvers",), raw["solvers"])
+    if "solvers" in top:
+        words = top["solvers"].texts()
         if words == (ALL,):
             words = tuple(name for name, back_end in sorted(back_ends().items()) if back_end.installed)
         for i, word in enumerate(words):
-            found.append(SolverEntry(word, _solver(("solvers", i), word, problems, *[ALL] * (len(words) == 1))))
-    for i, entry in enumerate(_tables("solver", raw, problems)):
-        found.append(_solver_entry(("solver", i), entry, problems))
-    if "solvers" not in raw and not raw.get("solver") and not problems.concern("solver"):
-        problems.add((), "there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")
+            found.append(SolverEntry(word, _solver(top, ("solvers", i), word, *[ALL] * (len(words) == 1))))
+    found += [_solver_entry(entry) for entry in _tables("solver", top)]
+    if "solvers" not in top and not top.value.get("solver") and not top.problems.concern("solver"):
+        top.note("there is no solver: add solvers = \"all\", solvers = [\"clarabel\", ...] or [[solver]]")
     return found
 
 
-def _solver_entry(path: Path, raw: Mapping[str, Any], problems: Problems) -> SolverEntry:
-    for key in raw:
-        if key not in _SOLVER:
-            problems.add((*path, key), _unknown(key, _SOLVER) + " Native options of the solver go into "
-                         "options = { ... }.")
-    word = problems.text((*path, "solver"), raw["solver"]) if "solver" in raw else None
-    if "solver" not in raw:
-        problems.add(path, "[[solver]] needs solver = \"NAME\" (optid solvers lists them)")
-    name = word and _solver((*path, "solver"), word, problems)
-    options = raw.get("options", {})
+def _solver_entry(entry: Place) -> SolverEntry:
+    entry.check_keys(_SOLVER, " Native options of the solver go into options = { ... }.")
+    word = entry.take("solver", Place.text)
+    if "solver" not in entry:
+        entry.note("[[solver]] needs solver = \"NAME\" (optid solvers lists them)")
+    name = word and _solver(entry, ("solver",), word)
+    options = entry.value.get("options", {})
     if not isinstance(options, Mapping):
-        problems.add((*path, "options"), f"must be a table, {{ key = value }}; {shown(options)} is not")
+        entry.note(f"must be a table, {{ key = value }}; {shown(options)} is not", "options")
         options = {}
     for key in options:
         if key in SETTINGS:
             where = f"write {key} = ... beside solver" if key == "accuracy" else "it is a key of the study" \
                 if key in _TOP else "the study sets it for every solver"
-            problems.add((*path, "options", key), f"options are the solver's own, and {key!r} is none: {where}")
-    problems.writable((*path, "options"), options)
-    accuracy = _accuracies((*path, "accuracy"), raw["accuracy"], problems) if "accuracy" in raw else ()
-    return SolverEntry(_label(path, raw, word or "solver", problems), name or "", accuracy, dict(options))
+            entry.note(f"options are the solver's own, and {key!r} is none: {where}", "options", key)
+    if options:
+        entry["options"].check_writable()
+    return SolverEntry(_label(entry, word or "solver"), name or "", entry.take("accuracy", _accuracies, ()),
+                       dict(options))
 
 
-def _solver(path: Path, word: str, problems: Problems, *more: str) -> str:
+def _solver(place: Place, keys: Path, word: str, *more: str) -> str:
     """Look a solver up; `more` are words that could be meant besides."""
     known = [AUTO, *back_ends()]
     if word.lower() not in known:
-        problems.add(path, f"no solver is called {word!r}. {nearest(word.lower(), [*known, *more])}")
+        place.note(f"no solver is called {word!r}. {nearest(word.lower(), [*known, *more])}", *keys)
     return word.lower()
 
 
-def _accuracies(path: Path, value: Any, problems: Problems) -> tuple[float, ...]:
-    numbers = [problems.number(at, one, "a number between 0 and 1", 0.0, 1.0) for at, one in items(path, value)]
-    if not numbers and not one_or_several(value):
-        problems.add(path, "accuracy is empty; give at least one number")
-    return problems.once(path, numbers)
+def _accuracies(at: Place) -> tuple[float, ...]:
+    if not at.items():
+        at.note("accuracy is empty; give at least one number")
+    return at.each(lambda one: one.number("a number between 0 and 1", 0.0, 1.0))
 
 
-def _seeds(value: Any, problems: Problems) -> tuple[int, ...]:
-    if not isinstance(value, list | tuple | range):
-        count = problems.whole(("seeds",), value, 1)
+def _seeds(at: Place) -> tuple[int, ...]:
+    if not isinstance(at.value, list | tuple | range):
+        count = at.whole(1)
         if count is not None and count > MOST_SEEDS:
-            problems.add(("seeds",), f"{count:,} seeds are too many: at most {MOST_SEEDS:,} are taken")
+            at.note(f"{count:,} seeds are too many: at most {MOST_SEEDS:,} are taken")
             return ()
         return tuple(range(count or 1))
-    seeds = [problems.whole(("seeds", i), seed, 0) for i, seed in enumerate(value)]
-    if not seeds:
-        problems.add(("seeds",), "seeds is empty; give their number or a list of them")
-    return problems.once(("seeds",), seeds)
+    if not at.items():
+        at.note("seeds is empty; give their number or a list of them")
+    return at.each(lambda one: one.whole(0))
 
 
-def _label(path: Path, raw: Mapping[str, Any], default: str, problems: Problems) -> str:
-    return (problems.text((*path, "name"), raw["name"]) if "name" in raw else None) or default
+def _label(entry: Place, default: str) -> str:
+    return entry.take("name", Place.text) or default
 
 
-def _distinct(key: str, entries: Sequence[Any], raw: Mapping[str, Any], problems: Problems) -> None:
+def _distinct(key: str, entries: Sequence[Any], top: Place) -> None:
     """Refuse two entries with one label; solvers listed at the top come before the tables."""
     seen: set[str] = set()
-    listed = len(entries) - len(raw.get("solver", [])) if key == "solver" else 0
+    listed = len(entries) - len(top.value.get("solver", [])) if key == "solver" else 0
     for i, entry in enumerate(entries):
         if entry.name in seen:
             path: Path = ("solvers", i) if i < listed else (key, i - listed)
-            problems.add(path, f"two entries are called {entry.name!r}; give this one another name = \"...\"")
+            top.note(f"two entries are called {entry.name!r}; give this one another name = \"...\"", *path)
         seen.add(entry.name)
-
-
-def _unknown(key: str, known: Sequence[str]) -> str:
-    return f"unknown key {key!r}. {nearest(key, known)}"

@@ -1,15 +1,14 @@
 """What is wrong with the description of a study, collected so that everything is told at once."""
 
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from datetime import date
 from datetime import time as clock
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from optid.errors import StudyError
+from optid.errors import StudyError, nearest
 
 
 class Label(str):
@@ -24,8 +23,7 @@ T = TypeVar("T")
 LARGEST = 2**62  # whole numbers from here on have no place in the database
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     """One thing that is wrong: the keys that lead to it, and what would be right."""
 
     path: Path
@@ -51,99 +49,112 @@ class Problems(list[Problem]):
         """
         if not self:
             return
-        places: dict[str, list[str]] = {}
+        places: dict[str, dict[str, None]] = {}
         for problem in self:
-            found = places.setdefault(problem.text, [])
-            if (place := written(problem.path)) not in found:
-                found.append(place)
+            places.setdefault(problem.text, {})[_written(problem.path)] = None
         lines = []
-        for text, found in places.items():
-            where = found[0] + (f" and {len(found) - 1} more" if len(found) > 1 else "")
+        for text, (first, *others) in places.items():
+            where = first + (f" and {len(others)} more" if others else "")
             lines.append(f"{where}: {text}" if where else text)
         count = f"{len(lines)} problems" if len(lines) > 1 else "a problem"
         raise StudyError(f"{label} has {count}:" + "".join(f"\n  {line}" for line in lines))
 
-    # -- values of one type ----------------------------------------------------------------------------------------
 
-    def text(self, path: Path, value: Any) -> str | None:
-        """Return a text that is not empty, or note a problem."""
-        if isinstance(value, str) and value.strip():
-            return value
-        self.add(path, f"must be a text; {shown(value)} is not")
-        return None
+class Place:
+    """A value of the description, the keys that lead to it, and its checks: what they cannot return, they note."""
 
-    def texts(self, path: Path, value: Any) -> tuple[str, ...]:
-        """Return a text or a list of texts as a tuple, or note a problem."""
-        if isinstance(value, str) and value.strip():
-            return (value,)
-        if isinstance(value, list | tuple) and all(isinstance(entry, str) and entry.strip() for entry in value):
-            return tuple(value)
-        self.add(path, f"must be a text or a list of texts; {shown(value)} is not")
-        return ()
+    def __init__(self, value: Any, problems: Problems, path: Path = ()) -> None:
+        self.value, self.problems, self.path = value, problems, path
 
-    def flag(self, path: Path, value: Any) -> bool | None:
-        """Return true or false, or note a problem."""
-        if isinstance(value, bool):
-            return value
-        self.add(path, f"must be true or false; {shown(value)} is not")
-        return None
+    def __getitem__(self, key: str | int) -> "Place":
+        return Place(self.value[key], self.problems, (*self.path, key))
 
-    def number(self, path: Path, value: Any, what: str, low: float, high: float = np.inf, *, closed: bool = False
-               ) -> float | None:
-        """Return a number between low and high, itself included where `closed`, or note a problem."""
+    def __contains__(self, key: str) -> bool:
+        return key in self.value
+
+    @property
+    def name(self) -> str:
+        """The last key that is a word."""
+        return next((part for part in reversed(self.path) if isinstance(part, str)), "")
+
+    def note(self, text: str, *keys: str | int) -> None:
+        """Note a problem, here or at keys below."""
+        self.problems.add((*self.path, *keys), text)
+
+    def take(self, key: str, check: "Callable[[Place], T]", default: Any = None) -> T:
+        """Return what a check makes of the value at a key, or the default where there is none."""
+        return check(self[key]) if key in self else default
+
+    def items(self) -> "list[Place]":
+        """The entries of a list; of anything else the place itself."""
+        several = isinstance(self.value, list | tuple | range | np.ndarray)
+        return [self[i] for i in range(len(self.value))] if several else [self]
+
+    def each(self, check: "Callable[[Place], T | None]") -> tuple[T, ...]:
+        """The entries that pass a check, each once; one that is there twice is noted."""
+        found = [check(item) for item in self.items()]
+        for i, value in enumerate(found):
+            if value is not None and value in found[:i]:
+                self.note(f"{self.name} has {value} twice; leave one of them out", i)
+        return tuple(value for value in found if value is not None)
+
+    def check_keys(self, known: tuple[str, ...], more: str = "") -> None:
+        """Note the keys that are not known."""
+        for key in self.value:
+            if key not in known:
+                self.note(f"unknown key {key!r}. {nearest(key, known)}{more}", key)
+
+    def text(self) -> str | None:
+        """A text that is not empty."""
+        return self.value if isinstance(self.value, str) and self.value.strip() else self.must_be("a text")
+
+    def texts(self) -> tuple[str, ...]:
+        """A text or a list of texts as a tuple."""
+        listed = self.value if isinstance(self.value, list | tuple) else [self.value]
+        if all(isinstance(entry, str) and entry.strip() for entry in listed):
+            return tuple(listed)
+        return self.must_be("a text or a list of texts") or ()
+
+    def flag(self) -> bool | None:
+        """True or false."""
+        return self.value if isinstance(self.value, bool) else self.must_be("true or false")
+
+    def number(self, what: str, low: float, high: float = np.inf, *, closed: bool = False) -> float | None:
+        """A number between low and high, low included where `closed`."""
+        value = self.value
         fits = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
-        if fits and (low < value < high or (closed and value == low)):
-            return float(value)
-        self.add(path, f"must be {what}; {shown(value)} is not")
-        return None
+        return float(value) if fits and (low < value < high or (closed and value == low)) else self.must_be(what)
 
-    def whole(self, path: Path, value: Any, low: int) -> int | None:
-        """Return a whole number from low, or note a problem."""
+    def whole(self, low: int) -> int | None:
+        """A whole number from low."""
+        value = self.value
         if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
-            if value < LARGEST:
-                return int(value)
-            self.add(path, f"must be below 2**62; {shown(value)} is not")
-            return None
-        whole = isinstance(value, float) and value.is_integer() and value >= low
+            return int(value) if value < LARGEST else self.must_be("below 2**62")
         what = "a positive integer" if low == 1 else f"an integer of at least {low}"
-        self.add(path, f"must be {what}; "
-                 + (f"write {value:.0f} instead of {value}" if whole else f"{shown(value)} is not"))
-        return None
+        if isinstance(value, float) and value.is_integer() and value >= low:
+            return self.note(f"must be {what}; write {value:.0f} instead of {value}")
+        return self.must_be(what)
 
-    def once(self, path: Path, values: Sequence[T | None]) -> tuple[T, ...]:
-        """Return the values without those that were noted as problems (None); note every one that is there twice."""
-        for i, value in enumerate(values):
-            if value is not None and value in values[:i]:
-                self.add((*path, i), f"{_last_word(path)} has {value} twice; leave one of them out")
-        return tuple(value for value in values if value is not None)
+    def must_be(self, what: str) -> None:
+        """Note what the value would have to be."""
+        self.note(f"must be {what}; {shown(self.value)} is not")
 
-    def writable(self, path: Path, value: Any) -> None:
+    def check_writable(self) -> None:
         """Note what a study file cannot hold: it has no text from which the key of a cell could be made."""
-        if isinstance(value, Mapping):
-            for key, item in value.items():
+        if isinstance(self.value, Mapping):
+            for key in self.value:
                 if isinstance(key, str):
-                    self.writable((*path, key), item)
+                    self[key].check_writable()
                 else:
-                    self.add(path, f"{_last_word(path)} has the key {key!r}, which is no text")
-        elif isinstance(value, list):
-            for i, item in enumerate(value):
-                self.writable((*path, i), item)
-        elif value is None:
-            self.add(path, f"{_last_word(path)} is None, which a study file cannot hold: leave it out")
-        elif not isinstance(value, str | int | float | date | clock):
-            self.add(path, f"{_last_word(path)} is of type {type(value).__name__}, which a study file cannot hold: "
-                           "give texts, numbers, true, false, dates, or lists and tables of them")
-
-
-def one_or_several(value: Any) -> Sequence[Any]:
-    """Return a list as it is, anything else as the only entry of one."""
-    return list(value) if isinstance(value, list | tuple | range | np.ndarray) else [value]
-
-
-def items(path: Path, value: Any) -> list[tuple[Path, Any]]:
-    """Return the entries of a list with their paths; anything else with the path itself."""
-    several = isinstance(value, list | tuple | range | np.ndarray)
-    return [((*path, i) if several else path, one) for i, one in enumerate(one_or_several(value))]
+                    self.note(f"{self.name} has the key {key!r}, which is no text")
+        elif isinstance(self.value, list):
+            for item in self.items():
+                item.check_writable()
+        elif self.value is None:
+            self.note(f"{self.name} is None, which a study file cannot hold: leave it out")
+        elif not isinstance(self.value, str | int | float | date | clock):
+            self.note(f"{self.name} is of type {type(self.value).__name__}, which a study file cannot hold: "
+                      "give texts, numbers, true, false, dates, or lists and tables of them")
 
 
 def shown(value: Any) -> str:
@@ -160,7 +171,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def written(path: Path) -> str:
+def _written(path: Path) -> str:
     """Write a path as in a study file: data[0].noise, formulation['relaxed'].na."""
     text = ""
     for part in path:
@@ -169,7 +180,3 @@ def written(path: Path) -> str:
         else:
             text += f".{part}" if text else part
     return text
-
-
-def _last_word(path: Path) -> str:
-    return next((part for part in reversed(path) if isinstance(part, str)), "")

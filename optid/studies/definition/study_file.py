@@ -8,7 +8,7 @@ from optid.errors import StudyError
 from optid.studies.definition.description import Study
 from optid.studies.definition.entries import read
 from optid.studies.definition.problems import Problems
-from optid.studies.definition.trial import Records, note_impossible, note_unreadable, note_wrong_options
+from optid.studies.definition.trial import note_all
 
 _PLACE = re.compile(r"(.*) \(at line (\d+), column (\d+)\)")
 _END = " (at end of document)"
@@ -42,14 +42,7 @@ def read_study(path: Path) -> Study:
 
 
 def parse_study(text: str, folder: Path, label: str, title: str = "study") -> Study:
-    """Read the text of a study file; see `Study.from_text`.
-
-    Args:
-        text: TOML.
-        folder: where relative data files are looked for.
-        label: what the text is called in messages.
-        title: title of a study that has none.
-    """
+    """Read the text of a study file; see `Study.from_text`. The title is that of a study that has none."""
     text = text.replace("\r\n", "\n")
     try:
         raw = tomllib.loads(text)
@@ -59,12 +52,7 @@ def parse_study(text: str, folder: Path, label: str, title: str = "study") -> St
         raise StudyError(f"{label} has a problem:\n  {_syntax(str(error), text)}") from None
     problems = Problems()
     found = {"name": title, **read(raw, problems)}
-    records = Records(folder)
-    if "data" in raw:
-        note_unreadable(found["data"], records, problems, wrong={problem.path[:2] for problem in problems})
-    if not problems:
-        note_impossible(found["data"], found["formulations"], records, problems)
-        note_wrong_options(found["data"], found["formulations"], found["solvers"], records, problems)
+    note_all(folder, found["data"], found["formulations"], found["solvers"], problems)
     problems.told(label)
     study = Study(**found, folder=folder)
     object.__setattr__(study, "data_checked", True)

@@ -15,48 +15,49 @@ from optid.registry import named_constraint
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.problems import Label, Problems
+from optid.studies.definition.problems import Path as Keys
 from optid.studies.sources.systems import simulate, system
 
-SHORT = 300
-"""Samples on which a formulation, and the options of a solver, are tried."""
-TRIAL = 20.0
-"""Seconds that a trial of options may take; whoever needs longer is left to the run."""
-LONGEST = 300
-"""Characters of the words of a solver that fails."""
+SHORT = 300  # samples on which a formulation, and the options of a solver, are tried
+TRIAL = 20.0  # seconds that a trial of options may take; whoever needs longer is left to the run
+LONGEST = 300  # characters of the words of a solver that fails
 
 
-class Records:
+def note_all(folder: Path, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry],
+             solvers: Sequence[SolverEntry], problems: Problems) -> None:
+    """Note data that cannot be read and, where nothing is wrong, impossible formulations and wrong options.
+
+    Relative files are in the folder; data at whose keys a problem is noted already are left alone.
+    """
+    records, wrong = _Records(folder), {problem.path[:2] for problem in problems}
+    for i, entry in enumerate(data):
+        if ("data", i) not in wrong:
+            _note_unreadable(("data", i), entry, records, problems)
+    if not problems:
+        note_impossible(data, formulations, records, problems)
+        note_wrong_options(data, formulations, solvers, records, problems)
+
+
+class _Records:
     """The records of data entries, each read once."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self.folder = folder
         self._read: dict[str, Data] = {}
 
-    def path(self, name: str) -> Path:
-        """Return where a file of the study is."""
-        return self._folder / name
-
     def read(self, entry: DataEntry) -> Data:
-        """Return the whole record of an entry that is not simulated.
-
-        Raises:
-            DataError: what `optid.read` refuses.
-        """
+        """The whole record of an entry that is not simulated."""
         from optid.studies.grid import located
         from optid.studies.sources.records import read_entry
 
         if entry.name not in self._read:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", DataWarning)  # they are told when the record is used
-                self._read[entry.name] = read_entry(located(entry, self._folder))
+                self._read[entry.name] = read_entry(located(entry, self.folder))
         return self._read[entry.name]
 
     def beginning(self, entry: DataEntry, samples: float = SHORT) -> Data:
-        """Return the beginning of a record, or a simulated one, of so many samples at most.
-
-        Raises:
-            DataError: what `optid.read` refuses.
-        """
+        """The beginning of a record, or a simulated one, of so many samples at most."""
         if entry.system is not None:
             longest = max(entry.samples or (system(entry.system).samples,))
             return simulate(entry.system, int(min(samples, longest)))[0]
@@ -68,63 +69,39 @@ class Records:
         return Data(first.u[:kept], first.y[:kept], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
 
 
-def note_unreadable(entries: Sequence[DataEntry], records: Records, problems: Problems,
-                    wrong: set[tuple[str | int, ...]] | None = None) -> None:
-    """Note the data entries whose files cannot be read.
-
-    Args:
-        entries: of the study.
-        records: where they are read.
-        problems: collects what is wrong.
-        wrong: paths of entries whose keys are known to be wrong: they are left alone.
-    """
-    for i, entry in enumerate(entries):
-        if ("data", i) not in (wrong or ()):
-            _note_trouble(("data", i), entry, records, problems)
-
-
-def _note_trouble(path: tuple[str | int, ...], entry: DataEntry, records: Records, problems: Problems) -> None:
+def _note_unreadable(path: Keys, entry: DataEntry, records: _Records, problems: Problems) -> None:
     """Note what is wrong with the files of one entry, at the key that is to blame."""
     from optid.data.reading.columns import choose
     from optid.data.reading.tables import open_table
 
-    options, key = dict(entry.options), "file"
-    for number, name in enumerate(entry.files):
-        try:
-            table = open_table(records.path(name), options.get("columns"), options.get("delimiter", ","),
+    options, at = dict(entry.options), (*path, "file")
+    try:
+        for number, name in enumerate(entry.files):
+            at = (*path, "file", number)
+            table = open_table(records.folder / name, options.get("columns"), options.get("delimiter", ","),
                                options.get("decimal", "."))
             for key, letter in (("inputs", "u"), ("outputs", "y")):
+                at = (*path, key)
                 choose(table.names, options.get(key), letter, table.label)
-            key = "file"
-        except DataError as error:
-            problems.add((*path, key, number) if key == "file" else (*path, key), str(error))
-            return
-    try:
+        at = (*path, "file")
         if entry.files:
             records.read(entry)
     except DataError as error:
-        problems.add((*path, "file"), str(error))
+        problems.add(at, str(error))
 
 
-def note_impossible(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: Records,
+def note_impossible(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: _Records,
                     problems: Problems) -> None:
     """Note the formulations whose arguments or constraints do not fit any of their data.
 
     Each is posed on a short record; what only a longer one can tell is left to the run, where it becomes a row.
-
-    Args:
-        data: entries of the study.
-        formulations: entries of the study.
-        records: where data are read.
-        problems: collects what is wrong.
     """
     for entry in formulations:
-        records_of = [one for one in data if not entry.data or one.name in entry.data]
-        if not all(_refused(entry, records.beginning(one)) for one in records_of):
-            continue
-        reasons = [_refused(entry, records.beginning(one, np.inf)) for one in records_of]  # was it too short?
-        if reasons and all(reasons):
-            problems.add(("formulation", Label(entry.name)), f"the formulation cannot be posed: {reasons[0]}")
+        its_data = [one for one in data if entry.is_for(one)]
+        if all(_refused(entry, records.beginning(one)) for one in its_data):
+            reasons = [_refused(entry, records.beginning(one, np.inf)) for one in its_data]  # was it too short?
+            if reasons and all(reasons):
+                problems.add(("formulation", Label(entry.name)), f"the formulation cannot be posed: {reasons[0]}")
 
 
 def _refused(entry: FormulationEntry, record: Data) -> str:
@@ -134,31 +111,27 @@ def _refused(entry: FormulationEntry, record: Data) -> str:
     except (StructureError, LookupFailed) as error:
         return str(error)
     except Exception:  # a record that is too short, a defect: the run will tell
-        return ""
+        pass
     return ""
 
 
 def _posed(entry: FormulationEntry, record: Data) -> Any:
-    """Return the programme of a formulation on a record, the first one of a procedure."""
+    """The programme of a formulation on a record, the first one of a procedure."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        constraints = tuple(named_constraint(text) for text in entry.constraints)
-        more = {"constraints": constraints} if constraints else {}
-        problem = look_up(entry.formulation)[1](record, **entry.options, **more)
+        problem = posed(entry.formulation, record, entry.constraints, entry.options)
         return problem if hasattr(problem, "view") else next(problem)
 
 
-def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry],
-                       solvers: Sequence[SolverEntry], records: Records, problems: Problems) -> None:
-    """Note the options with which a solver fails on a short record that it solves without them.
+def posed(formulation: str, record: Data, constraints: Sequence[str], options: Mapping[str, Any]) -> Any:
+    """Return the programme, or procedure, of a registered formulation with named constraints on a record."""
+    named = tuple(named_constraint(text) for text in constraints)
+    return look_up(formulation)[1](record, **options, **({"constraints": named} if named else {}))
 
-    Args:
-        data: entries of the study.
-        formulations: entries of the study.
-        solvers: entries of the study.
-        records: where data are read.
-        problems: collects what is wrong.
-    """
+
+def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry],
+                       solvers: Sequence[SolverEntry], records: _Records, problems: Problems) -> None:
+    """Note the options with which a solver fails on a short record that it solves without them."""
     for entry in solvers:
         if not entry.options:
             continue
@@ -166,27 +139,25 @@ def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[Formula
         if programme is None or not (all_fail := _failure(programme, entry.solver, entry.options)):
             continue
         alone = {key: _failure(programme, entry.solver, {key: value}) for key, value in entry.options.items()}
-        path = ("solver", Label(entry.name), "options")
+        path, without = ("solver", Label(entry.name), "options"), f"{entry.solver} fail where it succeeds without"
         for key, why in alone.items():
             if why:
-                problems.add((*path, key), f"{key} makes {entry.solver} fail where it succeeds without: {why}")
+                problems.add((*path, key), f"{key} makes {without}: {why}")
         if not any(alone.values()):
-            problems.add(path, f"these options make {entry.solver} fail where it succeeds without: {all_fail}")
+            problems.add(path, f"these options make {without}: {all_fail}")
 
 
-def _solved_without(solver: str, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: Records
+def _solved_without(solver: str, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: _Records
                     ) -> Iterator[Any]:
     """Programmes on short records that a solver solves without any option."""
     for entry in formulations:
-        for one in data:
-            if not entry.data or one.name in entry.data:
-                try:
-                    programme = _posed(entry, records.beginning(one))
-                    solved = _solve(programme, solver, {}).status in (Status.OPTIMAL, Status.LOCAL)
-                except Exception:  # not posed, not installed, not for this formulation
-                    continue
-                if solved:
+        for one in filter(entry.is_for, data):
+            try:
+                programme = _posed(entry, records.beginning(one))
+                if _solve(programme, solver, {}).status in (Status.OPTIMAL, Status.LOCAL):
                     yield programme
+            except Exception:  # not posed, not installed, not for this formulation
+                continue
 
 
 def _failure(programme: Any, solver: str, options: Mapping[str, Any]) -> str:

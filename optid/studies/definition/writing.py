@@ -1,7 +1,6 @@
 """From a study back to the keys and values of a study file, and to its text."""
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import fields
@@ -24,79 +23,60 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _ALONE = ("accuracy", "time_limit", "memory_limit", "repetitions", "warm", "seeds", "holdout")
 
 
+_AXES = {  # key in a file: argument of a Study, keys that tell an entry from labels, what is taken
+    "data": ("data", ("file", "system", "name"), "a record, optid.Data(u, y, dt), the name of a file or of a simulated "
+             "system"),
+    "formulation": ("formulations", ("formulation",), "the name of a formulation"),
+    "solver": ("solvers", ("solver",), "the name of a solver"),
+}
+
+
 def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
     """Return the keys and values of a study file for the arguments of a `Study`, however simply they were written.
 
-    Args:
-        given: the arguments by name.
-        problems: collects what cannot be read at all.
+    What cannot be read at all is noted.
     """
     raw: dict[str, Any] = {"name": given["name"], **{key: plain(given[key]) for key in _ALONE}}
-    raw["data"] = [_data(entry, label) for label, entry in _labelled(given["data"], _DATA_KEYS)]
-    raw["formulation"] = []
-    for label, entry in _labelled(given["formulations"], _FORMULATION_KEYS):
-        entry = {"formulation": entry} if isinstance(entry, str) else entry
-        raw["formulation"].append(_with_label(entry, label))
-    solvers = given["solvers"]
-    if isinstance(solvers, str) or plain(solvers) == [ALL]:
-        raw["solvers"] = solvers
-    else:
-        raw["solver"] = []
-        for label, entry in _labelled(solvers, _SOLVER_KEYS):
-            raw["solver"].append(_with_label({"solver": entry} if isinstance(entry, str) else entry, label))
-    for key, takes in _TAKES.items():
-        for i, entry in enumerate(raw.get(key, [])):
+    for key, (axis, marks, takes) in _AXES.items():
+        value = given[axis]
+        if key == "solver" and (isinstance(value, str) or plain(value) == [ALL]):
+            raw[axis] = value
+            continue
+        if isinstance(value, Mapping) and not any(mark in value for mark in marks):  # by labels
+            entries = [_entry(key, entry, str(label)) for label, entry in value.items()]
+        else:
+            entries = [_entry(key, entry) for entry in (value if isinstance(value, list | tuple) else [value])]
+        for i, entry in enumerate(entries):
             if not isinstance(entry, Mapping):
                 problems.add((key, i), f"{shown(entry)} is none of what is taken here: {takes}, or a mapping with the "
                              f"keys of [[{key}]]")
-        raw.update({key: [plain(entry) for entry in raw[key] if isinstance(entry, Mapping)]} if key in raw else {})
+        raw[key] = [plain(entry) for entry in entries if isinstance(entry, Mapping)]
     return raw
 
 
-_TAKES = {"data": "a record, optid.Data(u, y, dt), the name of a file or of a simulated system",
-          "formulation": "the name of a formulation", "solver": "the name of a solver"}
-_DATA_KEYS, _FORMULATION_KEYS, _SOLVER_KEYS = ("file", "system", "name"), ("formulation",), ("solver",)
-
-
-def _labelled(value: Any, marks: tuple[str, ...]) -> list[tuple[str | None, Any]]:
-    """Entries with their labels: a mapping without the keys of an entry has labels for keys."""
-    if isinstance(value, Mapping) and not any(key in value for key in marks):
-        return [(str(key), entry) for key, entry in value.items()]
-    return [(None, entry) for entry in (value if isinstance(value, list | tuple) else [value])]
-
-
-def _data(entry: Any, label: str | None) -> Any:
+def _entry(key: str, entry: Any, label: str | None = None) -> Any:
+    """One entry of an axis as a mapping, where it is something that is taken there."""
     if isinstance(entry, Data):
-        entry = {"record": entry}
-    elif isinstance(entry, str | Path):
+        entry = {"record": entry} if key == "data" else entry
+    elif isinstance(entry, str) and key != "data":
+        entry = {key: entry}
+    elif isinstance(entry, str | Path) and key == "data":
         known = isinstance(entry, str) and (entry in SYSTEMS or not PurePath(entry).suffix)
         entry = {"system": entry} if known else {"file": str(entry)}
-    return _with_label(entry, label)
+    elif isinstance(entry, DataEntry | FormulationEntry | SolverEntry):
+        entry = _entry_keys(entry)
+    return {"name": label, **entry} if isinstance(entry, Mapping) and label is not None else entry
 
 
-def _with_label(entry: Any, label: str | None) -> Any:
-    if isinstance(entry, DataEntry | FormulationEntry | SolverEntry):
-        entry = entry_keys(entry)
-    if isinstance(entry, Mapping) and label is not None:
-        return {"name": label, **entry}
-    return entry
-
-
-def entry_keys(entry: DataEntry | FormulationEntry | SolverEntry) -> dict[str, Any]:
-    """Return the keys and values of an entry; what is empty is left out."""
+def _entry_keys(entry: DataEntry | FormulationEntry | SolverEntry) -> dict[str, Any]:
+    """The keys and values of an entry; what is empty is left out."""
     found = {f.name: getattr(entry, f.name) for f in fields(entry)}
     options = dict(found.pop("options"))
     if "files" in found:
         found["file"] = found.pop("files")
     if isinstance(entry, SolverEntry):
-        found["options"] = options
-        options = {}
-    kept = {key: value for key, value in found.items() if value is not None and not _empty(value)}
-    return {**kept, **options}
-
-
-def _empty(value: Any) -> bool:
-    return isinstance(value, tuple | dict) and not value
+        found, options = {**found, "options": options}, {}
+    return {**{key: value for key, value in found.items() if value is not None and value not in ((), {})}, **options}
 
 
 def plain(value: Any) -> Any:
@@ -128,7 +108,7 @@ def as_toml(study: "Study") -> str:
                 raise StudyError(f"{entry.name!r} is a record in memory, which a study file cannot hold: write it to a "
                                  "file and name that")
             lines += ["", f"[[{key}]]"]
-            for name, value in entry_keys(entry).items():
+            for name, value in _entry_keys(entry).items():
                 lines.append(f"{_key(name)} = {_value(_single(name, plain(value)))}")
     return "\n".join(lines) + "\n"
 
@@ -147,10 +127,8 @@ def _key(name: str) -> str:
 def _value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float):
-        return repr(value) if math.isfinite(value) else {math.inf: "inf", -math.inf: "-inf"}.get(value, "nan")
+    if isinstance(value, int | float):
+        return repr(value)  # nan, inf and -inf are those of TOML
     if isinstance(value, str):
         return _text(value)
     if isinstance(value, list):

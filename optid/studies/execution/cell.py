@@ -17,7 +17,7 @@ import numpy as np
 
 from optid.errors import DataError, SolverMissing, SolverRefused
 from optid.identify.fitting import Fit, fit
-from optid.program.solution import Solution, Times
+from optid.program.solution import Solution
 from optid.solving.solve import NOT_FINITE, solve
 from optid.studies.execution.machine import Peak, machine
 from optid.studies.execution.worker import keep
@@ -26,14 +26,9 @@ from optid.studies.sources.records import Record, load
 from optid.studies.storage.rows import DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, as_json, complete
 from optid.studies.versions import determining
 
-KEPT = 3
-"""Records that a worker keeps, so that cells of one data set load it once."""
-
-SHORTEST = 0.01
-"""Seconds of a time limit that a solver always has: some take none at all for no limit."""
-
-REHEARSED = 0.25
-"""Share of the time limit up to which the first cell of its kind in a process is run twice."""
+KEPT = 3  # records that a worker keeps, so that cells of one data set load it once
+SHORTEST = 0.01  # seconds of a time limit that a solver always has: some take none at all for no limit
+REHEARSED = 0.25  # share of the time limit up to which the first cell of its kind in a process is run twice
 
 _records: OrderedDict[tuple[Any, ...], Record] = OrderedDict()
 _rehearsed: set[tuple[str, str, bool]] = set()
@@ -47,9 +42,6 @@ def run_cell(cell: Cell) -> dict[str, Any]:
 
     The solver's own clock is set to what loading the record left of the time limit, and it runs in this process:
     whoever calls this stops a process that does not keep its limits.
-
-    Args:
-        cell: what to run.
     """
     clock = time.perf_counter()
     row = _run(cell, clock)
@@ -78,20 +70,22 @@ def _run(cell: Cell, given: float) -> dict[str, Any]:
         found = {"outcome": MEMORY_LIMIT, "reason": f"MemoryError: {error}"}
     except (Exception, SystemExit) as error:
         found = {"outcome": ERROR, "reason": f"{type(error).__name__}: {error}"}
-    if (largest := peak.mb()) > cell.memory_limit:  # unseen by who watches: what is above the limit is no answer
-        found, fitted = {"outcome": MEMORY_LIMIT, "reason": _held(cell, largest)}, None
-    row = complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": largest, "base_mb": peak.start,
-                    "total_s": time.perf_counter() - clock})
+
+    if held := _too_much(peak, cell):  # unseen by who watches: what is above the limit is no answer
+        found, fitted = {"outcome": MEMORY_LIMIT, "reason": held}, None
+    row = complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": peak.mb(),
+                    "base_mb": peak.start, "total_s": time.perf_counter() - clock})
     if fitted is None:
         return row
     row = _warm(cell, fitted, row, limit, given)
-    if (largest := peak.mb()) > cell.memory_limit:
-        row = without_warm(row, _held(cell, largest))
-    return row | {"peak_mb": largest, "total_s": time.perf_counter() - clock}
+    if held := _too_much(peak, cell):
+        row = without_warm(row, held)
+    return row | {"peak_mb": peak.mb(), "total_s": time.perf_counter() - clock}
 
 
-def _held(cell: Cell, mb: float) -> str:
-    return f"held {mb:.0f} MB; the limit is {cell.memory_limit:g} MB"
+def _too_much(peak: Peak, cell: Cell) -> str:
+    held, most = peak.mb(), cell.memory_limit
+    return f"held {held:.0f} MB; the limit is {most:g} MB" if held > most else ""
 
 
 def prepare() -> None:
@@ -107,29 +101,15 @@ def prepare() -> None:
         simulated(model, data)
 
 
-def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None = None, total_s: float | None = None,
-             peak_mb: float | None = None) -> dict[str, Any]:
-    """Return the row of a cell that made none itself.
-
-    Args:
-        cell: which.
-        outcome: one of `rows.OUTCOMES`.
-        reason: one sentence.
-        started: when it was started; now when not given.
-        total_s: seconds until it was stopped.
-        peak_mb: largest memory seen.
-    """
-    return complete({**known(cell), "outcome": outcome, "reason": reason, "total_s": total_s, "peak_mb": peak_mb,
+def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None = None, total_s: float | None = None
+             ) -> dict[str, Any]:
+    """Return the row of a cell that made none itself: why, when it was started (by default now) and stopped."""
+    return complete({**known(cell), "outcome": outcome, "reason": reason, "total_s": total_s,
                      "started": (started or datetime.now(UTC)).isoformat()})
 
 
 def without_warm(row: Mapping[str, Any], reason: str) -> dict[str, Any]:
-    """Return the row of a cold solve that stands alone.
-
-    Args:
-        row: of the cold solve.
-        reason: what became of the second solve.
-    """
+    """Return the row of a cold solve that stands alone; the reason is what became of the second solve."""
     words = "; ".join(filter(None, [row["reason"], f"no warm solve: {reason}"]))
     return {**row, **dict.fromkeys(("warm_s", "warm_status", "warm_iterations")), "reason": words}
 
@@ -154,13 +134,13 @@ def known(cell: Cell) -> dict[str, Any]:
 def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit | None]:
     """What a fit comes to, and the fit where it is to be solved once more; ``limit``: seconds for each programme."""
     data = record.data
-    held = 0 if record.holdout is None else _length(record.holdout)
-    row: dict[str, Any] = {"n_samples": _length(data) + held, "n_estimation": _length(data), "n_inputs": data.m,
+    held = 0 if record.holdout is None else record.holdout.n_samples
+    row: dict[str, Any] = {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
                            "n_outputs": data.l}
     fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy, time_limit=limit,
                  isolate=False, constraints=cell.constraints, solver_options=dict(cell.solver_options), raises=False,
                  **cell.options)
-    row |= _verdict(fitted) | _times(fitted)
+    row |= _verdict(fitted)
     remarks = [row["reason"]]
     if fitted.model is not None:
         row |= _figures(fitted.model, record, remarks)
@@ -185,16 +165,13 @@ def _loaded(cell: Cell) -> Record:
     return _records[identity]
 
 
-def _length(data: Any) -> int:
-    return sum(experiment.n_samples for experiment in data.experiments)
-
-
 def _verdict(fitted: Fit) -> dict[str, Any]:
-    """Why it stopped, whether there is a point, whether it is proved, and the residuals."""
+    """Why it stopped, whether there is a point, whether it is proved, the residuals and the times."""
     solution, program = fitted.solution, fitted.program
     bound, residuals = solution.bound, solution.residuals
     steps = [step for _, step in fitted.steps]
-    counts = [step.iterations for step in steps]
+    counts, times = [step.iterations for step in steps], [step.times for step in steps]
+    told = [t.compile for t in times if np.isfinite(t.compile)]  # apart, in these programmes
     row = {
         "outcome": DONE, "status_claimed": solution.claimed, "status_verified": str(solution.status),
         "reason": solution.reason, "reached": str(solution.status) in SUCCESS, "proved": solution.proof,
@@ -202,36 +179,20 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
         "program_class": program.kind, "unknowns": program.size, "n_programs": len(steps),
         "objective": solution.objective, "scale": solution.scale, "bound": bound.value if bound else None,
         "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
+        "build_s": solution.times.build, "compile_s": sum(told) if told else None,
+        "solve_s": sum(t.solve for t in times) - sum(told), "judge_s": sum(t.judge for t in times),
+        "prove_s": sum(t.prove for t in times), "fit_s": fitted.seconds,
     }
     if residuals is not None:
-        row |= {"violation": residuals.violation, "stationarity": residuals.stationarity,
-                "complementarity": residuals.complementarity}
+        row |= {name: getattr(residuals, name) for name in ("violation", "stationarity", "complementarity")}
     return row
-
-
-def _times(fitted: Fit) -> dict[str, Any]:
-    phases = [step.times for _, step in fitted.steps]
-    return {"build_s": fitted.solution.times.build, **_compiled(phases), "judge_s": sum(t.judge for t in phases),
-            "prove_s": sum(t.prove for t in phases), "fit_s": fitted.seconds}
-
-
-def _compiled(phases: list[Times]) -> dict[str, Any]:
-    """Compilation, where it was told apart in at least one programme, and the rest of the solving."""
-    told = [t.compile for t in phases if np.isfinite(t.compile)]
-    return {"compile_s": sum(told) if told else None, "solve_s": sum(t.solve for t in phases) - sum(told)}
 
 
 def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: float) -> dict[str, Any]:
     """Solve once more from the solution; the programme and what was compiled of it are at hand.
 
-    The row of the cold solve stands whatever becomes of this: where it kills the process, the parent has that row.
-
-    Args:
-        cell: which.
-        fitted: by the cold solve.
-        row: of the cold solve.
-        limit: seconds that the cold solve had; with another number some back ends would compile again.
-        given: when this process was given the cell.
+    The row of the cold solve stands whatever becomes of this: where it kills the process, the parent has that row. The
+    limit is that of the cold solve; with another number some back ends would compile again.
     """
     left = cell.time_limit - (time.perf_counter() - given)
     if left < fitted.solution.times.solve:
@@ -266,13 +227,12 @@ def _figures(model: Any, record: Record, remarks: list[str | None]) -> dict[str,
     if record.holdout is not None:
         raw = record.holdout.raw()
         measured = np.vstack([e.y for e in raw.experiments])
-        for name, what, outputs in (("one_step_fit", "one-step fit", lambda: one_step(model, raw)),
-                                    ("simulation_fit", "simulation fit", lambda: simulated(model, raw))):
-            fits = attempt(what, lambda outputs=outputs: fit_percent(measured, np.vstack(outputs())))
+        for name, what, outputs in (("one_step_fit", "one-step fit", one_step),
+                                    ("simulation_fit", "simulation fit", simulated)):
+            fits = attempt(what, lambda outputs=outputs: fit_percent(measured, np.vstack(outputs(model, raw))))
             if fits is not None:
                 row |= {name: float(np.mean(fits)), f"{name}s": as_json(fits)}
-    truth = record.truth
-    if truth is not None:
+    if (truth := record.truth) is not None:
         row["parameter_error"] = attempt("parameter error", lambda: truth.parameter_error(model))
         row["nonlinearity_error"] = attempt("nonlinearity error", lambda: truth.nonlinearity_error(model))
     poles = attempt("poles", lambda: np.atleast_1d(np.asarray(model.poles, dtype=complex)))

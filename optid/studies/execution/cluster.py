@@ -36,15 +36,10 @@ Row = dict[str, Any]
 
 def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
             scheduler: Any) -> Iterator[Row]:
-    """Run every cell on the cluster and yield its row, in the order in which they end.
+    """Run every cell on the cluster of a scheduler and yield its row, as `workers.execute`.
 
-    Closing the generator, or an exception in it such as KeyboardInterrupt, ends the cells under way at once.
-
-    Args:
-        cells: what to run; their own limits hold. Data files are read where they are when a worker sees the same
-            content under the same path; else they are sent to it once.
-        function: what makes a row of a cell; workers import it by its name.
-        scheduler: as for `optid.data.clusters.connected`.
+    Data files are read where they are when a worker sees the same content under the same path; else they are sent to it
+    once. The scheduler is given as for `optid.data.clusters.connected`.
 
     Raises:
         ClusterError: no scheduler, no worker, workers with other versions (also those that join later), or a scheduler
@@ -65,21 +60,15 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
 
 
 def check(cells: Iterable[Cell], scheduler: Any) -> None:
-    """Refuse a cluster that cannot run the cells.
-
-    Raises:
-        ClusterError: as `execute`.
-    """
+    """Raise ClusterError, as `execute`, for a cluster that cannot run the cells."""
     with connected(scheduler, packages(cells)):
         pass
 
 
 def packages(cells: Iterable[Cell]) -> list[str]:
     """Return the distributions that determine the results of the cells."""
-    names = dict.fromkeys(PACKAGES)
-    for cell in cells:
-        names |= dict.fromkeys(name for name in _versions(cell) if not name.startswith("source of "))
-    return list(names)
+    found = (name for cell in cells for name in _versions(cell) if not name.startswith("source of "))
+    return list(dict.fromkeys([*PACKAGES, *found]))
 
 
 def _versions(cell: Cell) -> dict[str, str]:
@@ -145,8 +134,8 @@ class _Flight:
             answer = future.result(timeout=AGAIN)
         except KilledWorker as error:  # a cell cannot kill a Dask worker, but it may have been there by chance
             self._forget(future)
-            self._turns[cell.key, cell.repetition] += 1
-            turns = self._turns[cell.key, cell.repetition]
+            self._turns[cell.identity] += 1
+            turns = self._turns[cell.identity]
             if turns < TURNS:
                 self._send(cell, pickle.dumps(cell))
                 return None

@@ -4,8 +4,8 @@ import pickle
 import platform
 import threading
 from collections import deque
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -31,16 +31,10 @@ _studies: dict[str, _Hands] = {}
 
 
 def run(study: str, function: bytes, packed: bytes, contents: Sequence[bytes] | None) -> dict[str, Any] | None:
-    """Run a cell in a local worker process and return its row.
+    """Run a pickled cell in a local worker process, kept for a run of a study, and return its row.
 
-    Args:
-        study: name of the run of a study, for which worker processes are kept.
-        function: what makes a row of a cell, pickled.
-        packed: the cell, pickled.
-        contents: what is in its data files, or None.
-
-    Returns:
-        The row; None when this machine does not have the content of the data files.
+    The function makes a row of a cell, pickled; the contents are what is in the cell's data files, or None. None is
+    returned when this machine does not have the content of the data files.
 
     Raises:
         StudyError: worker processes do not start.
@@ -49,13 +43,11 @@ def run(study: str, function: bytes, packed: bytes, contents: Sequence[bytes] | 
     here = _with_files(cell, contents)
     if here is None:
         return None
-    pool = _taken(study, function)
     try:
-        rows = list(pool.run(deque([here])))
+        with _pool(study, function) as pool:
+            rows = list(pool.run(deque([here])))
     except StudyError as error:
         raise StudyError(f"on machine {platform.node()!r}: {error}") from None
-    finally:
-        _put_back(study, pool)
     if not rows:
         raise ClusterError("the study ended while this cell ran")
     return rows[0] | {"file": ", ".join(cell.data_source.files) or None}
@@ -75,24 +67,24 @@ def end(study: str) -> None:
         pool.close()
 
 
-def _taken(study: str, function: bytes) -> Pool:
+@contextmanager
+def _pool(study: str, function: bytes) -> Iterator[Pool]:
+    """A pool of a study that nobody else uses."""
     with _lock:
         hands = _studies.setdefault(study, _Hands())
         if hands.ended:
             raise ClusterError("the study has ended")
         pool = hands.idle.pop() if hands.idle else Pool(pickle.loads(function), 1)
         hands.busy.append(pool)
-        return pool
-
-
-def _put_back(study: str, pool: Pool) -> None:
-    with _lock:
-        hands = _studies[study]
-        hands.busy.remove(pool)
-        if not hands.ended:
-            hands.idle.append(pool)
-            return
-    pool.close()
+    try:
+        yield pool
+    finally:
+        with _lock:
+            hands.busy.remove(pool)
+            if not (ended := hands.ended):
+                hands.idle.append(pool)
+        if ended:
+            pool.close()
 
 
 def _with_files(cell: Cell, contents: Sequence[bytes] | None) -> Cell | None:

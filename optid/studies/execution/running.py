@@ -1,6 +1,7 @@
 """Run a study into its database: what has a row already is not run again, and what is finished is never lost."""
 
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
@@ -10,7 +11,7 @@ from typing import Any
 from optid.errors import DatabaseError, StudyError, nearest
 from optid.studies.definition.description import Study
 from optid.studies.execution.cell import known, lost_row
-from optid.studies.grid import Cell, cells, check_unchanged, left, located
+from optid.studies.grid import Cell, cells, check_unchanged, located
 from optid.studies.storage.rows import COLUMNS, NAMES, OUTCOMES, REFUSED
 from optid.studies.storage.store import LABELS, Store
 
@@ -48,31 +49,22 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
     """
     retry = _checked(retry)
     grid = cells(study)
-    if execute is None:
-        execute = _executor(grid, workers, scheduler)
+    execute = execute or _executor(grid, workers, scheduler)
     with Store(db, write=True) as store, store.claim(study.name):
         todo = _prepared(store, study, grid, accept_changed_data, retry)
         store.describe(study.name, _description(study))
         _work(todo, len(grid), execute, store, progress)
-        return store.rows_of(study.name, [(cell.key, cell.repetition) for cell in grid])
+        return store.rows_of(study.name, [cell.identity for cell in grid])
 
 
 def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
          ) -> tuple[list[Cell], list[Cell], str]:
-    """Return what a run would do, without changing the database.
+    """Return what a run would do, without changing the database, which need not be there.
 
-    Args:
-        study: what would be run.
-        db: the database, which need not be there.
-        accept_changed_data: as in `run`.
-        retry: as in `run`.
+    Arguments and errors are those of `run`.
 
     Returns:
         All cells, those that a run would run, and which rows it would set aside, in words.
-
-    Raises:
-        StudyError: as in `run`.
-        DatabaseError: the database cannot be read.
     """
     retry, grid = _checked(retry), cells(study)
     if not Path(db).exists():
@@ -86,15 +78,15 @@ def told_former(store: Store, study: Study) -> str:
     """Return in words which rows of a study are set aside, and why; empty where none is."""
     axes = {"data": study.data, "formulation": study.formulations, "solver": study.solvers}
     known_labels = [{entry.name for entry in entries} for entries in axes.values()]
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for labels, count in store.superseded(study.name).items():
-        gone = next((f"{axis} {label} is" for axis, label, names in zip(axes, labels, known_labels)
-                     if label not in names), "")
-        counts[gone] = counts.get(gone, 0) + count
-    reasons = [f"{gone} no longer in the study ({count:,})" for gone, count in sorted(counts.items()) if gone]
-    if "" in counts:
+        gone = [f"{axis} {label} is no longer in the study" for axis, label, names in zip(axes, labels, known_labels)
+                if label not in names]
+        counts[gone[0] if gone else ""] += count
+    reasons = [f"{gone} ({count:,})" for gone, count in sorted(counts.items()) if gone]
+    if counts[""]:
         reasons.append(f"former data, settings or versions, or run again ({counts['']:,})")
-    total = sum(counts.values())
+    total = counts.total()
     return f"{total:,} {'row is' if total == 1 else 'rows are'} set aside: {'; '.join(reasons)}" if total else ""
 
 
@@ -111,26 +103,31 @@ def _prepared(store: Store, study: Study, grid: list[Cell], accept_changed_data:
     """Make the rows of a database those of the grid, and return the cells that have none."""
     if not accept_changed_data:
         check_unchanged(grid, store.data_hashes())
-    store.keep(study.name, [(cell.key, cell.repetition) for cell in grid])
+    store.keep(study.name, [cell.identity for cell in grid])
     if retry:
         store.set_aside(study.name, retry)
-    if relabelled := _relabelled(store, grid, retry):
-        store.append(relabelled)
-    return left(grid, store.finished(study.name))
+    store.append(_relabelled(store, grid, retry))
+    done = store.finished(study.name)
+    return [cell for cell in grid if cell.identity not in done]
 
 
 def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) -> Any:
     """Run a study and return its rows as a pandas frame, or as a list of dictionaries where pandas is not installed.
 
-    Args:
-        study: what to run.
-        db: the database; one that is thrown away when not given.
-        settings: as in `run`.
+    Without a database its rows are kept in one that is thrown away; the settings are those of `run`.
     """
-    if db is None:
-        with tempfile.TemporaryDirectory() as folder:
-            return _framed(run(study, Path(folder) / "study.sqlite", **settings))
-    return _framed(run(study, db, **settings))
+    with tempfile.TemporaryDirectory() as folder:
+        rows = run(study, db or Path(folder) / "study.sqlite", **settings)
+    try:
+        import pandas as pd
+    except ImportError:
+        return rows
+    kinds = {"number": "float64", "integer": "Int64", "flag": "boolean"}
+    frame = pd.DataFrame(rows, columns=list(NAMES))
+    frame = frame.astype({c.name: "bool" if c.kind == "flag" and c.always else kinds[c.kind]
+                          for c in COLUMNS if c.kind in kinds})
+    frame["started"] = pd.to_datetime(frame["started"], utc=True)
+    return frame
 
 
 def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Executor:
@@ -152,7 +149,7 @@ def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progres
     done = total - len(todo)
     if progress is not None:
         progress(done, total, None)
-    expected = {(cell.key, cell.repetition) for cell in todo}
+    expected = {cell.identity for cell in todo}
     with closing(_all_rows(todo, execute)) as rows:
         for row in rows:
             identity = (row["key"], row["repetition"])
@@ -177,25 +174,6 @@ def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, N
     yield from execute([cell for cell in todo if not cell.refusal])
 
 
-def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> list[Row]:
-    """Rows for cells that were run under other labels or for another study: what determines them is the same.
-
-    Those with an outcome that is to be run again are left out.
-    """
-    there = store.labels()
-    wanted, any_study = [], {identity[1:] for identity in there}
-    for cell in grid:
-        if (cell.key, cell.repetition) in any_study:
-            facts = known(cell)
-            if there.get((cell.study, cell.key, cell.repetition)) != tuple(facts[name] for name in LABELS):
-                wanted.append((cell, facts))
-    former = {(row["key"], row["repetition"]): row
-              for row in store.rows_of(None, [(cell.key, cell.repetition) for cell, _ in wanted])
-              if row["outcome"] not in retry}
-    return [former[cell.key, cell.repetition] | {name: facts[name] for name in LABELS} for cell, facts in wanted
-            if (cell.key, cell.repetition) in former]
-
-
 def _description(study: Study) -> str:
     try:
         return replace(study, data=[located(entry, study.folder) for entry in study.data]).to_toml()
@@ -203,14 +181,18 @@ def _description(study: Study) -> str:
         return ""
 
 
-def _framed(rows: list[Row]) -> Any:
-    try:
-        import pandas as pd
-    except ImportError:
-        return rows
-    kinds = {"number": "float64", "integer": "Int64", "flag": "bool"}
-    frame = pd.DataFrame(rows, columns=list(NAMES))
-    frame = frame.astype({c.name: "boolean" if c.kind == "flag" and not c.always else kinds[c.kind]
-                          for c in COLUMNS if c.kind in kinds})
-    frame["started"] = pd.to_datetime(frame["started"], utc=True)
-    return frame
+def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> list[Row]:
+    """Rows for cells that were run under other labels or for another study: what determines them is the same.
+
+    Those with an outcome that is to be run again are left out.
+    """
+    there, wanted = store.labels(), {}
+    any_study = {identity[1:] for identity in there}
+    for cell in grid:
+        if cell.identity in any_study:
+            facts = known(cell)
+            labels = {name: facts[name] for name in LABELS}
+            if there.get((cell.study, *cell.identity)) != tuple(labels.values()):
+                wanted[cell.identity] = labels
+    return [row | wanted[row["key"], row["repetition"]] for row in store.rows_of(None, wanted)
+            if row["outcome"] not in retry]

@@ -34,12 +34,9 @@ _fresh_mb = 0.0
 
 
 def start(folder: str, packed: bytes, parent: int) -> None:
-    """Prepare a new process.
+    """Prepare a new process of a parent; its words and notes go to the folder.
 
-    Args:
-        folder: for its words and notes.
-        packed: what makes a row of a cell, and what prepares for it (or None), pickled.
-        parent: process id of the parent.
+    Packed is what makes a row of a cell, and what prepares for it (or None), pickled.
     """
     global _function, _folder, _fresh_mb
     _folder = Path(folder)
@@ -58,12 +55,7 @@ def start(folder: str, packed: bytes, parent: int) -> None:
 
 
 def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] | None, str, str]:
-    """Run a cell.
-
-    Args:
-        token: names the cell in the notes.
-        packed: the cell, pickled.
-        memory_limit: MB.
+    """Run a pickled cell, which the token names in the notes, within so many MB.
 
     Returns:
         The row; or None, an outcome and a reason where the function itself raised something.
@@ -90,10 +82,9 @@ def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] 
 
 
 def keep(row: Mapping[str, Any]) -> None:
-    """Keep the row of the cell under way, which stands where the rest of that cell comes to no end.
+    """Keep the whole row of the cell under way, which stands where the rest of that cell comes to no end.
 
-    Args:
-        row: whole. Outside of a worker nothing is done.
+    Outside of a worker nothing is done.
     """
     if _kept is not None:
         _kept.write_text(json.dumps(dict(row)))

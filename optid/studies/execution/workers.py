@@ -42,11 +42,7 @@ def cores() -> int:
 
 
 def check_number(workers: int | None) -> None:
-    """Refuse a number of processes that is none.
-
-    Raises:
-        StudyError: not a positive integer.
-    """
+    """Raise StudyError for a number of processes that is no positive integer."""
     if workers is not None and (not isinstance(workers, int) or isinstance(workers, bool) or workers < 1):
         raise StudyError(f"workers must be a positive integer, a number of processes; {workers!r} is not")
 
@@ -63,8 +59,7 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
         workers: number of processes; one per core when not given.
 
     Raises:
-        StudyError: not a positive number of workers, a function that has no name to import, workers that do not start
-            (with their last words), or pebble is missing (with the pip line).
+        StudyError: no positive number, or workers that do not start (with their last words); as for `Pool`.
     """
     todo = deque(cells)
     check_number(workers)
@@ -76,7 +71,7 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
 
 
 class Pool:
-    """Worker processes; they are kept over several calls of `run`, one at a time.
+    """Worker processes for a function of cells; they are kept over several calls of `run`, one at a time.
 
     Raises:
         StudyError: pebble is missing (with the pip line), or a function that has no name to import.
@@ -93,10 +88,9 @@ class Pool:
             self._function = pickle.dumps((function, prepare if function is run_cell else None))
         except Exception as error:
             raise StudyError(f"workers cannot import {function!r}: {error}") from None
-        self._pebble, self._size = pebble, size
+        self._pebble, self._size, self._pool = pebble, size, None
         self._notes = tempfile.TemporaryDirectory(prefix="optid-study-", ignore_cleanup_errors=True)
         self._folder = Path(self._notes.name)
-        self._pool: Any = None
         self._tokens, self._failed, self._killed = count(), 0, False
 
     def run(self, todo: deque[Cell]) -> Iterator[Row]:
@@ -111,15 +105,17 @@ class Pool:
                     yield lost_row(cell, ERROR, f"the cell cannot be sent to a worker: {error}")
                     continue
                 pending[self._scheduled(token, packed, cell)] = cell, token
-            done, _ = wait(pending, TICK, FIRST_COMPLETED)
-            for future in done:
+            for future in wait(pending, TICK, FIRST_COMPLETED).done:
                 cell, token = pending.pop(future)
                 row = self._row(cell, token, future)
                 if row is None:
                     todo.appendleft(cell)
                 else:
                     yield row
-            self._shorten_words()
+            for path in self._folder.glob("*.words"):
+                with suppress(OSError):
+                    if path.stat().st_size > TALK:  # forget what workers wrote where that fills the disk
+                        os.truncate(path, 0)
 
     def kill(self) -> None:
         """End all workers from another thread; `run` ends with the rows there are, and `close` is still to come."""
@@ -147,7 +143,10 @@ class Pool:
 
     def _row(self, cell: Cell, token: str, future: "Future[Any]") -> Row | None:
         """The row of a cell that has ended; None where it is to be given to another worker."""
-        begun = self._begun(token)
+        begun = None  # process that has, or had, the cell, and when it began
+        with suppress(OSError, ValueError):
+            path = note(self._folder, token)
+            begun = int(path.read_text()), path.stat().st_mtime
         try:
             row, outcome, reason = future.result()
             self._failed = 0
@@ -166,7 +165,12 @@ class Pool:
             elif code == RETIRED or begun is None:
                 return None
             else:
-                found = self._crashed(cell, token, begun, code)
+                said = last_words(words(self._folder, begun[0]))
+                how = ", ".join(filter(None, [death(code), said]))
+                fate = CRASHED, f"the worker died: {how}"
+                if "bad_alloc" in said or "memory allocation" in said or "MemoryError" in said:
+                    fate = MEMORY_LIMIT, f"got no more memory ({said}); the limit is {cell.memory_limit:g} MB"
+                found = self._lost(cell, token, begun, *fate)
         if begun is not None and future.exception() is not None:
             _kill_group(begun[0])
             words(self._folder, begun[0]).unlink(missing_ok=True)
@@ -174,29 +178,13 @@ class Pool:
             path.unlink(missing_ok=True)
         return found
 
-    def _crashed(self, cell: Cell, token: str, begun: tuple[int, float], code: int) -> Row:
-        said = last_words(words(self._folder, begun[0]))
-        if "bad_alloc" in said or "memory allocation" in said or "MemoryError" in said:
-            return self._lost(cell, token, begun, MEMORY_LIMIT, f"got no more memory ({said}); the limit is "
-                              f"{cell.memory_limit:g} MB")
-        how = ", ".join(filter(None, [death(code), said]))
-        return self._lost(cell, token, begun, CRASHED, f"the worker died: {how}")
-
-    def _begun(self, token: str) -> tuple[int, float] | None:
-        """Process that has, or had, a cell, and when it began; None where none has."""
-        path = note(self._folder, token)
-        with suppress(OSError, ValueError):
-            return int(path.read_text()), path.stat().st_mtime
-        return None
-
     def _lost(self, cell: Cell, token: str, begun: tuple[int, float] | None, outcome: str, reason: str) -> Row:
         """The row of a cell whose worker did not make one: the one that was kept, where there is one."""
         with suppress(OSError, ValueError):
             return without_warm(complete(json.loads(kept(self._folder, token).read_text())), reason)
-        if begun is None:
-            return lost_row(cell, outcome, reason)
-        return lost_row(cell, outcome, reason, started=datetime.fromtimestamp(begun[1], UTC),
-                        total_s=time.time() - begun[1])
+        times: dict[str, Any] = {} if begun is None else {"started": datetime.fromtimestamp(begun[1], UTC),
+                                                          "total_s": time.time() - begun[1]}
+        return lost_row(cell, outcome, reason, **times)
 
     def _renew(self) -> None:
         """Replace a pool that is broken; pebble breaks one when a worker ends that has no cell."""
@@ -210,13 +198,6 @@ class Pool:
             files = sorted(self._folder.glob("*.words"), key=lambda path: path.stat().st_mtime)
             said = next(filter(None, (last_words(path) for path in reversed(files))), "they do not say why")
             raise StudyError(f"workers ended before they could work, {STILLBORN} times in a row: {said}")
-
-    def _shorten_words(self) -> None:
-        """Forget what workers wrote where that fills the disk."""
-        for path in self._folder.glob("*.words"):
-            with suppress(OSError):
-                if path.stat().st_size > TALK:
-                    os.truncate(path, 0)
 
     def _end_workers(self) -> None:
         """Kill every worker with its children; pebble itself waits seconds for one that does not listen."""

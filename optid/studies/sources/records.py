@@ -11,23 +11,16 @@ from optid.studies.grid import Cell
 from optid.studies.sources.systems import simulate
 from optid.studies.sources.truth import Truth
 
-ANOTHER = 2**31
-"""Added to the seed of a simulated record for the hold-out, which is a record of its own."""
+ANOTHER = 2**31  # added to the seed of a simulated record for the hold-out, which is a record of its own
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What a cell works on.
+    """What a cell works on."""
 
-    Attributes:
-        data: what the fit sees.
-        holdout: what it is judged on; None where nothing is held out.
-        truth: the system behind a simulated record; None for a file.
-    """
-
-    data: Data
-    holdout: Data | None
-    truth: Truth | None
+    data: Data  # what the fit sees
+    holdout: Data | None  # what it is judged on; None where nothing is held out
+    truth: Truth | None  # the system behind a simulated record; None for a file
 
 
 def load(cell: Cell) -> Record:
@@ -36,19 +29,13 @@ def load(cell: Cell) -> Record:
     A file is cut: its last samples, of every experiment, are held out. A simulated record keeps the samples asked for,
     and a second one with another seed is held out, as long as the share of the whole demands.
 
-    Args:
-        cell: whose record.
-
     Raises:
         DataError: what `optid.read` refuses.
     """
     entry = cell.data_source
     if entry.system is None:
         whole = read_entry(entry)
-        if not cell.holdout:
-            return Record(whole, None, None)
-        data, rest = whole.split(1.0 - cell.holdout)
-        return Record(data, rest, None)
+        return Record(*(whole.split(1.0 - cell.holdout) if cell.holdout else (whole, None)), truth=None)
     if cell.samples is None or cell.seed is None:
         raise DataError(f"the simulated record {entry.name!r} needs a length and a seed")
     data, truth = simulate(entry.system, cell.samples, cell.noise, cell.seed)

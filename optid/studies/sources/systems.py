@@ -19,21 +19,13 @@ LENGTH = 200  # samples of an impulse response: it has decayed by then in every 
 
 @dataclass(frozen=True)
 class System:
-    """A system that can be simulated.
+    """A system that can be simulated."""
 
-    Attributes:
-        about: one sentence.
-        samples: of its record when none are asked for.
-        noise: standard deviation of its noise relative to that of the noise-free output, when none is asked for.
-        simulate: (samples, noise, seed) -> record and truth.
-        suggestion: arguments that suit it; a formulation takes those it has.
-    """
-
-    about: str
-    samples: int
-    noise: float
-    simulate: Callable[[int, float, int], tuple[Data, Truth]] = field(repr=False)
-    suggestion: Mapping[str, Any] = field(default_factory=dict)
+    about: str  # one sentence
+    samples: int  # of its record when none are asked for
+    noise: float  # standard deviation relative to that of the noise-free output, when none is asked for
+    simulate: Callable[[int, float, int], tuple[Data, Truth]] = field(repr=False)  # of samples, noise and seed
+    suggestion: Mapping[str, Any] = field(default_factory=dict)  # arguments that suit it; a formulation takes its own
 
 
 def system(name: str) -> System:
@@ -83,29 +75,23 @@ def _example(make: Callable[..., examples.Example], ranges: tuple[tuple[float, f
 # -- one input, one output, written as difference equations ------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Equation:
-    """A y = B f(u) + C e, or y = (B / A) f(u) + e with c = a; all from rest."""
+def _equation(a: np.ndarray, b: np.ndarray, c: np.ndarray, f: Callable[[np.ndarray], np.ndarray], samples: int,
+              noise: float, seed: int, *, most: float = 1.0, dt: float = 0.1, gaussian: bool = False,
+              power: float | None = None) -> tuple[Data, Truth]:
+    """A y = B f(u) + C e, or y = (B / A) f(u) + e with c = a; all from rest, u up to ``most``.
 
-    a: np.ndarray
-    b: np.ndarray
-    c: np.ndarray
-    f: Callable[[np.ndarray], np.ndarray]
-    range: tuple[float, float]
-    dt: float
-    gaussian: bool = False  # u standard normal instead of uniform on the range
-    power: float | None = None  # variance of the noise-free output; measured on the record when not given
-
-    def __call__(self, samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
-        rng = np.random.default_rng(seed)
-        u = rng.standard_normal(samples) if self.gaussian else rng.uniform(*self.range, samples)
-        e = rng.standard_normal(samples)
-        poles = np.concatenate([[1.0], self.a])
-        clean = lfilter(self.b, poles, self.f(u))
-        power = float(np.var(clean)) if self.power is None else self.power
-        sigma = noise * float(np.sqrt(power / np.sum(_impulse(self.c, self.a) ** 2)))
-        data = Data(u, clean + lfilter(sigma * self.c, poles, e), self.dt)
-        return data, Truth((self.f,), (self.range,), _impulse(self.b, self.a)[:, None, None])
+    The input is uniform, or standard normal; the power is the variance of the noise-free output, by default that of the
+    record.
+    """
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal(samples) if gaussian else rng.uniform(-most, most, samples)
+    e = rng.standard_normal(samples)
+    poles = np.concatenate([[1.0], a])
+    clean = lfilter(b, poles, f(u))
+    power = float(np.var(clean)) if power is None else power
+    sigma = noise * float(np.sqrt(power / np.sum(_impulse(c, a) ** 2)))
+    data = Data(u, clean + lfilter(sigma * c, poles, e), dt)
+    return data, Truth((f,), ((-most, most),), _impulse(b, a)[:, None, None])
 
 
 _NODES = np.linspace(-1.0, 1.0, 9)
@@ -150,12 +136,8 @@ def _fed_back(plant: FeedbackSystem, bound: float, samples: int, noise: float, s
     data = plant.record(u, seed, measurement=noise * size)
     response = None
     if not plant.e.any():
-        response = np.empty((LENGTH, 2, 2))
-        power = np.eye(plant.order)
-        response[0] = plant.d
-        for k in range(1, LENGTH):
-            response[k] = plant.c @ power @ plant.b
-            power = plant.a @ power
+        states = np.array([np.linalg.matrix_power(plant.a, k) for k in range(LENGTH - 1)])
+        response = np.concatenate([plant.d[None], plant.c @ states @ plant.b])
     return data, Truth(plant.f, ((-bound, bound),) * 2, response)
 
 
@@ -170,10 +152,8 @@ def _pendulum(samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
     u = plants.pendulum_input("levels", samples, seed)
     plant = plants.ReactionWheelPendulum()
     size = noise * float(np.std(plant.states(u)[:, 2]))
-    if noise:
-        data = plants.pendulum(u, seed, measurement=size)
-    else:  # a perfect encoder, too
-        data = plants.pendulum(u, seed, measurement=0.0, quantum=0.0)
+    perfect: dict[str, Any] = {} if noise else {"quantum": 0.0}  # a perfect encoder, too
+    data = plants.pendulum(u, seed, measurement=size, **perfect)
     return data, Truth((plant.torque,), ((-8.0, 8.0),))
 
 
@@ -187,7 +167,7 @@ SYSTEMS: dict[str, System] = {
         1000, 22**-0.5, partial(_example, examples.dead_zone, ((-1.0, 1.0),)), _SISO | {"nx": 2}),
     "dead_zone_in_span": System(
         "the same with a dead zone that is linear between nine nodes, so that triangular:8 holds the truth",
-        1000, 22**-0.5, _Equation(_A, _B, np.ones(1), _dead_zone_in_span, (-1.0, 1.0), 0.1, power=_IN_SPAN_POWER),
+        1000, 22**-0.5, partial(_equation, _A, _B, np.ones(1), _dead_zone_in_span, power=_IN_SPAN_POWER),
         _SISO | {"nx": 2}),
     "thruster": System(
         "a marine thruster rig, current to thrust, noise e / A (optid.examples)",
@@ -199,15 +179,15 @@ SYSTEMS: dict[str, System] = {
         {"na": 2, "nb": 2, "basis": "triangular:8", "nx": 2}),
     "linear": System(
         "second-order dynamics without a nonlinearity, white noise on the output",
-        1000, 0.1, _Equation(_A, _B, np.r_[1.0, _A], _identity, (-1.0, 1.0), 0.1), {"na": 2, "nb": 2, "nx": 2}),
+        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], _identity), {"na": 2, "nb": 2, "nx": 2}),
     "saturation": System(
         "f(u) = tanh(1.5 u) before second-order dynamics, white noise on the output",
-        1000, 0.1, _Equation(_A, _B, np.r_[1.0, _A], _saturation, (-1.0, 1.0), 0.1),
+        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], _saturation),
         {"na": 2, "nb": 2, "basis": "polynomial:5", "nx": 2}),
     "ding_chen": System(
         "the Hammerstein ARMAX example of Ding and Chen (Automatica 41, 2005), a cubic and coloured noise",
         3000, _DING_NOISE,
-        _Equation(_DING_A, _DING_B, _DING_D, _cubic, (-2.0, 2.0), 1.0, gaussian=True, power=_DING_POWER),
+        partial(_equation, _DING_A, _DING_B, _DING_D, _cubic, most=2.0, dt=1.0, gaussian=True, power=_DING_POWER),
         {"na": 2, "nb": 2, "nk": 1, "nc": 1, "basis": "polynomial:3", "nx": 2}),
     "vanderpol": System(
         "a driven Van der Pol oscillator: its cubic damping is nonlinear feedback (optid.plants)",

@@ -13,23 +13,16 @@ import numpy as np
 
 from optid.models.functions import has_feedback
 
-GRID = 401
-"""Points at which nonlinearities are compared."""
+GRID = 401  # points at which nonlinearities are compared
 
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The system behind a simulated record.
+    """The system behind a simulated record."""
 
-    Attributes:
-        f: one function per input.
-        ranges: (low, high) of every input, where its function is compared.
-        response: (K, l, m) impulse response of the linear part; None where nonlinear feedback makes it undetermined.
-    """
-
-    f: tuple[Callable[[np.ndarray], np.ndarray], ...]
-    ranges: tuple[tuple[float, float], ...]
-    response: np.ndarray | None = None
+    f: tuple[Callable[[np.ndarray], np.ndarray], ...]  # one function per input
+    ranges: tuple[tuple[float, float], ...]  # (low, high) of every input, where its function is compared
+    response: np.ndarray | None = None  # (K, l, m) impulse response; None with nonlinear feedback
 
     def nonlinearity_error(self, model: Any) -> float:
         """Return the root mean square error of f over the standard deviation of the true f on the grid.

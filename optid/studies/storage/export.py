@@ -7,16 +7,11 @@ from optid.studies.storage.rows import COLUMNS
 from optid.studies.storage.store import Store
 
 ENDINGS = (".parquet", ".csv")
-FORMULA = "^[=+\\-@\t\r]"
-"""Beginnings of a text that a spreadsheet runs as a formula; an apostrophe in front makes it a text."""
+FORMULA = "^[=+\\-@\t\r]"  # begins a text that a spreadsheet runs; an apostrophe in front makes it a text
 
 
 def check_target(target: str | Path) -> Path:
-    """Return the path of a file that rows can be exported to, before there are any.
-
-    Raises:
-        DatabaseError: another ending than .parquet or .csv.
-    """
+    """Return the path of a file to export to; DatabaseError for another ending than .parquet or .csv."""
     target = Path(target)
     if target.suffix.lower() not in ENDINGS:
         raise DatabaseError(f"{target}: rows are exported to a file that ends in {' or '.join(ENDINGS)}")

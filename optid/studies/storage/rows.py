@@ -1,12 +1,16 @@
 """The row of a study: names, types, units and meaning of its columns; tables and documentation come from here."""
 
+import hashlib
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from optid.errors import DataError
 from optid.program.solution import Status
 
 SCHEMA_VERSION = 2
@@ -35,21 +39,13 @@ SUCCESS = (str(Status.OPTIMAL), str(Status.LOCAL))
 
 @dataclass(frozen=True)
 class Column:
-    """One column.
-
-    Attributes:
-        name: its name.
-        kind: "text", "json" (text that parses), "number", "integer", "flag" or "time" (UTC, ISO 8601 in a row).
-        meaning: one sentence for people.
-        unit: of its numbers; "" where it has none.
-        always: whether every row has a value, whatever happened to the cell.
-    """
+    """One column."""
 
     name: str
-    kind: str
-    meaning: str
-    unit: str = ""
-    always: bool = False
+    kind: str  # "text", "json" (text that parses), "number", "integer", "flag" or "time" (UTC, ISO 8601 in a row)
+    meaning: str  # one sentence for people
+    unit: str = ""  # of its numbers
+    always: bool = False  # whether every row has a value, whatever happened to the cell
 
     @property
     def sql(self) -> str:
@@ -149,6 +145,9 @@ NAMES: tuple[str, ...] = tuple(column.name for column in COLUMNS)
 BY_NAME: Mapping[str, Column] = {column.name: column for column in COLUMNS}
 
 LARGEST = 2**63  # what a whole number in the database is below
+LONGEST_LABEL = 80  # characters of the labels of data, formulations and solvers in a table
+REQUIRED = ("data", "formulation", "solver", "outcome", "status_verified", "objective", "solve_s")
+"""Columns without which rows say nothing."""
 
 _TYPES: Mapping[str, tuple[type, ...]] = {"text": (str,), "json": (str,), "number": (float, int), "integer": (int,),
                                           "flag": (bool,), "time": (str,)}
@@ -216,25 +215,108 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def columns(rows: Any) -> dict[str, np.ndarray]:
+    """Return rows as one array per column of the schema; what is not given is empty.
+
+    Args:
+        rows: a mapping of columns, a frame (pandas, polars), or dict rows.
+
+    Returns:
+        {column: (rows,) array}: numbers and integers as floats (``nan`` where empty), flags as bools (False), texts,
+        JSON and times as str (""); labels longer than `LONGEST_LABEL` shortened.
+
+    Raises:
+        DataError: a column that every study has is missing, columns of unequal length, or a text in place of a number.
+    """
+    given = _by_column(rows)
+    n = max(map(len, given.values()), default=0)
+    for name, values in given.items():
+        if len(values) != n:
+            raise DataError(f"column {name!r} has {len(values)} values, others have {n}")
+    missing = [name for name in REQUIRED if name not in given] if n else []
+    if missing:
+        raise DataError(f"the rows have no column {', '.join(missing)}: this is not a table of study rows")
+    table = {column.name: _array(column, given.get(column.name, [None] * n)) for column in COLUMNS}
+    for name in ("data", "formulation", "solver"):
+        table[name] = _objects([_label(text) for text in table[name]])
+    return table
+
+
+def _by_column(rows: Any) -> dict[str, Any]:
+    if isinstance(rows, Mapping):
+        return {name: rows[name] for name in rows if name in BY_NAME}
+    if hasattr(rows, "columns"):
+        return {name: rows[name].to_numpy() for name in rows.columns if name in BY_NAME}
+    if isinstance(rows, str | bytes) or not isinstance(rows, Iterable):
+        raise DataError(f"rows are a mapping of columns, a frame or dicts, not {type(rows).__name__}")
+    listed = list(rows)
+    if not all(isinstance(row, Mapping) for row in listed):
+        raise DataError("rows are a mapping of columns, a frame or dicts; one of them is not a dict")
+    return {name: [row.get(name) for row in listed] for name in NAMES if any(name in row for row in listed)}
+
+
+def _array(column: Column, values: Any) -> np.ndarray:
+    if column.kind in ("number", "integer"):
+        try:
+            return np.array(values, dtype=float)  # None becomes NaN
+        except (TypeError, ValueError, OverflowError):
+            pass
+        try:
+            return np.array([np.nan if _is_empty(v) else float(v) for v in values])
+        except (TypeError, ValueError, OverflowError) as error:
+            raise DataError(f"column {column.name!r} holds something that is not a number: {error}") from error
+    if column.kind == "flag":
+        return np.array([not _is_empty(v) and bool(v) for v in values], dtype=bool)
+    return _objects(["" if _is_empty(v) else str(v) for v in values])
+
+
+def _objects(texts: list[str]) -> np.ndarray:
+    return np.array(texts, dtype=object)
+
+
+def _is_empty(value: Any) -> bool:
+    """Whether a value is None, NaN or the missing value of a frame."""
+    nan = isinstance(value, float) and value != value
+    return value is None or nan or type(value).__name__ in ("NAType", "NaTType")
+
+
+def _label(text: str) -> str:
+    """Shorten a label that no sentence could hold, so that it stays different from others."""
+    if len(text) <= LONGEST_LABEL:
+        return text or "(no name)"
+    return f"{text[: LONGEST_LABEL - 8]}…{hashlib.sha256(text.encode(errors='replace')).hexdigest()[:6]}"
+
+
 _NOTES = {"json": " (JSON)", "flag": " (flag)", "time": " (time)"}
 
 
 def markdown() -> str:
     """Return the documentation of the schema as two Markdown tables: columns and outcomes."""
-    lines = ["# The rows of a study", "",
-             f"Schema version {SCHEMA_VERSION}. One row per cell and repetition, in the table `rows` of the SQLite "
-             "file and in what `optid study export` writes. A column without a value is NULL; there is no NaN and no "
-             "infinity; flags are 0 and 1, times are texts (ISO 8601, UTC). A row of a cell that the study no longer "
-             "has (entries taken out, changed data, versions or options), or that was run again, is in the table "
-             "`superseded`, from where a run takes back what the study has again; the text of the study file is in "
-             "`studies`, runs under way are in `runs`, the schema version is in `meta`.", "",
-             "Other programs read the file as it is, also while a run goes on:", "",
-             "```python", "import sqlite3, pandas", "pandas.read_sql(\"SELECT * FROM rows\", "
-             "sqlite3.connect(\"study.sqlite\"))", "```", "",
-             "```sql", "-- DuckDB", "INSTALL sqlite; LOAD sqlite;", "SELECT solver, median(solve_s) FROM "
-             "sqlite_scan('study.sqlite', 'rows') GROUP BY solver;", "```", "",
-             "In exported CSV files a text that a spreadsheet would run as a formula begins with an apostrophe.", "",
-             "| column | type | unit | meaning |", "|---|---|---|---|"]
+    lines = [f"""# The rows of a study
+
+Schema version {SCHEMA_VERSION}. One row per cell and repetition, in the table `rows` of the SQLite file and in what \
+`optid study export` writes. A column without a value is NULL; there is no NaN and no infinity; flags are 0 and 1, \
+times are texts (ISO 8601, UTC). A row of a cell that the study no longer has (entries taken out, changed data, \
+versions or options), or that was run again, is in the table `superseded`, from where a run takes back what the study \
+has again; the text of the study file is in `studies`, runs under way are in `runs`, the schema version is in `meta`.
+
+Other programs read the file as it is, also while a run goes on:
+
+```python
+import sqlite3, pandas
+pandas.read_sql("SELECT * FROM rows", sqlite3.connect("study.sqlite"))
+```
+
+```sql
+-- DuckDB
+INSTALL sqlite; LOAD sqlite;
+SELECT solver, median(solve_s) FROM sqlite_scan('study.sqlite', 'rows') GROUP BY solver;
+```
+
+In exported CSV files a text that a spreadsheet would run as a formula begins with an apostrophe.
+
+| column | type | unit | meaning |
+|---|---|---|---|"""]
     lines += [f"| `{c.name}` | {c.sql}{_NOTES.get(c.kind, '')}{' NOT NULL' if c.always else ''} "
               f"| {c.unit} | {c.meaning} |" for c in COLUMNS]
     lines += ["", "| outcome | meaning |", "|---|---|", *(f"| {word} | {text} |" for word, text in OUTCOMES.items())]

@@ -7,7 +7,7 @@ while a run goes on, and several processes may write. SQLite recovers an interru
 import os
 import platform
 import sqlite3
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.errors import DatabaseError, LookupFailed, StudyError, nearest
-from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, complete
+from optid.errors import DatabaseError, DataError, LookupFailed, StudyError, nearest
+from optid.studies.storage.rows import COLUMNS, DONE, NAMES, SCHEMA_VERSION, columns, complete
 
 PATIENCE = 30.0  # seconds to wait for another writer
 LABELS = ("study", "data", "formulation", "solver", "file")
@@ -28,15 +28,12 @@ Row = dict[str, Any]
 _LIST = ", ".join(f'"{name}"' for name in NAMES)
 _SAME = "study = ? AND key = ? AND repetition = ?"
 _OF_STUDY = "(:study IS NULL OR study = :study)"
-_ASIDE = f"INSERT INTO superseded ({_LIST}) SELECT {_LIST} FROM rows WHERE"
 
 
 class Store:
     """An open database; a context manager that closes it.
 
-    Args:
-        path: the file.
-        write: open it for writing; it is made when it is not there.
+    To write, it is made when it is not there.
 
     Raises:
         DatabaseError: no such file, not a database of studies, a damaged one or one of another version.
@@ -80,25 +77,21 @@ class Store:
             hint = "" if known else ". Where it is damaged, take another copy, or remove it and run the study again"
             raise DatabaseError(f"{self.path} cannot be {verb}: {error}{hint}") from error
 
-    def _tables(self) -> set[str]:
-        found = self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-        return {name for (name,) in found}
-
     def _make(self) -> None:
         """Make the file under another name first, so that readers and later runs find all of it or nothing."""
         from optid import __version__
 
         new = self.path.with_name(f"{self.path.name}.{platform.node()}.{os.getpid()}.new")
         columns = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
-        tables = (f"rows ({columns}, PRIMARY KEY (study, key, repetition))", f"superseded ({columns})",
-                  "studies (study TEXT PRIMARY KEY, description TEXT)",
-                  "runs (study TEXT PRIMARY KEY, machine TEXT, process INTEGER, since TEXT, seen TEXT)",
-                  "meta (name TEXT PRIMARY KEY, value TEXT)")
+        tables = {"rows": f"{columns}, PRIMARY KEY (study, key, repetition)", "superseded": columns,
+                  "studies": "study TEXT PRIMARY KEY, description TEXT",
+                  "runs": "study TEXT PRIMARY KEY, machine TEXT, process INTEGER, since TEXT, seen TEXT",
+                  "meta": "name TEXT PRIMARY KEY, value TEXT"}
         try:
             with self._named("written"), closing(sqlite3.connect(new, isolation_level=None)) as connection:
                 connection.execute("PRAGMA journal_mode = WAL")
-                for table in tables:
-                    connection.execute(f"CREATE TABLE {table} STRICT")
+                for table, its_columns in tables.items():
+                    connection.execute(f"CREATE TABLE {table} ({its_columns}) STRICT")
                 connection.executemany("INSERT INTO meta VALUES (?, ?)", [
                     ("schema version", str(SCHEMA_VERSION)), ("made by", f"optid {__version__}")])
             with self._named("written"), suppress(FileExistsError):  # another process was first
@@ -108,7 +101,7 @@ class Store:
                 rest.unlink()
 
     def _check(self) -> None:
-        tables = self._tables()
+        tables = {name for (name,) in self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"rows", "superseded", "studies", "runs", "meta"} <= tables:
             raise DatabaseError(f"{self.path} is an SQLite file, but not a database of studies (it has "
                                 f"{', '.join(sorted(tables)) or 'no tables'}); give another file name")
@@ -155,21 +148,17 @@ class Store:
     # -- rows ------------------------------------------------------------------------------------------------------
 
     def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write rows in one transaction; a row that was there for the same cell and repetition is replaced.
-
-        Args:
-            rows: mappings of columns; completed and checked by `rows.complete`.
+        """Complete rows and write them in one transaction; those that were there for the same cells are replaced.
 
         Raises:
             DatabaseError: they cannot be written, such as on a full disk: what was there before stays.
             ValueError: a row that does not keep the schema.
         """
         whole = [tuple(complete(row).values()) for row in rows]
-        marks = ", ".join("?" * len(NAMES))
         with self._transaction():
-            self._connection.executemany(f"INSERT OR REPLACE INTO rows ({_LIST}) VALUES ({marks})", whole)
-            seen = {(datetime.now(UTC).isoformat(), row["study"]) for row in rows[-1:]}
-            self._connection.executemany("UPDATE runs SET seen = ? WHERE study = ?", seen)
+            self._connection.executemany(f"INSERT OR REPLACE INTO rows ({_LIST}) VALUES ({_marks(NAMES)})", whole)
+            for row in rows[-1:]:
+                self._connection.execute("UPDATE runs SET seen = ? WHERE study = ?", [_now(), row["study"]])
 
     def finished(self, study: str | None = None) -> set[tuple[str, int]]:
         """Return (key, repetition) of every row, or of those of one study."""
@@ -180,12 +169,10 @@ class Store:
         found = self._all(f"SELECT key, repetition, {', '.join(LABELS)} FROM rows")
         return {(values[0], key, repetition): values for key, repetition, *rest in found if (values := tuple(rest))}
 
-    def rows_of(self, study: str | None, identified: Collection[tuple[str, int]]) -> list[dict[str, Any]]:
-        """Return rows as they were written, in the order asked for; those that are not there are left out.
+    def rows_of(self, study: str | None, identified: Iterable[tuple[str, int]]) -> list[dict[str, Any]]:
+        """Return rows by (key, repetition) as they were written, in this order; those that are not there are left out.
 
-        Args:
-            study: only rows of this study; None for any: one of each, "done" before others, then the newest.
-            identified: (key, repetition) of the rows.
+        Without a study there is one row of each, "done" before others, then the newest.
         """
         found: dict[tuple[str, int], Row] = {}
         for values in self._all(f"SELECT {_LIST} FROM rows WHERE {_OF_STUDY} ORDER BY outcome = :done, started, study",
@@ -209,16 +196,16 @@ class Store:
             DatabaseError: another run holds it: a process that lives on this machine, or one on another machine that
                 wrote a row within the last `STALE` seconds.
         """
-        now, here = datetime.now(UTC), (platform.node(), os.getpid())
+        here = platform.node(), os.getpid()
         with self._transaction():
             for machine, process, since, seen in self._connection.execute(
                     "SELECT machine, process, since, seen FROM runs WHERE study = ?", [study]).fetchall():
-                if _lives(machine, process, since, seen, now):
+                if _lives(machine, process, since, seen):
                     raise DatabaseError(f"another run of {study!r} is writing to {self.path}: process {process} on "
                                         f"{machine} since {since[:19]} UTC. Wait until it ends, stop it, or give "
                                         "another database")
             self._connection.execute("INSERT OR REPLACE INTO runs VALUES (?, ?, ?, ?, ?)",
-                                     [study, *here, now.isoformat(), now.isoformat()])
+                                     [study, *here, _now(), _now()])
         try:
             yield
         finally:
@@ -227,15 +214,11 @@ class Store:
                                          [study, *here])
 
     def keep(self, study: str, cells: Collection[tuple[str, int]]) -> None:
-        """Make the rows of a study those of its grid as it is now.
+        """Make the rows of a study those of its grid as it is now, given by (key, repetition).
 
         Rows of other cells (entries taken out of the study, other data, options or versions) move to the table
         ``superseded``, and rows of these cells that are there come back, the newest of each, so that an entry that is
         taken out and put in again is not run again.
-
-        Args:
-            study: title of the study.
-            cells: (key, repetition) of the cells of its grid.
         """
         asked = "study = ? AND (key, repetition) {} (SELECT key, repetition FROM grid)"
         with self._transaction():
@@ -243,8 +226,7 @@ class Store:
                                      "PRIMARY KEY (key, repetition))")
             self._connection.execute("DELETE FROM grid")
             self._connection.executemany("INSERT INTO grid VALUES (?, ?)", cells)
-            self._connection.execute(f"{_ASIDE} {asked.format('NOT IN')}", [study])
-            self._connection.execute(f"DELETE FROM rows WHERE {asked.format('NOT IN')}", [study])
+            self._move_aside(asked.format("NOT IN"), [study])
             back = self._connection.execute(
                 f"SELECT key, repetition, max(started) FROM superseded WHERE {asked.format('IN')} AND (key, repetition)"
                 " NOT IN (SELECT key, repetition FROM rows WHERE study = ?) GROUP BY key, repetition",
@@ -256,10 +238,12 @@ class Store:
 
     def set_aside(self, study: str, outcomes: Sequence[str]) -> None:
         """Move the rows of a study with these outcomes to the table ``superseded``, so that their cells run again."""
-        chosen = f"study = ? AND outcome IN ({', '.join('?' * len(outcomes))})"
         with self._transaction():
-            self._connection.execute(f"{_ASIDE} {chosen}", [study, *outcomes])
-            self._connection.execute(f"DELETE FROM rows WHERE {chosen}", [study, *outcomes])
+            self._move_aside(f"study = ? AND outcome IN ({_marks(outcomes)})", [study, *outcomes])
+
+    def _move_aside(self, chosen: str, values: Sequence[str]) -> None:
+        self._connection.execute(f"INSERT INTO superseded ({_LIST}) SELECT {_LIST} FROM rows WHERE {chosen}", values)
+        self._connection.execute(f"DELETE FROM rows WHERE {chosen}", values)
 
     def superseded(self, study: str | None = None) -> dict[tuple[str, str, str], int]:
         """Return {(data, formulation, solver): rows set aside}: kept, but in no report."""
@@ -292,10 +276,9 @@ def _check_kind(path: Path) -> None:
     locks of the whole process (POSIX), and another process would remove the writes that are pending.
     """
     try:
-        with path.open("rb") as file:
+        head = b""
+        with suppress(FileNotFoundError), path.open("rb") as file:
             head = file.read(16)
-    except FileNotFoundError:
-        return
     except OSError as error:
         raise DatabaseError(f"{path} cannot be opened: {error.strerror}") from None
     if head[8:12] == b"DUCK":
@@ -328,10 +311,10 @@ def _connected(path: Path, write: bool) -> sqlite3.Connection:
     return connection
 
 
-def _lives(machine: str, process: int, since: str, seen: str, now: datetime) -> bool:
+def _lives(machine: str, process: int, since: str, seen: str) -> bool:
     """Whether the process that claimed a study still runs it."""
     if machine != platform.node():
-        return (now - datetime.fromisoformat(seen)).total_seconds() < STALE
+        return (datetime.now(UTC) - datetime.fromisoformat(seen)).total_seconds() < STALE
     import psutil
 
     try:
@@ -340,16 +323,12 @@ def _lives(machine: str, process: int, since: str, seen: str, now: datetime) -> 
         return False
 
 
-def _array(values: Sequence[Any], kind: str, always: bool) -> np.ndarray:
-    if kind in ("text", "json"):
-        return np.array(["" if value is None else value for value in values], dtype=object)
-    if kind == "flag":
-        return np.array([bool(value) for value in values], dtype=bool)
-    if kind == "time":
-        return np.array([value.partition("+")[0] for value in values], dtype="datetime64[us]")
-    if kind == "integer" and always:
-        return np.array(values, dtype=np.int64)
-    return np.array(values, dtype=float)  # None becomes NaN
+def _now() -> str:
+    return datetime.now(UTC).isoformat()
+
+
+def _marks(values: Sequence[Any]) -> str:
+    return ", ".join("?" * len(values))
 
 
 def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -359,26 +338,25 @@ def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarray]:
-    """Return the rows of a database as one array per column, in the order in which the cells started.
+    """Return the rows of a database as `rows.columns` does, sorted by the moments their cells started.
+
+    These are datetime64[us], and repetitions int64.
 
     Args:
         path: the database; a run may be writing to it.
         study: only rows of this study.
 
-    Returns:
-        {column: (rows,) array} for every column of `rows.COLUMNS`: "number" float64, "integer" float64 (int64 for the
-        columns that every row has), both NaN where there is no value; "text" and "json" objects, "" where there is no
-        value; "flag" bool, False where there is none; "time" datetime64[us].
-
     Raises:
         DatabaseError: as for `Store`.
     """
     with Store(path) as store:
-        columns = list(zip(*store.values(study))) or [()] * len(COLUMNS)
-        try:
-            return {c.name: _array(values, c.kind, c.always) for c, values in zip(COLUMNS, columns)}
-        except (TypeError, ValueError, OverflowError) as error:
-            raise DatabaseError(f"{path} holds values that no run writes ({error}): take another copy") from None
+        values = dict(zip(NAMES, zip(*store.values(study))))
+    try:
+        starts = [text.partition("+")[0] for text in values.get("started", ())]
+        return columns(values) | {"started": np.array(starts, dtype="datetime64[us]"),
+                                  "repetition": np.array(values.get("repetition", ()), dtype=np.int64)}
+    except (DataError, AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise DatabaseError(f"{path} holds values that no run writes ({error}): take another copy") from None
 
 
 def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:
@@ -390,7 +368,7 @@ def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]
 
 
 def rows_of_one(path: str | Path, study: str | None = None) -> Any:
-    """Return the rows of a study as one array per column, as `read_rows` does; a frame of an exported Parquet file.
+    """Return the rows of a study as `read_rows` does, or those of an exported Parquet file.
 
     Args:
         path: the database, or a .parquet file that `optid study export` wrote.

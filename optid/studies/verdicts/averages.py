@@ -1,4 +1,9 @@
-"""Averages of times: shifted geometric means, and comparisons on the problems that two solvers both solved."""
+"""Averages of times, comparisons of two on the problems that both solved, performance profiles and growth with length.
+
+E. D. Dolan, J. J. Moré: Benchmarking optimization software with performance profiles. Mathematical Programming 91
+(2002) 201-213. With more than two solvers a profile compares each with the fastest, not with each other (N. Gould,
+J. Scott, ACM Transactions on Mathematical Software 43 (2016) 15).
+"""
 
 from dataclasses import dataclass
 
@@ -7,6 +12,10 @@ from scipy.stats import t as student
 
 SHIFT = 0.01  # s; times far below it count alike, so that a microsecond saved does not outweigh a second
 MINIMUM_PAIRS = 6  # with five, even a unanimous comparison has a two-sided sign-test probability of 1/16 > 0.05
+MINOR = 0.1  # 10 % of a time or an error, 0.1 points of fit: of no practical meaning
+VAGUE = 10.0  # with 10 % of practical meaning, a tie is known to within a factor of 2
+MINIMUM_LENGTHS = 3  # two lengths give a slope but nothing to judge it by
+MINIMUM_SPREAD = 4.0  # between the longest and the shortest record
 
 
 def shifted_geometric_mean(times: np.ndarray, shift: float = SHIFT) -> float:
@@ -22,33 +31,58 @@ def shifted_geometric_mean(times: np.ndarray, shift: float = SHIFT) -> float:
 
 @dataclass(frozen=True)
 class Paired:
-    """One against another, problem by problem.
+    """One against another, problem by problem: lower is better."""
 
-    Attributes:
-        value: geometric mean of the ratios, or mean of the differences; ``nan`` without a common problem.
-        low, high: its 95 % interval; infinite with fewer than two problems.
-        n: problems that both solved, or groups of them.
-    """
-
-    value: float
-    low: float
+    value: float  # geometric mean of the ratios, or mean of the differences; nan without a common problem
+    low: float  # its 95 % interval; infinite with fewer than two problems
     high: float
-    n: int
+    n: int  # problems that both solved, or groups of them
+    ratio: bool = False  # whether these are ratios, whose equals are at 1, or differences, whose equals are at 0
 
     @property
     def enough(self) -> bool:
         """Whether there are enough common problems to tell anything."""
         return self.n >= MINIMUM_PAIRS
 
+    @property
+    def notable(self) -> bool:
+        """Whether one is worse than the other by more than a trifle, for sure or not."""
+        return self.value > self._around(MINOR)[1]
 
-def paired_difference(values: np.ndarray, reference: np.ndarray, groups: np.ndarray | None = None) -> Paired:
-    """Return the mean of ``values - reference`` with its 95 % interval from Student's distribution.
+    @property
+    def behind(self) -> bool:
+        """Whether one is worse than the other, for sure and by more than a trifle."""
+        return self.enough and self.low > self._around(0.0)[1] and self.notable
+
+    @property
+    def ahead(self) -> bool:
+        """Whether one is better than the other, for sure and by more than a trifle."""
+        return self.enough and self.high < self._around(0.0)[0] and self.value < self._around(MINOR)[0]
+
+    @property
+    def vague(self) -> bool:
+        """Whether the interval holds differences `VAGUE` times a trifle: that is ignorance, not a tie."""
+        low, high = self._around(VAGUE * MINOR)
+        return self.low < low or self.high > high
+
+    def _around(self, slack: float) -> tuple[float, float]:
+        """Values so close to equality, to both sides."""
+        return (1 / (1 + slack), 1 + slack) if self.ratio else (-slack, slack)
+
+
+def paired(values: np.ndarray, reference: np.ndarray, ratio: bool = True, groups: np.ndarray | None = None) -> Paired:
+    """Return the mean of ``values / reference`` or ``values - reference``, with its interval by Student's distribution.
 
     Args:
-        values: (P,), ``nan`` where not solved; only problems that both solved count.
+        values: (P,), positive for ratios, ``nan`` where not solved; only problems that both solved count.
         reference: (P,), alike.
-        groups: (P,) labels; where given, the mean of each group counts as one difference.
+        ratio: whether to take the geometric mean of ratios; else the mean of differences.
+        groups: (P,) labels; where given, the mean of each group counts as one.
     """
+    if ratio:
+        logs = paired(np.log(values), np.log(reference), False, groups)
+        value, low, high = (float(v) for v in np.exp([logs.value, logs.low, logs.high]))
+        return Paired(value, low, high, logs.n, True)
     both = np.isfinite(values) & np.isfinite(reference)
     d = (values - reference)[both]
     if groups is not None:
@@ -61,23 +95,90 @@ def paired_difference(values: np.ndarray, reference: np.ndarray, groups: np.ndar
 
 
 def means_of_groups(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Return the mean of every group, in order of first appearance.
+    """Return the mean over the rows of every group, in order of first appearance; (P, ...) values, (P,) labels."""
+    return np.array([np.mean(values[groups == label], axis=0) for label in dict.fromkeys(groups)])
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The share of the problems solved within a factor of the fastest: a step function, continuous from the right."""
+
+    factors: np.ndarray  # where it steps, ascending, the first at least 1
+    shares: np.ndarray  # its value from there on, in (0, 1]
+
+    def __call__(self, factor: float) -> float:
+        """Return the share of the problems solved within this factor of the fastest."""
+        at = int(np.searchsorted(self.factors, factor, side="right"))
+        return float(self.shares[at - 1]) if at else 0.0
+
+
+def time_ratios(times: np.ndarray) -> np.ndarray:
+    """Return every time relative to the fastest on its problem; (P, S), ``nan`` where not solved becomes ``inf``."""
+    reached = np.where(np.isfinite(times), times, np.inf)
+    fastest = np.min(reached, axis=1, initial=np.inf, keepdims=True)
+    return np.where(np.isfinite(reached), reached / np.where(np.isfinite(fastest), fastest, 1.0), np.inf)
+
+
+def performance_profiles(times: np.ndarray) -> list[Profile]:
+    """Return one profile per solver.
 
     Args:
-        values: (P,) finite.
-        groups: (P,) labels.
+        times: (P, S), ``nan`` where the problem was not solved. Problems that nobody solved stay in the denominator.
     """
-    return np.array([np.mean(values[groups == label]) for label in dict.fromkeys(groups)])
+    profiles = []
+    for ratios in time_ratios(times).T:
+        factors, counts = np.unique(ratios[np.isfinite(ratios)], return_counts=True)
+        profiles.append(Profile(factors, np.cumsum(counts) / max(len(ratios), 1)))
+    return profiles
 
 
-def paired_ratio(times: np.ndarray, reference: np.ndarray, groups: np.ndarray | None = None) -> Paired:
-    """Return the geometric mean of ``times / reference`` with its 95 % interval.
+@dataclass(frozen=True)
+class Growth:
+    """Time proportional to the record length to the power of the slope."""
+
+    slope: float  # nan where it cannot be told
+    low: float  # its 95 % interval
+    high: float
+    lengths: np.ndarray  # ascending, of data with two or more
+    times: np.ndarray  # geometric mean time at each of them
+    missing: str = ""  # what is missing to tell
+
+
+def time_growth(times: np.ndarray, n: np.ndarray, groups: np.ndarray) -> Growth:
+    """Fit ``log t = c_group + slope log N`` by least squares.
+
+    Seeds of one group and length are averaged first: their number must not narrow the interval, because what is
+    uncertain is whether a power law holds, not the mean time. At least one group must have `MINIMUM_LENGTHS` lengths
+    and `MINIMUM_SPREAD` between them: a power law over short spans at different lengths is none over the whole.
 
     Args:
-        times: (P,) positive, ``nan`` where not solved; only problems that both solved count.
-        reference: (P,), alike.
-        groups: (P,) labels; where given, the mean of each group counts as one ratio.
+        times: (P,) seconds, ``nan`` where not solved.
+        n: (P,) record lengths.
+        groups: (P,) numbers of whatever else makes a problem slow: formulation, data set, noise. Only groups with two
+            lengths count.
     """
-    logs = paired_difference(np.log(times), np.log(reference), groups)
-    value, low, high = (float(v) for v in np.exp([logs.value, logs.low, logs.high]))
-    return Paired(value, low, high, logs.n)
+    usable = np.isfinite(times) & np.isfinite(n) & (n > 0) & (times > 0)
+    logs = np.log(times[usable])
+    pairs, place = np.unique(np.column_stack([groups[usable], n[usable]]), axis=0, return_inverse=True)
+    group, place = pairs[:, 0], place.ravel()
+    spans = {g: pairs[group == g, 1] for g in np.unique(group)}
+    several = np.isin(group, [g for g, span in spans.items() if len(span) > 1])
+    lengths = np.unique(pairs[several, 1])
+    shown = np.array([np.exp(np.mean(logs[(several & (pairs[:, 1] == at))[place]])) for at in lengths])
+    if not any(len(span) >= MINIMUM_LENGTHS and span[-1] >= MINIMUM_SPREAD * span[0] for span in spans.values()):
+        most = max(map(len, spans.values()), default=0)
+        needs = (f"needs at least {MINIMUM_LENGTHS} record lengths, the longest {MINIMUM_SPREAD:g} times the shortest, "
+                 f"solved on the same data; there {'is' if most == 1 else 'are'} at most {most}")
+        return Growth(float("nan"), float("nan"), float("nan"), lengths, shown, needs)
+    means = np.bincount(place, logs) / np.bincount(place)
+    _, number = np.unique(group[several], return_inverse=True)
+    x, y = _centred(np.log(pairs[several, 1]), number), _centred(means[several], number)
+    slope = float(x @ y / (x @ x))
+    freedom = len(x) - int(number.max()) - 2  # one at least: a group has three lengths
+    error = np.sqrt(np.sum((y - slope * x) ** 2) / freedom / (x @ x))
+    half = float(student.ppf(0.975, freedom) * error)
+    return Growth(slope, slope - half, slope + half, lengths, shown)
+
+
+def _centred(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    return values - (np.bincount(group, values) / np.bincount(group))[group]

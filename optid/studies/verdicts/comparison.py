@@ -1,6 +1,6 @@
 """Solvers side by side on one record and one formulation: a line for each, and one sentence that says which to use."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,111 +8,82 @@ import numpy as np
 
 from optid.errors import DataError
 from optid.show.wording import seconds
-from optid.studies.storage.rows import ERROR, REFUSED
-from optid.studies.verdicts.choice import listed
+from optid.studies.storage.rows import ERROR, REFUSED, columns
+from optid.studies.verdicts.averages import MINOR
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
-from optid.studies.verdicts.standings import MINOR
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting
-from optid.studies.verdicts.table import columns
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, listed
 from optid.studies.verdicts.verdict import Verdict, conclude
 
 
 @dataclass(frozen=True)
 class Line:
-    """One solver.
-
-    Attributes:
-        solver: its label.
-        state: "solved", or the word for why not.
-        status: status after our own residuals have judged the claim; the outcome where nothing was judged.
-        proved: whether the answer is proved globally optimal.
-        above: objective above the best verified one, relative; NaN without a point.
-        residual: worst verified residual; NaN without a point.
-        cold: seconds of the first solve, compilation included, median over the repetitions.
-        warm: seconds of the second solve, from the first one's solution.
-        one_step: one-step fit in % on the hold-out samples.
-        simulation: simulation fit in % there.
-        reason: one sentence where the state needs one.
-    """
+    """One solver."""
 
     solver: str
-    state: str
-    status: str
-    proved: bool
-    above: float
-    residual: float
-    cold: float
-    warm: float
-    one_step: float
-    simulation: float
-    reason: str
+    state: str  # "solved", or the word for why not
+    status: str  # after our own residuals have judged the claim; the outcome where nothing was judged
+    proved: bool  # globally optimal
+    above: float  # objective above the best verified one, relative; NaN without a point
+    residual: float  # worst verified residual; NaN without a point
+    cold: float  # seconds of the first solve, compilation included, median over the repetitions
+    warm: float  # seconds of the second solve, from the first one's solution
+    one_step: float  # one-step fit in % on the hold-out samples
+    simulation: float  # simulation fit in % there
+    reason: str  # one sentence where the state needs one
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All solvers on one record.
+    """All solvers on one record."""
 
-    Attributes:
-        lines: those that were run, the recommended order first.
-        refused: {solver: why it was not run}.
-        accuracy: requested relative accuracy.
-    """
-
-    lines: tuple[Line, ...]
-    refused: dict[str, str]
-    accuracy: float
+    lines: tuple[Line, ...]  # those that were run, the recommended order first
+    refused: dict[str, str]  # {solver: why it was not run}
+    accuracy: float  # requested, relative
 
     @property
     def reasons(self) -> dict[str, list[str]]:
         """Solvers that did not solve it by the sentence that says why."""
-        found: dict[str, list[str]] = {}
-        for line in self.lines:
-            if line.state != SOLVED and line.reason:
-                found.setdefault(line.reason, []).append(line.solver)
-        return found
+        return _by_word((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
 
     @property
     def common_error(self) -> str | None:
         """What kept every solver from being run, such as a record without excitation; None where one was run."""
         if self.lines and len(self.reasons) == 1 and all(line.state == ERROR for line in self.lines):
-            return next(iter(self.reasons)).partition(": ")[2] or next(iter(self.reasons))
+            (reason,) = self.reasons
+            return reason.partition(": ")[2] or reason
         return None
 
     @property
     def headline(self) -> Statement:
         """Which solver to use on this record, with the evidence."""
         solved = [line for line in self.lines if line.state == SOLVED]
+        at = f"the accuracy of {self.accuracy:.0e}"
         if not solved and not self.lines:
             return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).", "solver")
         if not solved:
-            word = f"No solver reached the accuracy of {self.accuracy:.0e}"
-            return Statement(BAD, word, f"{counting(self.accuracy)}; {self._why_not()}.", "solver")
+            states = _by_word((line.state, line.solver) for line in self.lines)
+            why = "; ".join(f"{state}: {listed(names)}" for state, names in states.items())
+            return Statement(BAD, f"No solver reached {at}", f"{counting(self.accuracy)}; {why}.", "solver")
         first, *others = solved
-        proof = f", {'' if first.proved else 'not '}proved globally optimal"
         close = [line for line in others if line.cold <= (1 + MINOR) * first.cold and line.proved == first.proved]
-        names = [line.solver for line in (first, *close)]
-        text = f"{'they' if close else 'it'} reached the accuracy of {self.accuracy:.0e} ({counting(self.accuracy)}) "
-        text += f"in {seconds(first.cold)}"
-        text += f", equal within {MINOR:.0%}{proof}" if close else proof
         rest = [line for line in others if line not in close]
+        names = [line.solver for line in (first, *close)]
+        text = f"{'they' if close else 'it'} reached {at} ({counting(self.accuracy)}) in {seconds(first.cold)}"
+        text += f", equal within {MINOR:.0%}" if close else ""
+        text += f", {'' if first.proved else 'not '}proved globally optimal"
         if rest:
             text += f"; next is {rest[0].solver} with {seconds(rest[0].cold)}"
             text += " (without a proof)" if first.proved and not rest[0].proved else ""
         elif not others:
             failed = [line.solver for line in self.lines if line is not first]
             text += f"; {listed(failed)} did not" if failed else "; there is no other to compare it with"
-        return Statement(GOOD, f"Use {_either(names)}", f"{text}.", "solver")
+        either = " or ".join(names) if len(names) < 4 else f"any of {listed(names)}"
+        return Statement(GOOD, f"Use {either}", f"{text}.", "solver")
 
     @property
     def recommendation(self) -> str:
         """One sentence: which solver, with the evidence."""
         return f"{self.headline.word}: {self.headline.text}"
-
-    def _why_not(self) -> str:
-        counts: dict[str, list[str]] = {}
-        for line in self.lines:
-            counts.setdefault(line.state, []).append(line.solver)
-        return "; ".join(f"{state}: {listed(names)}" for state, names in counts.items())
 
 
 def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
@@ -128,23 +99,21 @@ def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
         raise DataError("there are no rows to compare: the study has no run")
     table = columns(rows)
     found = tabulate(table)
-    accuracy = float(table["accuracy"][0])
     best = np.min(found.objective[0][found.solved[0]], initial=np.inf)
     lines, refused = [], {}
-    for s, solver in enumerate(found.solvers):
-        row = int(found.row[0, s])
-        if found.state[0, s] == REFUSED:
-            refused[solver] = str(table["reason"][row])
+    for solver, state, row, residual in zip(found.solvers, found.state[0], found.row[0], found.residual[0]):
+        speaks = {name: values[row] for name, values in table.items()}
+        if state == REFUSED:
+            refused[solver] = str(speaks["reason"])
             continue
-        mine = (table["solver"] == solver) & (table["outcome"] == table["outcome"][row])
+        mine = (table["solver"] == solver) & (table["outcome"] == speaks["outcome"])
         cold = np.nan_to_num(table["compile_s"][mine]) + table["solve_s"][mine]
-        above = (table["objective"][row] - best) / found.size[0] if np.isfinite(best) else np.nan
         lines.append(Line(
-            solver, str(found.state[0, s]), str(table["status_verified"][row] or table["outcome"][row]),
-            bool(table["proved"][row]), float(above), float(found.residual[0, s]), _median(cold),
-            _median(table["warm_s"][mine]), float(table["one_step_fit"][row]), float(table["simulation_fit"][row]),
-            str(table["reason"][row])))
-    return Comparison(tuple(sorted(lines, key=_order)), refused, accuracy)
+            solver, str(state), str(speaks["status_verified"] or speaks["outcome"]), bool(speaks["proved"]),
+            float((speaks["objective"] - best) / found.size[0] if np.isfinite(best) else np.nan), float(residual),
+            _median(cold), _median(table["warm_s"][mine]), float(speaks["one_step_fit"]),
+            float(speaks["simulation_fit"]), str(speaks["reason"])))
+    return Comparison(tuple(sorted(lines, key=_order)), refused, float(table["accuracy"][0]))
 
 
 def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
@@ -156,12 +125,11 @@ def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
     Raises:
         DataError: there are no rows, or these are none of a study.
     """
-    found, verdict = compare(rows), conclude(rows)
+    head, verdict = compare(rows).headline, conclude(rows)
     caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. Which solver to prefer on others is "
-                       "told by a study of at least 6 problems (optid study run).", "data sets")  # fmt: skip
+                       "told by a study of at least 6 problems (optid study run).", "data sets")
     said = [statement for statement in verdict.statements if statement.about != "data sets"]
-    text = found.headline.text
-    head = replace(found.headline, text=text[:1].upper() + text[1:])  # a sentence of its own on the page
+    head = replace(head, text=head.text[:1].upper() + head.text[1:])  # a sentence of its own on the page
     return replace(verdict, headline=head, statements=(caveat, *said))
 
 
@@ -171,10 +139,13 @@ def _order(line: Line) -> tuple[Any, ...]:
     return rank, not line.proved, np.nan_to_num(line.cold, nan=np.inf), line.solver
 
 
+def _by_word(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for word, solver in pairs:
+        found.setdefault(word, []).append(solver)
+    return found
+
+
 def _median(values: np.ndarray) -> float:
     values = values[np.isfinite(values)]
     return float(np.median(values)) if values.size else float("nan")
-
-
-def _either(names: Sequence[str]) -> str:
-    return " or ".join(names) if len(names) < 4 else f"any of {listed(list(names))}"

@@ -1,7 +1,8 @@
 """Which runs count: a table of problems and solvers, every entry with a time or with the reason why it has none."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -42,54 +43,37 @@ MEANINGS = {
 }
 """What the words of the failure table mean beyond the outcomes of a row."""
 
+Table = Mapping[str, np.ndarray]
+_RECORD = ("study", "data", "samples", "noise", "seed")
+
 
 @dataclass(frozen=True)
 class Results:
-    """Problems (rows) against solvers (columns).
+    """Problems (P rows) against solvers (S columns).
 
     A problem is what every solver was given alike: study, record (data, samples, noise, seed) and formulation.
-
-    Attributes:
-        study, data, formulation: labels per problem, (P,).
-        samples, noise, seed: what the record was simulated with, (P,); ``nan`` for files.
-        n: samples that the fits see, those held out left out, (P,); ``nan`` where no run got that far.
-        solvers: labels, S of them, in alphabetical order.
-        state: `SOLVED` or the word for why not, (P, S).
-        reason: sentence of the first run that did not solve it, (P, S).
-        false: whether a claim was false, of any repetition at any accuracy, or contradicted, (P, S).
-        time: median over the repetitions in seconds, (P, S); ``nan`` unless solved.
-        fit: median over the repetitions of the whole fit in seconds, (P, S); ``nan`` unless solved.
-        proved: whether every repetition was proved globally optimal, (P, S).
-        objective: (P, S), of the runs whose verified accuracy was reached, local minima included; ``nan`` otherwise.
-        size: yardstick of differences of objectives, (P,).
-        residual: worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point.
-        limit: time limit in seconds, (P,).
-        row: number of the row that speaks for the entry, (P, S); -1 where there is none.
-        accuracy: requested relative accuracy that is compared at.
-        measure: of time: "solve", "fit" or "warm".
     """
 
-    study: np.ndarray
+    study: np.ndarray  # labels per problem, (P,), as those of data and formulation
     data: np.ndarray
     formulation: np.ndarray
-    samples: np.ndarray
-    noise: np.ndarray
-    seed: np.ndarray
-    n: np.ndarray
-    solvers: tuple[str, ...]
-    state: np.ndarray
-    reason: np.ndarray
-    false: np.ndarray
-    time: np.ndarray
-    fit: np.ndarray
-    proved: np.ndarray
-    objective: np.ndarray
-    size: np.ndarray
-    residual: np.ndarray
-    limit: np.ndarray
-    row: np.ndarray
-    accuracy: float
-    measure: str
+    case: np.ndarray  # number of the record, (P,): the same for all formulations of one record
+    group: np.ndarray  # number of formulation, data set and noise, (P,): what makes a problem slow but its length
+    n: np.ndarray  # samples that the fits see, those held out left out, (P,); nan where no run got that far
+    solvers: tuple[str, ...]  # labels, in alphabetical order
+    state: np.ndarray  # `SOLVED` or the word for why not, (P, S)
+    reason: np.ndarray  # sentence of the first run that did not solve it, (P, S)
+    false: np.ndarray  # whether a claim was false, of any repetition at any accuracy, or contradicted, (P, S)
+    time: np.ndarray  # median over the repetitions in seconds, (P, S); nan unless solved
+    fit: np.ndarray  # median over the repetitions of the whole fit in seconds, (P, S); nan unless solved
+    proved: np.ndarray  # whether every repetition was proved globally optimal, (P, S)
+    objective: np.ndarray  # (P, S), where the verified accuracy was reached, local minima included; nan otherwise
+    size: np.ndarray  # yardstick of differences of objectives, (P,)
+    residual: np.ndarray  # worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point
+    limit: np.ndarray  # time limit in seconds, (P,)
+    row: np.ndarray  # number of the row that speaks for the entry, (P, S); -1 where there is none
+    accuracy: float  # requested relative accuracy that is compared at
+    measure: str  # of time: "solve", "fit" or "warm"
 
     @property
     def tolerance(self) -> float:
@@ -106,25 +90,25 @@ class Results:
         """Which entries are solved, or would be but for the time that is compared, (P, S)."""
         return np.isin(self.state, VERIFIED)
 
-    def where(self, problems: np.ndarray, solvers: np.ndarray | None = None) -> "Results":
-        """Return some of the problems (mask over P) and solvers (mask over S; all unless given)."""
-        kept = np.ones(len(self.solvers), dtype=bool) if solvers is None else solvers
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        for name, value in values.items():
-            if isinstance(value, np.ndarray):
-                values[name] = value[problems][:, kept] if value.ndim == 2 else value[problems]
-        values["solvers"] = tuple(s for s, keep in zip(self.solvers, kept) if keep)
-        return Results(**values)
+    @property
+    def ran(self) -> np.ndarray:
+        """Where the solver was run at all: not refused, left out, or without a time, (P, S)."""
+        return ~np.isin(self.state, (REFUSED, NOT_RUN, UNTIMED))
 
     @property
-    def case(self) -> np.ndarray:
-        """Number of the record per problem, (P,): the same for all formulations of one record."""
-        keys = list(zip(self.study, self.data, *(_words(v) for v in (self.samples, self.noise, self.seed))))
-        numbers = {key: i for i, key in enumerate(dict.fromkeys(keys))}
-        return np.array([numbers[key] for key in keys], dtype=int)
+    def data_set(self) -> np.ndarray:
+        """Study and data as one label per problem, (P,)."""
+        return np.array([f"{study}\0{data}" for study, data in zip(self.study, self.data)], dtype=object)
+
+    def where(self, problems: np.ndarray | slice = slice(None), solvers: np.ndarray | slice = slice(None)) -> "Results":
+        """Return some of the problems (mask over P) and solvers (mask over S)."""
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
+        kept = {name: value[problems][:, solvers] if value.ndim == 2 else value[problems]
+                for name, value in values.items() if isinstance(value, np.ndarray)}
+        return replace(self, **kept, solvers=tuple(np.array(self.solvers, dtype=object)[solvers]))
 
 
-def usual_accuracy(table: Mapping[str, np.ndarray]) -> float:
+def usual_accuracy(table: Table) -> float:
     """Return the accuracy that most runs asked for, of equally frequent ones the strictest."""
     known = table["accuracy"][np.isfinite(table["accuracy"]) & (table["accuracy"] > 0)]
     if not known.size:
@@ -133,11 +117,11 @@ def usual_accuracy(table: Mapping[str, np.ndarray]) -> float:
     return float(values[np.argmax(counts)])
 
 
-def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, time: str = "solve") -> Results:
+def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -> Results:
     """Sort rows into problems and solvers, and decide which entries are solved.
 
     Args:
-        table: what `optid.studies.verdicts.table.columns` returned.
+        table: what `optid.studies.storage.rows.columns` returned.
         accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
         time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
 
@@ -162,48 +146,49 @@ def tabulate(table: Mapping[str, np.ndarray], accuracy: float | None = None, tim
         members[problem[i]].append(i)
         if states[i] != OTHER_ACCURACY:
             entries.setdefault((problem[i], solver[i]), []).append(i)
-    first = np.array([m[0] for m in members], dtype=int)
     shape = (len(members), len(solvers))
     state, reason = np.full(shape, NOT_RUN, dtype=object), np.full(shape, "", dtype=object)
     false = np.zeros(shape, dtype=bool)
     np.logical_or.at(false, (problem, solver), table["false_claim"])
     row, proved = np.full(shape, -1), np.zeros(shape, dtype=bool)
     numbers = {name: np.full(shape, np.nan) for name in ("time", "fit", "objective", "residual")}
-    for (p, s), runs in entries.items():
+    for at, runs in entries.items():
         runs.sort(key=lambda i: (table["repetition"][i], table["key"][i]))
         bad = next((i for i in runs if not verified[i]), next((i for i in runs if states[i] != SOLVED), None))
-        speaks = runs[0] if bad is None else bad
-        row[p, s], state[p, s] = speaks, states[speaks]
-        reason[p, s] = "" if bad is None else table["reason"][speaks]
-        numbers["residual"][p, s] = np.max(residual[runs])
+        row[at] = runs[0] if bad is None else bad
+        state[at], reason[at] = states[row[at]], "" if bad is None else table["reason"][bad]
+        numbers["residual"][at] = np.max(residual[runs])
         if bad is None:
-            numbers["time"][p, s] = np.median(seconds[runs])
-            numbers["fit"][p, s] = np.median(table["fit_s"][runs])
-            proved[p, s] = table["proved"][runs].all()
+            numbers["time"][at], numbers["fit"][at] = np.median(seconds[runs]), np.median(table["fit_s"][runs])
+            proved[at] = table["proved"][runs].all()
         if verified[runs].all():
-            numbers["objective"][p, s] = np.max(table["objective"][runs])
-    found = Results(
-        *(table[name][first] for name in ("study", "data", "formulation", "samples", "noise", "seed")),
+            numbers["objective"][at] = np.max(table["objective"][runs])
+    first = np.array([m[0] for m in members], dtype=int)
+    of_problem = {name: values[first] for name, values in table.items()}
+    return _against_the_best(Results(
+        *(of_problem[name] for name in ("study", "data", "formulation")),
+        case=_numbered(of_problem, *_RECORD), group=_numbered(of_problem, "formulation", "study", "data", "noise"),
         n=np.array([_largest(*(table[c][m] for c in ("n_estimation", "n_samples", "samples"))) for m in members]),
         size=np.array([_largest(table["scale"][m]) for m in members]),
-        limit=np.array([_largest(table["time_limit"][m]) for m in members]),
-        solvers=solvers, state=state, reason=reason, false=false, row=row, proved=proved, accuracy=accuracy,
-        measure=time, **numbers,
-    )  # fmt: skip
-    return _against_the_best(found)
+        limit=np.array([_largest(table["time_limit"][m]) for m in members]), solvers=solvers, state=state,
+        reason=reason, false=false, row=row, proved=proved, accuracy=accuracy, measure=time, **numbers))
 
 
-def _places(table: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+def _places(table: Table) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Number of the problem and of the solver of every row, and the solvers in alphabetical order."""
-    labels = (table[c] for c in ("study", "data", "formulation"))
-    keys = list(zip(*labels, *(_words(table[c]) for c in ("samples", "noise", "seed"))))
-    problems = {key: p for p, key in enumerate(dict.fromkeys(keys))}
-    solvers = {name: s for s, name in enumerate(sorted(set(table["solver"])))}
-    return (np.array([problems[key] for key in keys], dtype=int),
-            np.array([solvers[name] for name in table["solver"]], dtype=int), tuple(solvers))  # fmt: skip
+    solvers, solver = np.unique(table["solver"], return_inverse=True)
+    return _numbered(table, *_RECORD, "formulation"), solver, tuple(solvers)
 
 
-def _other_accuracy(table: Mapping[str, np.ndarray], accuracy: float) -> np.ndarray:
+def _numbered(table: Table, *names: str) -> np.ndarray:
+    """Number the rows by their values in some columns, in order of first appearance; empty numbers equal each other."""
+    words = ([f"{v:.12g}" for v in table[name]] if table[name].dtype.kind == "f" else table[name] for name in names)
+    keys = list(zip(*words))
+    numbers = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    return np.array([numbers[key] for key in keys], dtype=int)
+
+
+def _other_accuracy(table: Table, accuracy: float) -> np.ndarray:
     """Which runs asked for an accuracy that another run of the same solver on the same problem suits better, (rows,).
 
     What suits best is the loosest that is not looser than the common one; where all are looser, the strictest.
@@ -218,17 +203,12 @@ def _other_accuracy(table: Mapping[str, np.ndarray], accuracy: float) -> np.ndar
     return distance > nearest[entry]
 
 
-def _words(values: np.ndarray) -> list[str]:
-    """Numbers as words, so that an empty one equals an empty one."""
-    return [f"{v:.12g}" for v in values]
-
-
 def _largest(*choices: np.ndarray) -> float:
     """Largest finite number of the first choice that has one."""
     return next((float(np.max(c[np.isfinite(c)])) for c in choices if np.isfinite(c).any()), float("nan"))
 
 
-def worst_residual(table: Mapping[str, np.ndarray]) -> np.ndarray:
+def worst_residual(table: Table) -> np.ndarray:
     """Return what is held against the tolerance, (rows,); ``nan`` without a point.
 
     It is the largest of violation, complementarity and stationarity, the last one divided by `GRADIENT`: solving allows
@@ -237,29 +217,28 @@ def worst_residual(table: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.fmax(np.fmax(table["violation"], table["complementarity"]), table["stationarity"] / GRADIENT)
 
 
-def seconds_of(table: Mapping[str, np.ndarray], time: str) -> np.ndarray:
+def seconds_of(table: Table, time: str) -> np.ndarray:
     """Return the time that is compared, (rows,); ``nan`` where it is not known."""
-    parts = TIMES[time]  # only the last one must be there
-    total = table[parts[-1]] + sum(np.nan_to_num(table[part]) for part in parts[:-1])
+    *parts, last = TIMES[time]  # only the last one must be there
+    total = table[last] + sum(np.nan_to_num(table[part]) for part in parts)
     return np.where(total > 0, total, np.where(total == 0, 1e-6, np.nan))  # a clock that stood still: a microsecond
 
 
-def _row_states(table: Mapping[str, np.ndarray], accuracy: float, time: str) -> np.ndarray:
+def _row_states(table: Table, accuracy: float, time: str) -> np.ndarray:
     """`SOLVED` or why not, for every row by itself."""
     warm_failed = (time == "warm") & (table["warm_status"] != "") & ~np.isin(table["warm_status"], SUCCESS)
-    verified = np.isin(table["status_verified"], SUCCESS)
-    unknown = np.where(table["status_verified"] == "", "failed", table["status_verified"])
+    status, outcome = table["status_verified"], table["outcome"]
     choices = [
         (_other_accuracy(table, accuracy), OTHER_ACCURACY),
-        (table["outcome"] != DONE, np.where(table["outcome"] == "", "error", table["outcome"])),
+        (outcome != DONE, np.where(outcome == "", ERROR, outcome)),
         (table["false_claim"], FALSE_CLAIM),
-        (~verified, unknown),
+        (~np.isin(status, SUCCESS), np.where(status == "", str(Status.FAILED), status)),
         (~np.isfinite(table["objective"]), NON_FINITE),
         (worst_residual(table) > tolerance(accuracy), LESS_ACCURATE),
         (warm_failed, WARM_FAILED),
         (~np.isfinite(seconds_of(table, time)), UNTIMED),
     ]
-    states = np.full(len(verified), SOLVED, dtype=object)
+    states = np.full(len(status), SOLVED, dtype=object)
     for condition, word in reversed(choices):
         states = np.where(condition, word, states)
     return states.astype(object)
@@ -276,19 +255,12 @@ def _against_the_best(found: Results) -> Results:
     worse = found.solved & far
     denied = np.isin(found.state, (INFEASIBLE, str(Status.UNBOUNDED))) & np.any(verified, axis=1, keepdims=True)
     state = np.where(worse, WORSE_MINIMUM, np.where(denied, CONTRADICTED, found.state)).astype(object)
-    values = {f.name: getattr(found, f.name) for f in fields(found)}
-    values |= {"state": state, "false": found.false | denied, "proved": found.proved & ~worse, "size": size,
-               "time": np.where(worse, np.nan, found.time), "fit": np.where(worse, np.nan, found.fit)}
-    return Results(**values)
+    return replace(found, state=state, false=found.false | denied, proved=found.proved & ~worse, size=size,
+                   time=np.where(worse, np.nan, found.time), fit=np.where(worse, np.nan, found.fit))
 
 
-def states_of_rows(table: Mapping[str, np.ndarray], found: Results) -> np.ndarray:
-    """Return `SOLVED` or the word for why not for every row, (rows,).
-
-    Args:
-        table: the rows.
-        found: what `tabulate` made of them.
-    """
+def states_of_rows(table: Table, found: Results) -> np.ndarray:
+    """Return `SOLVED` or the word for why not for every row, (rows,), once `tabulate` has made results of the table."""
     states = _row_states(table, found.accuracy, found.measure)
     for word in (WORSE_MINIMUM, CONTRADICTED):
         states[found.row[found.state == word]] = word
@@ -302,10 +274,5 @@ def agreed_infeasible(found: Results) -> np.ndarray:
     without a point, so nothing about it can be verified.
     """
     says = found.state == INFEASIBLE
-    answered = applicable(found) & ~np.isin(found.state, UNANSWERED)
+    answered = found.ran & ~np.isin(found.state, UNANSWERED)
     return (says.sum(axis=1) >= 2) & (says | ~answered).all(axis=1)
-
-
-def applicable(found: Results) -> np.ndarray:
-    """Return the entries where the solver was run at all: not refused, left out, or without a time, (P, S)."""
-    return ~np.isin(found.state, (REFUSED, NOT_RUN, UNTIMED))

@@ -12,35 +12,25 @@ from scipy.special import gammaln
 from scipy.stats import f as fisher
 from scipy.stats import rankdata, studentized_range
 
+from optid.studies.verdicts.averages import means_of_groups
+from optid.studies.verdicts.statement import there_are
+
 MINIMUM_DATA_SETS = 6  # with five, even a unanimous comparison of two has a two-sided probability of 1/16 > 0.05
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """Mean ranks of k solvers over N data sets, 1 the best, and which of them differ.
+    """Mean ranks of k solvers over data sets, 1 the best, and which of them differ."""
 
-    Attributes:
-        names: the solvers, best mean rank first.
-        ranks: their mean ranks.
-        n: data sets.
-        probability: of ranks as different as these if all solvers were alike (Friedman with Iman and Davenport's
-            correction; Wilcoxon's signed ranks for two); ``nan`` where it cannot be told.
-        difference: mean ranks further apart than this differ (Nemenyi); ``nan`` where there is no such number.
-        test: name of the test.
-        missing: what is missing to tell; "" where it can be told.
-        left_out: solvers that did not run on every data set.
-        level: significance level.
-    """
-
-    names: tuple[str, ...]
-    ranks: np.ndarray
-    n: int
-    probability: float
-    difference: float
-    test: str
-    missing: str = ""
-    left_out: tuple[str, ...] = ()
-    level: float = 0.05
+    names: tuple[str, ...]  # the solvers, best mean rank first
+    ranks: np.ndarray  # their mean ranks
+    n: int  # data sets
+    level: float = 0.05  # significance level
+    left_out: tuple[str, ...] = ()  # solvers that did not run on every data set
+    missing: str = ""  # what is missing to tell
+    test: str = "none"
+    probability: float = float("nan")  # of ranks as different as these if all were alike; nan where it cannot be told
+    difference: float = float("nan")  # mean ranks further apart differ (Nemenyi); nan where there is no such number
 
     @property
     def told(self) -> bool:
@@ -57,19 +47,27 @@ class Ranking:
         return bool(abs(a - b) > self.difference)
 
 
-def ranks_of_problems(times: np.ndarray) -> np.ndarray:
-    """Return the ranks within every problem, (P, S): 1 the fastest, equal times and all failures tied."""
-    return rankdata(np.where(np.isfinite(times), times, np.inf), axis=1) if times.size else np.zeros(times.shape)
-
-
-def scores_by_data_set(ranks: np.ndarray, data: np.ndarray) -> np.ndarray:
-    """Return the mean rank of every solver on every data set, (N, S), data sets in order of first appearance.
+def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.ndarray, noun: str = "solver"
+         ) -> Ranking:
+    """Rank those that were tried on every data set; a failure on a problem ranks last there, failures tied.
 
     Args:
-        ranks: (P, S).
+        costs: (P, k) lower is better, ``nan`` where not solved.
+        tried: (P, k) where somebody was run.
+        names: the k names.
         data: (P,) labels of the data sets.
+        noun: what is ranked.
     """
-    return np.array([np.mean(ranks[data == label], axis=0) for label in dict.fromkeys(data)])
+    everywhere = [bool(len(data)) and all(column[data == label].any() for label in dict.fromkeys(data))
+                  for column in tried.T]
+    kept, out = (tuple(name for name, there in zip(names, everywhere) if there == keep) for keep in (True, False))
+    scores = means_of_groups(ranks_of_problems(costs[:, everywhere]), data)
+    return rank_over_data_sets(scores, kept, out, noun)
+
+
+def ranks_of_problems(costs: np.ndarray) -> np.ndarray:
+    """Return the ranks within every problem, (P, S): 1 the best, equal costs and all failures (``nan``) tied."""
+    return rankdata(np.where(np.isfinite(costs), costs, np.inf), axis=1) if costs.size else np.zeros(costs.shape)
 
 
 def friedman(scores: np.ndarray) -> tuple[float, float]:
@@ -101,57 +99,47 @@ def critical_difference(k: int, n: int, level: float = 0.05) -> float:
 
 
 def signed_ranks(differences: np.ndarray) -> float:
-    """Return the exact two-sided probability of Wilcoxon's signed-rank statistic, ties included.
+    """Return the exact two-sided probability of Wilcoxon's signed-rank statistic over all signs, ties included.
 
     Args:
-        differences: (N,) paired; zeros are left out.
-
-    Returns:
-        The probability over all assignments of signs; 1 where no difference is left.
+        differences: (N,) paired; zeros are left out, and the probability is 1 where none is left.
     """
     d = differences[differences != 0]
     if not d.size:
         return 1.0
     doubled = np.rint(2 * rankdata(np.abs(d))).astype(int)  # ties give halves
-    ways = np.zeros(doubled.sum() + 1)
-    ways[0] = 1.0
+    chances = np.ones(1)
     for r in doubled:
-        shifted = np.zeros_like(ways)
-        shifted[r:] = ways[: ways.size - r]
-        ways = (ways + shifted) / 2
+        chances = (np.pad(chances, (0, r)) + np.pad(chances, (r, 0))) / 2
     low = min(doubled[d > 0].sum(), doubled[d < 0].sum())
-    return float(min(1.0, 2 * np.sum(ways[: low + 1])))
+    return float(min(1.0, 2 * np.sum(chances[: low + 1])))
 
 
 def rank_over_data_sets(scores: np.ndarray, names: tuple[str, ...], left_out: tuple[str, ...] = (),
-                        level: float = 0.05, noun: str = "solver") -> Ranking:
-    """Rank solvers over data sets and test the differences.
+                        noun: str = "solver", level: float = 0.05) -> Ranking:
+    """Rank over data sets and test the differences: Wilcoxon's signed ranks for two, Friedman and Nemenyi for more.
 
     Args:
-        scores: (N, k) lower is better, one row per data set, no ``nan``.
-        names: the k solvers.
-        left_out: solvers that could not take part, for the record.
-        level: significance level.
+        scores: (N, k) lower is better, one row per data set, no ``nan``; fewer than `MINIMUM_DATA_SETS` rows or two
+            columns give no test, and `Ranking.missing` says so.
+        names: the k names.
+        left_out: who could not take part, for the record.
         noun: what is ranked.
-
-    Returns:
-        The ranking: Wilcoxon's signed ranks for two solvers, Friedman and Nemenyi for more. Fewer than
-        `MINIMUM_DATA_SETS` data sets or two solvers give no test, and `missing` says so.
-    """  # fmt: skip
+        level: significance level.
+    """
     n, k = len(scores), len(names)
     means = np.mean(rankdata(scores, axis=1), axis=0) if n and k else np.full(k, np.nan)
     order = sorted(range(k), key=lambda s: (means[s], names[s]))
     named, sorted_means = tuple(names[s] for s in order), means[order]
     missing = []
     if k < 2:
-        missing.append(f"at least 2 {noun}s that ran on every data set; there {'is' if k == 1 else 'are'} {k}")
+        missing.append(f"at least 2 {noun}s that ran on every data set; {there_are(k)}")
     if n < MINIMUM_DATA_SETS:
-        missing.append(f"at least {MINIMUM_DATA_SETS} data sets; there {'is' if n == 1 else 'are'} {n}")
-    nan = float("nan")
+        missing.append(f"at least {MINIMUM_DATA_SETS} data sets; {there_are(n)}")
     if missing:
-        return Ranking(named, sorted_means, n, nan, nan, "none", "needs " + ", and ".join(missing), left_out, level)
+        return Ranking(named, sorted_means, n, level, left_out, "needs " + ", and ".join(missing))
     if k == 2:
         p = signed_ranks(scores[:, 0] - scores[:, 1])
-        return Ranking(named, sorted_means, n, p, nan, "Wilcoxon signed ranks", "", left_out, level)
-    p, apart = friedman(scores)[1], critical_difference(k, n, level)
-    return Ranking(named, sorted_means, n, p, apart, "Friedman and Nemenyi", "", left_out, level)
+        return Ranking(named, sorted_means, n, level, left_out, "", "Wilcoxon signed ranks", p)
+    return Ranking(named, sorted_means, n, level, left_out, "", "Friedman and Nemenyi", friedman(scores)[1],
+                   critical_difference(k, n, level))

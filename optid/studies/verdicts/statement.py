@@ -1,5 +1,6 @@
-"""One sentence of a verdict, and how its numbers are written."""
+"""One sentence of a verdict, and how its numbers and names are written."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from optid.program.solution import tolerance
@@ -10,19 +11,12 @@ FINEST = tolerance(0.0) / 100  # requested accuracies below are judged as this o
 
 @dataclass(frozen=True)
 class Statement:
-    """One sentence or two.
+    """One sentence or two."""
 
-    Attributes:
-        tone: "good", "fair" or "bad".
-        word: the heading: what to do.
-        text: why, with the numbers.
-        about: "solver", "formulation", "data sets", "claims".
-    """
-
-    tone: str
-    word: str
-    text: str
-    about: str
+    tone: str  # "good", "fair" or "bad"
+    word: str  # the heading: what to do
+    text: str  # why, with the numbers
+    about: str  # "solver", "formulation", "data sets", "claims"
 
 
 def plural(n: int, noun: str) -> str:
@@ -41,3 +35,18 @@ def of(n: int, total: int, noun: str = "problem") -> str:
     if n == total:
         return f"the only {noun}" if total == 1 else f"all {plural(total, noun)}"
     return f"{n:,} of {plural(total, noun)}"
+
+
+def there_are(n: int) -> str:
+    """Write "there is 1", "there are 3"."""
+    return f"there {'is' if n == 1 else 'are'} {n}"
+
+
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """Write names as "a, b and c", in quotes where a name has a comma; of many the first ones and how many more."""
+    names = list(names)
+    if any("," in name or " and " in name for name in names):
+        names = [f"\u201c{name}\u201d" for name in names]
+    if len(names) > most:
+        return ", ".join(names[: most - 1]) + f" and {len(names) - most + 1} more"
+    return " and ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
