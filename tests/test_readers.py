@@ -474,7 +474,7 @@ def test_bad_streams(tmp_path):
     with pytest.raises(DataError, match="not a Parquet file"):
         open_stream(tmp_path / "r.parquet")
     pl.DataFrame({"u": ["a"], "y": [1.0]}).write_parquet(tmp_path / "r.parquet")
-    with pytest.raises(DataError, match="column 'u' is of type .*string"):
+    with pytest.raises(DataError, match="column 'u' is of type String, numbers"):
         list(open_stream(tmp_path / "r.parquet"))
     for array, message in [
         (np.ones((2, 9)), "more channels than samples"),

@@ -21,7 +21,7 @@ from optid.data.reading.columns import (
     time_column,
     uniform_step,
 )
-from optid.data.reading.tables import Table, open_table
+from optid.data.reading.sources import Table, open_table
 from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError
@@ -115,8 +115,8 @@ def _runs(
     group = None if experiment is None else column_name(table.names, experiment, label)
     loaded = table.load(list(dict.fromkeys([*signals, *(name for name in (clock, group) if name is not None)])),
                         clock, group)
-    stamps = None if clock is None else as_stamps(loaded[clock], f"{label}, column {clock!r}")
-    groups = None if group is None else loaded[group]
+    stamps = None if clock is None else as_stamps(np.ravel(loaded[clock]), f"{label}, column {clock!r}")
+    groups = None if group is None else np.ravel(loaded[group])
     loaded = {name: loaded[name] for name in signals}
     y_names, y = _stacked(outs, loaded, label, kept=set(ins.values()))
     u_names, u = _stacked(ins, loaded, label)

@@ -179,6 +179,17 @@ def agreed_step(found: float | None, dt: float | None, tolerance: float, label: 
     return dt
 
 
+def position_names(columns: Sequence[str] | None, width: int, label: str) -> list[str]:
+    """Return the names of the columns of a plain array: those given, else their positions as text.
+
+    Raises:
+        DataError: the number of names is not the number of columns.
+    """
+    if columns is not None and len(columns) != width:
+        raise DataError(f"{label} has {width} columns, columns= names {len(columns)}.")
+    return [str(c) for c in (range(width) if columns is None else columns)]
+
+
 def _parsed(text: np.ndarray, label: str) -> np.ndarray:
     missing = np.isin(np.char.lower(np.char.strip(text)), [*MISSING, "nat"])
     try:

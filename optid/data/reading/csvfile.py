@@ -58,46 +58,37 @@ class CsvFile:
     decimal: str
 
     def columns(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Columns:
-        """Return the wanted columns whole; arguments and errors as of `blocks`.
-
-        Raises:
-            DataError: the table has no rows.
-        """
-        parts: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
-        for block in self._blocks(wanted, clock, group):
-            for name, part in block.items():
-                parts[name].append(part)
-        if not parts[wanted[0]]:
-            raise DataError(f"{self.path.name} has a header but no rows.")
-        return {name: np.concatenate(parts.pop(name)) for name in wanted}
-
-    def blocks(self, wanted: Sequence[str], clock: str | None, group: str | None, rows: int) -> Iterator[Columns]:
-        """Yield the wanted columns as float64, NaN where a cell says missing, `rows` rows at a time.
+        """Return the wanted columns whole as float64, NaN where a cell says missing.
 
         Args:
             wanted: names of columns.
             clock: the one of them that is returned as text where it does not hold numbers.
             group: the one of them that is returned as text.
-            rows: number of rows of every block but the last.
 
         Raises:
-            DataError: a cell that is not a number, a row of another width, a blank row inside the table, or text that
-                is not UTF-8.
+            DataError: no rows, a cell that is not a number, a row of another width, a blank row inside the table, or
+                text that is not UTF-8.
         """
+        whole = list(self._blocks(wanted, clock, group))
+        if not whole:
+            raise DataError(f"{self.path.name} has a header but no rows.")
+        return _joined(whole, wanted)
+
+    def blocks(self, rows: int, wanted: Sequence[str], clock: str | None) -> Iterator[Columns]:
+        """Yield the wanted columns `rows` rows at a time; arguments and errors as of `columns`."""
         kept: list[Columns] = []
         count = 0
-        for block in self._blocks(wanted, clock, group):
+        for block in self._blocks(wanted, clock, None):
             kept.append(block)
             count += len(block[wanted[0]])
             if count >= rows:
-                whole = {name: np.concatenate([part[name] for part in kept]) for name in wanted}
-                full = count - count % rows
+                whole, full = _joined(kept, wanted), count - count % rows
                 for first in range(0, full, rows):
                     yield {name: column[first : first + rows] for name, column in whole.items()}
                 count -= full
-                kept = [{name: column[full:] for name, column in whole.items()}] if count else []
+                kept = [{name: column[full:] for name, column in whole.items()}]
         if count:
-            yield {name: np.concatenate([part[name] for part in kept]) for name in wanted}
+            yield _joined(kept, wanted)
 
     def _blocks(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Iterator[Columns]:
         done = 0
@@ -268,6 +259,11 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
         if name and count > 1:
             raise DataError(f"{path.name} has two columns named {name!r}: rename one.")
     return CsvFile(path, names, start + len(line) if columns is None else start, delimiter, decimal)
+
+
+def _joined(blocks: list[Columns], wanted: Sequence[str]) -> Columns:
+    """Join blocks, each column freed as soon as it is copied."""
+    return {name: np.concatenate([block.pop(name) for block in blocks]) for name in dict.fromkeys(wanted)}
 
 
 def _whole_lines(file: BinaryIO | io.RawIOBase, start: int) -> Iterator[tuple[int, bytes]]:

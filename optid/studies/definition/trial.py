@@ -86,7 +86,7 @@ def note_unreadable(entries: Sequence[DataEntry], records: Records, problems: Pr
 def _note_trouble(path: tuple[str | int, ...], entry: DataEntry, records: Records, problems: Problems) -> None:
     """Note what is wrong with the files of one entry, at the key that is to blame."""
     from optid.data.reading.columns import choose
-    from optid.data.reading.tables import open_table
+    from optid.data.reading.sources import open_table
 
     options, key = dict(entry.options), "file"
     for number, name in enumerate(entry.files):
