@@ -185,21 +185,13 @@ class CsvFile:
                 raise ValueError
             return np.array(list(map(float, text)), dtype=np.float64)
         except ValueError:
-            return np.array([self._number(cell, column, first + k) for k, cell in enumerate(text)], dtype=np.float64)
-
-    def _number(self, cell: str, column: str, row: int) -> float:
-        if cell.strip().lower() in MISSING:
-            return np.nan
-        try:
-            if "_" in cell:
-                raise ValueError
-            return float(cell)
-        except ValueError:
-            comma = ' For decimal commas pass decimal=","' if "," in cell else ""
-            raise DataError(
-                f"{self.path.name}: column {column!r}, row {row + 1} after the header holds {cell!r}, not a number. "
-                f"Leave the cell blank where a sample is missing.{comma}"
-            ) from None
+            pass
+        for row, cell in enumerate(text, first + 1):
+            if not is_missing(cell) and ("_" in cell or not is_number(cell)):
+                comma = ' For decimal commas pass decimal=","' if "," in cell else ""
+                raise DataError(f"{self.path.name}: column {column!r}, row {row} after the header holds {cell!r}, not a "
+                                f"number. Leave the cell blank where a sample is missing.{comma}") from None
+        return np.array([np.nan if is_missing(cell) else float(cell) for cell in text], dtype=np.float64)
 
     def _without_tail(self, block: list[list[str]], reader: Any, done: int) -> list[list[str]]:
         """Accept blank lines at the end of the file; refuse any other row of the wrong width."""
@@ -225,10 +217,7 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
     Raises:
         DataError: empty file, no header, two columns of one name, not UTF-8, a delimiter that cannot be one.
     """
-    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter.isalnum() or delimiter in '"\r\n+-\0':
-        raise DataError(f"delimiter = {delimiter!r}: one character such as ',' or ';' or a tab is needed.")
-    if decimal not in (".", ",") or decimal == delimiter:
-        raise DataError(f"decimal = {decimal!r} with delimiter = {delimiter!r}: '.' or ',' and not the delimiter.")
+    check_marks(delimiter, decimal)
     with open(path, "rb") as file:
         start = 3 if file.read(3) == b"\xef\xbb\xbf" else 0
         file.seek(start)
@@ -249,7 +238,7 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
         raise DataError(f"{path.name} is empty: a header row and at least one row of numbers are needed.")
     if following is not None:
         raise DataError(f"{path.name} has quoted names and carriage returns as line ends: save it with line feeds.")
-    if columns is None and all(_is_number(cell) for cell in first):
+    if columns is None and all(is_number(cell) for cell in first):
         raise DataError(f"{path.name} has no header row (it starts with {first[:20]}): name the columns, "
                         "columns=[...].")
     names = [str(cell).strip() for cell in (first if columns is None else columns)]
@@ -259,6 +248,14 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
         if name and count > 1:
             raise DataError(f"{path.name} has two columns named {name!r}: rename one.")
     return CsvFile(path, names, start + len(line) if columns is None else start, delimiter, decimal)
+
+
+def check_marks(delimiter: Any, decimal: Any) -> None:
+    """Refuse a delimiter or a decimal mark that cannot be one (`DataError`)."""
+    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter.isalnum() or delimiter in '"\r\n+-\0':
+        raise DataError(f"delimiter = {delimiter!r}: one character such as ',' or ';' or a tab is needed.")
+    if decimal not in (".", ",") or decimal == delimiter:
+        raise DataError(f"decimal = {decimal!r} with delimiter = {delimiter!r}: '.' or ',' and not the delimiter.")
 
 
 def _joined(blocks: list[Columns], wanted: Sequence[str]) -> Columns:
@@ -292,9 +289,15 @@ def _is_plain(block: bytes) -> bool:
     return True
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Say whether float() reads a cell."""
     try:
         float(cell)
     except ValueError:
         return False
     return True
+
+
+def is_missing(cell: str) -> bool:
+    """Say whether a cell means a missing sample."""
+    return cell.strip().lower() in MISSING
