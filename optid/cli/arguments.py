@@ -2,7 +2,6 @@
 
 import inspect
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,21 +27,23 @@ def read_record(
     """
     from optid.data.readers import open_stream, read
 
-    time = how["time"]
-    options: dict[str, Any] = {
-        **how,
-        "inputs": listed(how["inputs"]),
-        "outputs": listed(how["outputs"]),
-        "columns": listed(how["columns"]),
-        "time": False if time == "none" else time,
-        "delimiter": how["delimiter"].replace("\\t", "\t"),
-    }
+    options = reading(how)
     if not stream and scheduler is None:
         return read([Path(name) for name in files], **options)
     if options.pop("experiment") is not None:
         raise DataError("--stream and --scheduler read a file or folder as one experiment; leave --experiment out")
     paths = [Path(name) for name in files]
     return open_stream(paths if len(paths) > 1 else paths[0], scheduler=scheduler, **options)
+
+
+def reading(how: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a record as arguments of `optid.read`."""
+    return {
+        **how,
+        **{key: listed(how[key]) for key in ("inputs", "outputs", "columns")},
+        "time": False if how["time"] == "none" else how["time"],
+        "delimiter": how["delimiter"].replace("\\t", "\t"),
+    }
 
 
 def record(
@@ -137,33 +138,20 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
-def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
-    """Cut a record in an estimation and a validation part.
+def held_out(record: Any, share: float | None, files: Sequence[str] | None, how: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the record to fit and the one to validate on: files, or the rest of the record after a share, or None.
 
     Raises:
         DataError: an impossible share, or a stream.
     """
+    if files:
+        return record, read_record(files, how)
+    if share is None:
+        return record, None
     if isinstance(record, Stream):
         raise DataError("--split needs the record in memory; leave --stream and --scheduler out, or give --test "
                         "another file")
     return record.split(share)
-
-
-def check_folders(*paths: Path | None) -> None:
-    """Refuse a file that cannot be written, before any work is done.
-
-    Raises:
-        DataError: its folder is not there or takes no files, or it is a folder itself.
-    """
-    for path in (path for path in paths if path is not None):
-        folder = path.absolute().parent
-        if not folder.is_dir():
-            raise DataError(f"{path} cannot be written: there is no folder {folder}")
-        if path.is_dir():
-            raise DataError(f"{path} cannot be written: it is a folder; name a file in it")
-        if not os.access(path if path.exists() else folder, os.W_OK):
-            raise DataError(f"{path} cannot be written: {'it' if path.exists() else f'folder {folder}'} is read-only "
-                            "here; give a file in another folder")
 
 
 def listed(words: Sequence[str] | None) -> list[str] | None:
@@ -189,6 +177,33 @@ def whole_numbers(words: Sequence[str] | None, option: str) -> Any:
         except ValueError:
             raise StructureError(f"{option} {word}: a whole number is needed, or one per input") from None
     return one_or_all(numbers) if words is not None else None
+
+
+def numbers(words: Sequence[str] | None, option: str) -> list[float] | None:
+    """Read numbers, one per channel; None stays None.
+
+    Raises:
+        StructureError: naming the option and the words.
+    """
+    found = listed(words)
+    try:
+        return None if found is None else [float(part) for text in found for part in text.split()]
+    except ValueError:
+        raise StructureError(f"{option} {' '.join(found or [])}: numbers are needed, one per channel") from None
+
+
+def zeros(words: Sequence[str] | None) -> dict[str, float]:
+    """Read INPUT=VALUE words of ``--zero`` (`StructureError` for any other)."""
+    found = {}
+    for word in listed(words) or []:
+        name, equals, number = word.partition("=")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            equals = ""
+        if not (name and equals):
+            raise StructureError(f"--zero {word}: write INPUT=VALUE, the input at which the actuator does nothing")
+    return found
 
 
 def value(word: str) -> Any:

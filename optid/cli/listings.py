@@ -4,11 +4,9 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import EntryPoint
 from typing import Any
 
-from rich import box
-from rich.table import Table
 from rich.text import Text
 
-from optid.cli.terminal import output
+from optid.cli.terminal import new_table, output
 from optid.descriptions import Description, describe, describe_function
 from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, registered
 
@@ -116,7 +114,7 @@ def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], fo
     """Return what prints a table; the first `firm` columns are never broken."""
 
     def show() -> None:
-        table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+        table = new_table(title)
         for c, column in enumerate(columns):
             table.add_column(column, overflow="fold", no_wrap=c < firm)
         for row in rows:

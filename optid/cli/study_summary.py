@@ -5,11 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 from rich.text import Text
 
-from optid.cli.terminal import output, say
+from optid.cli.terminal import new_table, output, say
 from optid.program.solution import Status
 from optid.studies.storage.rows import DONE, REFUSED
 
@@ -24,7 +22,7 @@ def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
         title: of the table.
         rows: {column: (rows,) array}.
     """
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    table = new_table(title)
     table.add_column("solver", no_wrap=True)
     for column in ("cells", "accuracy reached", "proved", "false claims", "refused"):
         table.add_column(column, justify="right")
@@ -88,8 +86,7 @@ def print_models(verdict: Any) -> None:
     from optid.studies.page import quality_table
 
     found = quality_table(verdict.quality)
-    table = Table(title=found.title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False,
-                  padding=(0, 1, 0, 0))
+    table = new_table(found.title, padding=(0, 1, 0, 0))
     for number, name in enumerate(found.head):
         table.add_column(name, justify="left" if number < 2 else "right", overflow="fold",
                          min_width=max(map(len, name.split())))

@@ -189,8 +189,8 @@ class CsvFile:
         for row, cell in enumerate(text, first + 1):
             if not is_missing(cell) and ("_" in cell or not is_number(cell)):
                 comma = ' For decimal commas pass decimal=","' if "," in cell else ""
-                raise DataError(f"{self.path.name}: column {column!r}, row {row} after the header holds {cell!r}, not a "
-                                f"number. Leave the cell blank where a sample is missing.{comma}") from None
+                raise DataError(f"{self.path.name}: column {column!r}, row {row} after the header holds {cell!r}, not "
+                                f"a number. Leave the cell blank where a sample is missing.{comma}") from None
         return np.array([np.nan if is_missing(cell) else float(cell) for cell in text], dtype=np.float64)
 
     def _without_tail(self, block: list[list[str]], reader: Any, done: int) -> list[list[str]]:
