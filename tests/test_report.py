@@ -9,7 +9,7 @@ from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, two_by_
 
 import optid
 from optid import report
-from optid.show.page import _extremes
+from optid.show.sections import extremes
 
 
 class Page(HTMLParser):
@@ -161,5 +161,5 @@ def test_long_curves_keep_their_peaks():
     values = np.sin(np.arange(1e5) / 500)
     values[[12_345, 54_321]] = 7.0, -9.0
     values[70_000:70_010] = np.nan
-    kept = _extremes(values, 1000)
+    kept = extremes(values, 1000)
     assert kept.size <= 2020 and {12_345, 54_321} <= set(kept) and np.isnan(values[kept]).any()

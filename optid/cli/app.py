@@ -1,7 +1,7 @@
 """The command line: all commands, and the lists of what there is to choose from."""
 
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -13,7 +13,7 @@ from optid.cli.fitting import fit, identify, validate
 from optid.cli.monitoring import monitor
 from optid.cli.options import register
 from optid.cli.studies import study
-from optid.cli.terminal import Command, Group, Waiting, say
+from optid.cli.terminal import Command, Group, Waiting, output, say
 
 app = typer.Typer(
     cls=Group,
@@ -71,11 +71,12 @@ def examples() -> None:
     _show(listings.examples, "loading the examples")
 
 
-def _show(listing: Callable[[], Callable[[], None]], doing: str) -> None:
+def _show(listing: Callable[[], list[Any]], doing: str) -> None:
     with Waiting() as waiting:
         waiting.step(doing)
-        show = listing()
-    show()
+        found = listing()
+    for part in found:
+        output().print(part)
 
 
 register(app, fit, FittingCommand)

@@ -10,6 +10,7 @@ import typer
 from rich.text import Text
 
 from optid.cli.derived import DEFAULT
+from optid.cli.options import File, Paths, Words
 from optid.cli.results import check_folders, check_names, command_line
 from optid.cli.studies import NOTHING_SOLVED, Workers, follow_progress
 from optid.cli.terminal import new_table, note, output, say
@@ -22,11 +23,10 @@ ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
 
 
 def compare(
-    data: list[Path] | None = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
-    constraint: list[str] | None = None, settings: list[str] | None = None, solvers: list[str] | None = None,
-    accuracy: float = 1e-8, time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3,
-    holdout: float = 0.3, seed: int = 0, db: Path | None = None, workers: Workers = 1,
-    accept_changed_data: bool = False, report: Path | None = None,
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
+    constraint: Words = None, settings: Words = None, solvers: Words = None, accuracy: float = 1e-8,
+    time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3, seed: int = 0,
+    db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None,
 ) -> None:
     """Compare solvers on one record at equal verified accuracy, and say which to use.
 

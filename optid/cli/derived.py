@@ -2,19 +2,17 @@
 
 import inspect
 import json
-import re
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
 
-from optid.cli.options import option_of
+from optid.cli.options import descriptions, option_of
 from optid.cli.terminal import Command
-from optid.descriptions import Description, describe
+from optid.descriptions import describe
 from optid.errors import LookupFailed
-from optid.registry import FORMULATIONS, entry_point, registered
+from optid.registry import FORMULATIONS, entry_point
 
 DEFAULT = "hammerstein_arx.exact"
 
@@ -101,13 +99,6 @@ def options_of_others(taken: set[str]) -> list[Any]:
     return _options(parameters)
 
 
-def descriptions() -> Iterator[tuple[str, Description]]:
-    """Yield the name and the description of every formulation that can be loaded."""
-    for name, point in sorted(registered(FORMULATIONS).items()):
-        with suppress(ImportError):  # a broken plug-in takes nothing away
-            yield name, describe(point)
-
-
 def _parameter(key: str, text: str, more: str, panel: str, flag: bool = False) -> inspect.Parameter:
     word = option_of(key)
     option = typer.Option(
@@ -142,20 +133,6 @@ def unknown(name: str, option: str) -> str:
         return f"there is no option {option}, and {error}"
     others = f" Formulations that do: {', '.join(having)}." if having else ""
     return f"formulation {name} takes no {option}; its own options are {takes}.{others}"
-
-
-def in_options(text: str) -> str:
-    """Write a message about arguments of Python with the options of the command."""
-    known = {"solver", "accuracy", "time_limit"}.union(*(found.options for _, found in descriptions()))
-    word = "|".join(sorted(known, key=len, reverse=True))
-
-    def several(match: re.Match[str]) -> str:
-        return match[1] + ", ".join(option_of(one) for one in match[2].split(", ") if one != "constraints")
-
-    text = re.sub(rf"(takes no )argument '({word})'(?=\.)", lambda m: m[1] + option_of(m[2]), text)
-    text = re.sub(rf"( needs |Known: )((?:{word})(?:, (?:{word}))*)(?=$|\.)", several, text)
-    text = re.sub(rf"(?<![\w.-])({word})=(?=['\w\[(.-])", lambda m: option_of(m[1]) + " ", text)
-    return re.sub(rf"^({word})(?=,| must| is )", lambda m: option_of(m[1]), text)
 
 
 def _json(words: Any) -> str:

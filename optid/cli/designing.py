@@ -1,17 +1,16 @@
 """The commands before a fit: an excitation for the plant of a record, and the order that a record asks for."""
 
-from pathlib import Path
 from typing import Any
 
+from optid.cli.options import File, Paths, Words
 from optid.cli.results import working
 
 
 def design(
-    like: list[str] | None = None, example: str | None = None, *, how: dict[str, Any], kind: str = "multisine",
+    like: Words = None, example: str | None = None, *, how: dict[str, Any], kind: str = "multisine",
     samples: int | None = None, levels: int | None = None, band: list[float] | None = None,
     amplitude: list[float] | None = None, shaped: bool = False, hold: int = 5, periods: int = 1, candidates: int = 8,
-    seed: int = 0, basis: list[str] | None = None, feedback_basis: list[str] | None = None, rows: int = 10,
-    output: Path | None = None,
+    seed: int = 0, basis: Words = None, feedback_basis: Words = None, rows: int = 10, output: File = None,
 ) -> None:
     """Design an excitation for the plant of a record, with a promise about the expanded regressor.
 
@@ -61,10 +60,9 @@ def design(
 
 
 def order(
-    data: list[Path] | None = None, example: str | None = None, *, how: dict[str, Any], basis: list[str] | None = None,
-    feedback_basis: list[str] | None = None, block_rows: int | None = None, nx: int | None = None, na: int = 8,
-    nb: int = 6, nk: int = 8, holdout: float = 0.3, level: float | None = None, seed: int = 0,
-    picture: Path | None = None,
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], basis: Words = None,
+    feedback_basis: Words = None, block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6,
+    nk: int = 8, holdout: float = 0.3, level: float | None = None, seed: int = 0, picture: File = None,
 ) -> None:
     """Find the order of a record: singular values, thresholds, criteria, a recommendation with its reasons.
 

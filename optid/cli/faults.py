@@ -3,13 +3,16 @@
 from pathlib import Path
 from typing import Any
 
+from optid.cli.options import File, Paths, Words
 from optid.cli.results import command_line, working
+
+ZERO = "INPUT=VALUE, the input at which the actuator does nothing"
 
 
 def isolability(
     model: Path, window: int = 100, onset: str = "unknown", prob: float = 0.95, false_alarm: float = 0.01,
-    kinds: list[str] | None = None, load: list[str] | None = None, disturbance: list[str] | None = None,
-    state_jump: bool = True, draws: int = 1000, seed: int = 0, picture: Path | None = None,
+    kinds: Words = None, load: Words = None, disturbance: Words = None, state_jump: bool = True, draws: int = 1000,
+    seed: int = 0, picture: File = None,
 ) -> None:
     """Find how large every fault must be to be noticed, and to be told from the others; no data are needed.
 
@@ -45,12 +48,11 @@ def isolability(
 
 
 def diagnose(
-    model: Path, data: list[Path] | None = None, *, example: str | None = None, how: dict[str, Any],
-    healthy: list[Path] | None = None, identified: list[Path] | None = None, rescale: bool = False,
-    kinds: list[str] | None = None, load: list[str] | None = None, disturbance: list[str] | None = None,
-    zero: list[str] | None = None, state_jump: bool = True, max_faults: int = 1, false_alarm: float = 0.01,
-    coverage: float = 0.95, robust: bool = False, method: str = "exact", solver: str = "auto", seed: int = 0,
-    out: Path | None = None, report: Path | None = None, picture: Path | None = None,
+    model: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any], healthy: Paths = None,
+    identified: Paths = None, rescale: bool = False, kinds: Words = None, load: Words = None,
+    disturbance: Words = None, zero: Words = None, state_jump: bool = True, max_faults: int = 1,
+    false_alarm: float = 0.01, coverage: float = 0.95, robust: bool = False, method: str = "exact",
+    solver: str = "auto", seed: int = 0, out: File = None, report: File = None, picture: File = None,
 ) -> None:
     """Find out whether a record is healthy, and if not, what broke, when, and how much of it.
 
@@ -96,7 +98,8 @@ def diagnose(
         work.step("signatures")
         found = dictionary(
             plant, kinds=words.listed(kinds) or list(KINDS), process=words.directions(load, "--process", plant),
-            state_jump=state_jump, disturbances=words.listed(disturbance) or (), zeros=words.zeros(zero),
+            state_jump=state_jump, disturbances=words.listed(disturbance) or (),
+            zeros=words.pairs(words.listed(zero), "--zero", ZERO, float),
         )
         work.step("searching")
         uncertainty: Any = "ignore"
@@ -139,10 +142,10 @@ def _origin(identified: list[Path] | None, how: dict[str, Any]) -> Any:
 
 
 def reformulate(
-    model: Path, diagnosis: Path, data: list[Path] | None = None, *, example: str | None = None, how: dict[str, Any],
-    constraint: list[str] | None = None, stage: str = "auto", nodes: int = 7, low: list[str] | None = None,
-    high: list[str] | None = None, target: list[str] | None = None, if_ambiguous: str = "auto", solver: str = "auto",
-    seed: int = 0, saved: Path | None = None, report: Path | None = None, picture: Path | None = None,
+    model: Path, diagnosis: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any],
+    constraint: Words = None, stage: str = "auto", nodes: int = 7, low: Words = None, high: Words = None,
+    target: Words = None, if_ambiguous: str = "auto", solver: str = "auto", seed: int = 0, saved: File = None,
+    report: File = None, picture: File = None,
 ) -> None:
     """Turn a healthy model and a diagnosis into the damaged system: its model, what observes it, what it can still do.
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.cli.derived import DEFAULT
+from optid.cli.options import File, Paths, Words
 from optid.cli.results import Work, check_names, command_line, working
 from optid.lazy import import_cvxpy
 
@@ -12,14 +13,13 @@ BUDGET = 60.0
 
 
 def fit(
-    data: list[Path] | None = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
-    scheduler: str | None = None, split: float | None = None, test: list[str] | None = None,
-    formulation: str = DEFAULT, na: int | None = None, nb: list[str] | None = None, nk: list[str] | None = None,
-    basis: list[str] | None = None, constraint: list[str] | None = None, loss: str | None = None,
-    ridge: float | None = None, curvature: float | None = None, holdout: str | None = None, gauge: str | None = None,
-    settings: list[str] | None = None, solver: str = "auto", accuracy: float = 1e-8, time_limit: float | None = None,
-    prove: bool = True, option: list[str] | None = None, seed: int = 0, report: Path | None = None,
-    saved: Path | None = None,
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
+    scheduler: str | None = None, split: float | None = None, test: Words = None, formulation: str = DEFAULT,
+    na: int | None = None, nb: Words = None, nk: Words = None, basis: Words = None, constraint: Words = None,
+    loss: str | None = None, ridge: float | None = None, curvature: float | None = None, holdout: str | None = None,
+    gauge: str | None = None, settings: Words = None, solver: str = "auto", accuracy: float = 1e-8,
+    time_limit: float | None = None, prove: bool = True, option: Words = None, seed: int = 0, report: File = None,
+    saved: File = None,
 ) -> None:
     """Fit a model to a record, prove it optimal, and report it; without orders, search for them as optid identify does.
 
@@ -93,10 +93,10 @@ def fit(
 
 
 def identify(
-    data: list[Path] | None = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
-    horizon: int | None = None, classes: list[str] | None = None, constraint: list[str] | None = None,
-    solver: str = "auto", workers: int | None = None, split: float | None = None, test: list[str] | None = None,
-    seed: int = 0, report: Path | None = None, saved: Path | None = None,
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
+    horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
+    workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0, report: File = None,
+    saved: File = None,
 ) -> None:
     """Find the structure of a record by cross-validation, and fit it: formulation, delay, orders, functions.
 
@@ -118,8 +118,8 @@ def identify(
 
 
 def _search(
-    data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: list[str] | None,
-    constraint: list[str] | None, solver: str, saved: Path | None, report: Path | None, **settings: Any,
+    data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
+    constraint: Words, solver: str, saved: File, report: File, **settings: Any,
 ) -> None:
     check_names(constraint, solver)
     with working(model=saved, report=report) as work:
@@ -151,7 +151,7 @@ def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, what: str
         found.model.save(saved)
 
 
-def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: Path | None = None) -> None:
+def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:
     """Validate saved models on another record: fits, residual tests; several models side by side.
 
     Inputs, outputs and sampling time are those of the first model where they are not given.

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from optid.cli.options import READING
+from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
 
@@ -22,13 +22,12 @@ KEPT = 10_000
 
 
 def monitor(
-    model: Path, follow: Path | None = None, until_end: bool = False, inputs: list[str] | None = None,
-    outputs: list[str] | None = None, dt: float | None = None, time: str | None = None,
-    columns: list[str] | None = None, delimiter: str = ",", decimal: str = ".", fill_gaps: int | None = None,
-    strict: bool = False, kinds: list[str] | None = None, load: list[str] | None = None, state_jump: bool = True,
-    arl0: float | None = None, window: int = 100, identified: list[Path] | None = None,
-    healthy: list[Path] | None = None, thresholds: Path | None = None, extrapolate: bool = False, seed: int = 0,
-    state: Path | None = None, lines: bool = False,
+    model: Path, follow: File = None, until_end: bool = False, inputs: Words = None, outputs: Words = None,
+    dt: float | None = None, time: str | None = None, columns: Words = None, delimiter: str = ",", decimal: str = ".",
+    fill_gaps: int | None = None, strict: bool = False, kinds: Words = None, load: Words = None,
+    state_jump: bool = True, arl0: float | None = None, window: int = 100, identified: Paths = None,
+    healthy: Paths = None, thresholds: File = None, extrapolate: bool = False, seed: int = 0, state: File = None,
+    lines: bool = False,
 ) -> None:
     """Watch a stream: one line for every alarm, every fault that is named, and everything that is over.
 

@@ -8,10 +8,19 @@ parameter, or has a letter besides. What several commands share is described onc
 import functools
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Any, get_origin
 
 import typer
+
+from optid.descriptions import Description, describe
+from optid.registry import FORMULATIONS, registered
+
+Words = list[str] | None
+Paths = list[Path] | None
+File = Path | None
 
 SHARED = """
 Files:
@@ -45,12 +54,12 @@ The result:
 """
 
 READING: dict[str, tuple[Any, Any]] = {
-    "inputs": (list[str] | None, None),
-    "outputs": (list[str] | None, None),
+    "inputs": (Words, None),
+    "outputs": (Words, None),
     "dt": (float | None, None),
     "time": (str | None, None),
     "experiment": (str | None, None),
-    "columns": (list[str] | None, None),
+    "columns": (Words, None),
     "delimiter": (str, ","),
     "decimal": (str, "."),
 }
@@ -76,7 +85,8 @@ def register(app: typer.Typer, function: Callable[..., None], kind: Any) -> None
 
     @functools.wraps(function)
     def run(**given: Any) -> None:
-        function(**given, **({"how": {key: given.pop(key) for key in READING}} if reads else {}))
+        how = {"how": {key: given.pop(key) for key in READING}} if reads else {}
+        function(**how, **given)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
@@ -100,6 +110,27 @@ def described(text: str) -> tuple[str, dict[str, tuple[str, str, str]]]:
 def option_of(argument: str) -> str:
     """Return the option word of an argument."""
     return "--" + argument.replace("_", "-")
+
+
+def descriptions() -> Iterator[tuple[str, Description]]:
+    """Yield the name and the description of every formulation that can be loaded."""
+    for name, point in sorted(registered(FORMULATIONS).items()):
+        with suppress(ImportError):  # a broken plug-in takes nothing away
+            yield name, describe(point)
+
+
+def in_options(text: str) -> str:
+    """Write a message about arguments of Python with the options of the command."""
+    known = {"solver", "accuracy", "time_limit"}.union(*(found.options for _, found in descriptions()))
+    word = "|".join(sorted(known, key=len, reverse=True))
+
+    def several(match: re.Match[str]) -> str:
+        return match[1] + ", ".join(option_of(one) for one in match[2].split(", ") if one != "constraints")
+
+    text = re.sub(rf"(takes no )argument '({word})'(?=\.)", lambda m: m[1] + option_of(m[2]), text)
+    text = re.sub(rf"( needs |Known: )((?:{word})(?:, (?:{word}))*)(?=$|\.)", several, text)
+    text = re.sub(rf"(?<![\w.-])({word})=(?=['\w\[(.-])", lambda m: option_of(m[1]) + " ", text)
+    return re.sub(rf"^({word})(?=,| must| is )", lambda m: option_of(m[1]), text)
 
 
 def _option(parameter: inspect.Parameter, panel: str, words: str, text: str) -> Any:

@@ -1,5 +1,6 @@
 """The commands of studies: run, report, export, systems, schema."""
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,9 +10,9 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
-from optid.cli.options import register
+from optid.cli.options import File, Words, register
 from optid.cli.results import check_folders, command_line
-from optid.cli.terminal import Command, SafeConsole, new_table, output, say
+from optid.cli.terminal import Command, SafeConsole, output, say
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
                     help="Compare formulations and solvers on your data: run a study, report it, export its rows.")
@@ -26,9 +27,9 @@ Workers = Annotated[
 
 
 def run(
-    file: Path | None = None, example: bool = False, db: Path | None = None, workers: Workers = None,
-    scheduler: str | None = None, accept_changed_data: bool = False, retry: list[str] | None = None,
-    export: Path | None = None, dry_run: bool = False,
+    file: File = None, example: bool = False, db: File = None, workers: Workers = None,
+    scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
+    dry_run: bool = False,
 ) -> None:
     """Run a study, or what is left of it; stop it whenever you like, the same command goes on.
 
@@ -73,7 +74,7 @@ def run(
 
 
 def report(
-    db: Path, page: Path | None = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve",
+    db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve",
 ) -> None:
     """Print the verdict of a study, and write its page.
 
@@ -138,30 +139,17 @@ def problems(db: Path, out: Path, title: str | None = None) -> None:
     from optid.studies.problem_set import write_problems
 
     lines = write_problems(db, out, title)
-    kinds: dict[str, int] = {}
-    for line in lines:
-        kinds[line["kind"]] = kinds.get(line["kind"], 0) + 1
+    kinds = Counter(line["kind"] for line in lines)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "none is convex"
     say(f"{len(lines)} problems written to {out} ({listed}); solve_problems.py there solves them without optid")
 
 
 def systems() -> None:
     """List the simulated systems that a study file may name."""
-    from optid.studies.sources.systems import SYSTEMS
+    from optid.cli import listings
 
-    table = new_table("Simulated systems")
-    table.add_column("system", no_wrap=True)
-    table.add_column("samples", justify="right")
-    for column in ("noise", "na", "nb", "nk"):
-        table.add_column(column, justify="right")
-    table.add_column("what it is")
-    for name, system in SYSTEMS.items():
-        orders = (str(system.suggestion.get(key, default)) for key, default in (("na", "-"), ("nb", "-"), ("nk", 0)))
-        table.add_row(Text(name, "bold"), str(system.samples), f"{system.noise:.3g}", *orders, system.about)
-    output().print(table)
-    output().print(Text("samples and noise are those used where a study names none; noise is relative to the "
-                        "noise-free output. na, nb and nk suit the system; with other ones a model may be "
-                        "far from the truth.", "dim"))
+    for part in listings.systems():
+        output().print(part)
 
 
 def schema() -> None:
@@ -222,14 +210,11 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
 def _now(row: dict[str, Any] | None) -> str:
     if row is None:
         return "cells"
-    word = row["status_verified"] or row["outcome"]
-    return f"[dim]{_short(row['formulation'])} · {_short(row['solver'])}: {word}[/]"
-
-
-def _short(text: str) -> str:
     from rich.markup import escape
 
-    return escape(text if len(text) <= 28 else text[:27] + "…")
+    formulation, solver = (escape(text if len(text) <= 28 else text[:27] + "…")
+                           for text in (row["formulation"], row["solver"]))
+    return f"[dim]{formulation} · {solver}: {row['status_verified'] or row['outcome']}[/]"
 
 
 def _plan(described: Any, db: Path, **settings: Any) -> None:
@@ -239,11 +224,7 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
     every, left, former = running.plan(described, db, **settings)
     say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
         f"{len(described.solvers)} solvers; {len(every):,} cells, {len(left):,} of them to run")
-    refusals: dict[str, int] = {}
-    for cell in every:
-        if cell.refusal:
-            refusals[cell.refusal] = refusals.get(cell.refusal, 0) + 1
-    for refusal, count in refusals.items():
+    for refusal, count in Counter(cell.refusal for cell in every if cell.refusal).items():
         say(f"{count:,} cells that cannot be run here: {refusal}")
     if former:
         say(former)

@@ -1,5 +1,6 @@
 """What the commands of studies print about rows: how cells ended, why, and which rows are kept apart."""
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,7 @@ LISTED = 12
 
 
 def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
-    """Print a table of how the cells ended, by solver.
-
-    Args:
-        title: of the table.
-        rows: {column: (rows,) array}.
-    """
+    """Print a table of how the cells ended, by solver; rows are {column: (rows,) array}."""
     table = new_table(title)
     table.add_column("solver", no_wrap=True)
     for column in ("cells", "accuracy reached", "proved", "false claims", "refused"):
@@ -37,11 +33,8 @@ def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
 
 def _others(mine: Mapping[str, Any]) -> str:
     """The outcomes, and the statuses of those that ended, that are neither a success nor a refusal."""
-    counts: dict[str, int] = {}
-    for word in _failures(mine):
-        if word and word != REFUSED:
-            counts[word] = counts.get(word, 0) + 1
-    return ", ".join(f"{word} {count:,}" for word, count in sorted(counts.items(), key=lambda item: -item[1])) or "-"
+    counts = Counter(word for word in _failures(mine) if word and word != REFUSED)
+    return ", ".join(f"{word} {count:,}" for word, count in counts.most_common()) or "-"
 
 
 def _failures(rows: Mapping[str, Any]) -> list[str]:
@@ -54,9 +47,6 @@ def print_reasons(rows: Mapping[str, Any]) -> None:
     """Print why cells did not reach their accuracy: every reason once, with its solvers and how often it came.
 
     Sentences that differ in their numbers alone count as one. Refusals come last.
-
-    Args:
-        rows: {column: (rows,) array}.
     """
     from optid.studies.verdicts.choice import listed
     from optid.studies.verdicts.verdict import without_numbers
@@ -76,11 +66,7 @@ def print_reasons(rows: Mapping[str, Any]) -> None:
 
 
 def print_models(verdict: Any) -> None:
-    """Print the figures of the formulations, where a study of one solver compares them.
-
-    Args:
-        verdict: of the study.
-    """
+    """Print the figures of the formulations, where the study of a verdict compares them with one solver."""
     if len(verdict.overall.standings) != 1 or len(verdict.quality.formulations) < 2:
         return
     from optid.studies.page import quality_table

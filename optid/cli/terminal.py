@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from threading import Timer
-from typing import Any
+from typing import Any, Self
 
 import typer
 from rich import box
@@ -146,7 +146,7 @@ def complain(error: BaseException) -> None:
     """Print one message for an error, on the error stream."""
     text = str(error) or type(error).__name__
     if isinstance(error, OptidError):
-        from optid.cli.derived import in_options
+        from optid.cli.options import in_options
 
         text = in_options(text)
     if exit_code(error) == 1:
@@ -208,7 +208,7 @@ class Waiting:
         """Say what is being done now."""
         self._progress.update(self._task, description=text)
 
-    def __enter__(self) -> "Waiting":
+    def __enter__(self) -> Self:
         self._timer.start()
         return self
 

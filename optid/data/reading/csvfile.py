@@ -126,11 +126,7 @@ class CsvFile:
     def _parsed(self, block: bytes, wanted: Sequence[str], as_text: Set[str], nulls: list[str]) -> Columns | None:
         """Return the columns of whole rows, None where polars refuses a cell or a row has other cells than the header.
 
-        Args:
-            block: rows in which nothing is quoted.
-            wanted: names of columns.
-            as_text: those of them that are not converted.
-            nulls: words besides nothing at all that mean a missing sample.
+        Nothing in the block is quoted; `as_text` are not converted; `nulls` mean a missing sample, as nothing does.
         """
         import polars as pl
 
@@ -206,13 +202,7 @@ class CsvFile:
 
 
 def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal: str) -> CsvFile:
-    """Read the header of a CSV file.
-
-    Args:
-        path: the file.
-        columns: names of the columns when the file has no header row.
-        delimiter: character between cells.
-        decimal: decimal mark.
+    """Read the header of a CSV file; `columns` are the names where it has none.
 
     Raises:
         DataError: empty file, no header, two columns of one name, not UTF-8, a delimiter that cannot be one.

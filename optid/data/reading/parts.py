@@ -45,8 +45,8 @@ class Part:
         Raises:
             DataError: no such file on this machine, or one with another content.
         """
-        for path, *found in self.files:
-            _check_same(path, tuple(found))
+        for path, size, digest in self.files:
+            _check_same(path, (size, digest))
         return self.read(wanted, clock) if self.content is None else self.read(self.content, wanted, clock)
 
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -58,22 +59,14 @@ class Source:
 
 
 def existing(path: Path) -> Path:
-    """Return the path of a file that is there and not empty.
-
-    Raises:
-        DataError: no such file, a folder, or an empty file.
-    """
-    try:
-        is_file = path.is_file()
-    except (OSError, ValueError):  # a name too long, or with a null character
-        is_file = False
-    if not is_file:
-        try:
-            near = sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:5] if path.parent.is_dir() else []
-        except (OSError, ValueError):
-            near = []
+    """Return the path of a file that is there and not empty (else a `DataError`)."""
+    size, near = -1, []
+    with suppress(OSError, ValueError):  # a name too long, or with a null character
+        size = path.stat().st_size if path.is_file() else -1
+        near = [] if size >= 0 else sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:5]
+    if size < 0:
         raise DataError(f"no file {str(path)!r}." + (f" There: {', '.join(near)}." if near else ""))
-    if path.stat().st_size == 0:
+    if size == 0:
         raise DataError(f"{path.name} is empty (0 bytes).")
     return path
 
@@ -82,13 +75,7 @@ def existing(path: Path) -> Path:
 
 
 def open_table(source: Any, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
-    """Open a file, a frame, a dictionary of arrays or an array.
-
-    Args:
-        source: as of `optid.data.readers.read`, one of them.
-        columns: names of the columns of a source that has none (npy, array, CSV without a header).
-        delimiter: character between the cells of a CSV file.
-        decimal: decimal mark of a CSV file.
+    """Open a file, a frame, a dictionary of arrays or an array; arguments as of `optid.data.readers.read`.
 
     Raises:
         DataError: no such file, unknown format, a file that cannot be read, or a missing extra with its pip line.
@@ -163,12 +150,7 @@ def is_dask(thing: Any) -> bool:
 def open_source(source: Any, chunk: int, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Source:
     """Open a file, a folder of Parquet files, a mapping {channel: npy file or Dask array} or a Dask collection.
 
-    Args:
-        source: as of `optid.data.streams.open_stream`, one of them.
-        chunk: samples of a block.
-        columns: as in `open_table`.
-        delimiter: as in `open_table`.
-        decimal: as in `open_table`.
+    Arguments as of `optid.data.streams.open_stream`.
 
     Raises:
         DataError: no such file, unknown format, a file that cannot be read, or a missing extra with its pip line.
