@@ -10,6 +10,7 @@ from refusals import refused
 from scipy.io import savemat
 
 import optid
+from optid.data.channels import Transform
 from optid.data.readers import open_stream, read
 from optid.data.reading import csvfile
 from optid.data.record import Data
@@ -399,6 +400,16 @@ def test_ranges_take_one_pass(long_record):
     for name in ("u1", "y"):
         (folder / f"{name}.npy").unlink()
     assert stream.ranges()[0][0] < 0
+
+
+def test_ranges_are_in_the_units_of_the_stream(long_record):
+    folder, _ = long_record
+    stream = open_stream([folder / "r.csv", folder / "r.parquet"])
+    assert stream.lengths == (1000, 1000)
+    for one in (stream, open_stream(folder / "r.csv")):
+        lo, hi = one.ranges()
+        units = Transform((2.0, 4.0), (1.0, 0.0), (1.0,), (0.0,))
+        np.testing.assert_allclose(one.in_units(units).ranges(), [(lo - [1, 0]) / [2, 4], (hi - [1, 0]) / [2, 4]])
 
 
 def test_stream_keeps_integers_and_finds_bad_samples(tmp_path):

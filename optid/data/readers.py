@@ -18,20 +18,12 @@ from optid.errors import DataError
 
 __all__ = ["Stream", "open_stream", "read"]
 
+
 def read(
-    source: Any,
-    inputs: Wanted = None,
-    outputs: Wanted = None,
-    dt: float | None = None,
-    time: str | int | bool | None = None,
-    experiment: str | int | None = None,
-    *,
-    columns: Sequence[str] | None = None,
-    input_units: str | Sequence[str] | None = None,
-    output_units: str | Sequence[str] | None = None,
-    name: str | None = None,
-    delimiter: str = ",",
-    decimal: str = ".",
+    source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None,
+    time: str | int | bool | None = None, experiment: str | int | None = None, *,
+    columns: Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
+    output_units: str | Sequence[str] | None = None, name: str | None = None, delimiter: str = ",", decimal: str = ".",
     time_tolerance: float = TIME_TOLERANCE,
 ) -> Data:
     """Read a record; blank, NaN and NA cells are missing samples.

@@ -96,21 +96,8 @@ class Stream(Ports):
             found.__dict__["_survey"] = self._survey
         return found
 
-    def first_chunk(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (u, y) of the first chunk in which every output has a sample; of the last one where none has."""
-        found = np.empty((0, self.m)), np.empty((0, self.l))
-        for u, y, _ in self._channels.read(next(self._sources())):
-            found = u, y
-            if not np.isnan(y).all(axis=0).any():
-                break
-        return found
-
-    def reduced(
-        self,
-        leaf: Callable[[Part, Iterable[Chunk]], Result],
-        merge: Callable[[Sequence[Result]], Result],
-        threads: int = 1,
-    ) -> Result:
+    def reduced(self, leaf: Callable[[Part, Iterable[Chunk]], Result], merge: Callable[[Sequence[Result]], Result],
+                threads: int = 1) -> Result:
         """Reduce the parts, each with its chunks, where they are read; see `optid.data.reduction.reduced`."""
         return reduced(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
 
@@ -154,20 +141,10 @@ class Stream(Ports):
 
 
 def open_stream(  # noqa: D417 - the others stand with `read`
-    source: Any,
-    inputs: Wanted = None,
-    outputs: Wanted = None,
-    dt: float | None = None,
-    chunk: int = CHUNK,
-    *,
-    time: str | int | bool | None = None,
-    columns: Sequence[str] | None = None,
-    input_units: str | Sequence[str] | None = None,
-    output_units: str | Sequence[str] | None = None,
-    name: str | None = None,
-    delimiter: str = ",",
-    decimal: str = ".",
-    time_tolerance: float = TIME_TOLERANCE,
+    source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None, chunk: int = CHUNK, *,
+    time: str | int | bool | None = None, columns: Sequence[str] | None = None,
+    input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
+    name: str | None = None, delimiter: str = ",", decimal: str = ".", time_tolerance: float = TIME_TOLERANCE,
     scheduler: Any = None,
 ) -> Stream:
     """Open a record that need not fit into memory; nothing but headers is read yet.
@@ -221,13 +198,9 @@ def open_stream(  # noqa: D417 - the others stand with `read`
     lengths = [one.n_samples for one in opened]
     label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
     return Stream(
-        **names,
-        dt=step,
-        name=label if name is None else name,
+        **names, dt=step, name=label if name is None else name,
         n_samples=None if None in lengths else sum(n for n in lengths if n is not None),
-        _channels=Channels(ins, outs, clock, step, time_tolerance),
-        _whole=opened[0].whole,
-        parts=tuple(parts),
+        _channels=Channels(ins, outs, clock, step, time_tolerance), _whole=opened[0].whole, parts=tuple(parts),
         scheduler=scheduler,
     )
 
