@@ -96,6 +96,15 @@ class Stream(Ports):
             found.__dict__["_survey"] = self._survey
         return found
 
+    def first_chunk(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (u, y) of the first chunk in which every output has a sample; of the last one where none has."""
+        found = np.empty((0, self.m)), np.empty((0, self.l))
+        for u, y, _ in self._channels.read(next(self._sources())):
+            found = u, y
+            if not np.isnan(y).all(axis=0).any():
+                break
+        return found
+
     def reduced(self, leaf: Callable[[Part, Iterable[Chunk]], Result], merge: Callable[[Sequence[Result]], Result],
                 threads: int = 1) -> Result:
         """Reduce the parts, each with its chunks, where they are read; see `optid.data.reduction.reduced`."""
