@@ -70,12 +70,9 @@ def test_spreading_repeats_the_option_before_each_value(options, before):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ("--in a b data.csv", "--in a --in b data.csv"),
-        ("--in a data.csv --in b", "--in a data.csv --in b"),
-        ("--files a.csv b.csv", "--files a.csv --files b.csv"),
-        ("--in=a b", "--in=a --in b"),
-        ("--in a -- b", "--in a -- b"),
-        ("--in -1.5 -2", "--in -1.5 --in -2"),
+        ("--in a b data.csv", "--in a --in b data.csv"), ("--in a data.csv --in b", "--in a data.csv --in b"),
+        ("--files a.csv b.csv", "--files a.csv --files b.csv"), ("--in=a b", "--in=a --in b"),
+        ("--in a -- b", "--in a -- b"), ("--in -1.5 -2", "--in -1.5 --in -2"),
     ],
 )
 def test_spreading_stops_where_the_list_ends(words, expected):
@@ -104,42 +101,16 @@ def test_several_values_by_spaces_commas_and_repetition_are_the_same(csv, tmp_pa
 
 def test_the_command_line_and_python_give_the_same_model(csv, tmp_path):
     result = run(
-        "fit",
-        csv,
-        "--dt",
-        0.5,
-        "--na",
-        1,
-        "--nb",
-        1,
-        2,
-        "--nk",
-        0,
-        1,
-        "--basis",
-        "polynomial:3",
-        "polynomial:2",
-        "--constraint",
-        "monotone:increasing,channel=u1",
-        "--gauge",
-        "b0",
-        "--ridge",
-        1e-3,
-        "--model",
+        "fit", csv, "--dt", 0.5, "--na", 1, "--nb", 1, 2, "--nk", 0, 1, "--basis", "polynomial:3", "polynomial:2",
+        "--constraint", "monotone:increasing,channel=u1", "--gauge", "b0", "--ridge", 1e-3, "--model",
         tmp_path / "m.json",
     )
     assert result.exit_code == 0, result.output
     from formulations.constraints import shape
 
     fit = optid.fit(
-        optid.read(csv, dt=0.5),
-        na=1,
-        nb=[1, 2],
-        nk=[0, 1],
-        basis=["polynomial:3", "polynomial:2"],
-        constraints=[shape.monotone("increasing", channel="u1")],
-        gauge="b0",
-        ridge=1e-3,
+        optid.read(csv, dt=0.5), na=1, nb=[1, 2], nk=[0, 1], basis=["polynomial:3", "polynomial:2"],
+        constraints=[shape.monotone("increasing", channel="u1")], gauge="b0", ridge=1e-3,
     )
     loaded = optid.load(tmp_path / "m.json")
     assert np.array_equal(loaded.a, fit.model.a) and loaded.dt == 0.5
@@ -324,11 +295,8 @@ def bad(folder: Path, kind: str) -> list[object]:
     rng = np.random.default_rng(0)
     u, y = rng.uniform(-1, 1, 100), rng.standard_normal(100)
     spoiled = {
-        "infinite": (np.where(np.arange(100) == 7, np.inf, u), y),
-        "constant": (np.ones(100), y),
-        "binary": (np.sign(u), y),
-        "levels": (np.round(u), y),
-        "short": (u[:6], y[:6]),
+        "infinite": (np.where(np.arange(100) == 7, np.inf, u), y), "constant": (np.ones(100), y),
+        "binary": (np.sign(u), y), "levels": (np.round(u), y), "short": (u[:6], y[:6]),
     }
     if kind in spoiled:
         return ["fit", table(folder / "bad.csv", u=spoiled[kind][0], y=spoiled[kind][1]), *ORDERS]
@@ -339,10 +307,8 @@ def bad(folder: Path, kind: str) -> list[object]:
     time[50:] += 0.5
     stamped = table(folder / "stamped.csv", time=time, u=u, y=y)
     return {
-        "empty": ["fit", folder / "empty.csv", *ORDERS],
-        "no file": ["fit", folder / "nothing.csv", *ORDERS],
-        "no data": ["fit", *ORDERS],
-        "column": ["fit", good, "--inputs", "v", *ORDERS],
+        "empty": ["fit", folder / "empty.csv", *ORDERS], "no file": ["fit", folder / "nothing.csv", *ORDERS],
+        "no data": ["fit", *ORDERS], "column": ["fit", good, "--inputs", "v", *ORDERS],
         "stamps": ["fit", stamped, *ORDERS],
         "formulation": ["fit", good, *ORDERS, "--formulation", "hammerstein_arx.exakt"],
         "solver": ["fit", good, *ORDERS, "--solver", "clarabell"],
@@ -350,8 +316,7 @@ def bad(folder: Path, kind: str) -> list[object]:
         "example": ["fit", "--example", "thrster"],
         "basis": ["fit", good, "--na", 1, "--nb", 2, "--basis", "triangle:5"],
         "order": ["fit", good, "--na", 1, "--nb", "two", "--basis", "triangular:5"],
-        "missing order": ["fit", good, "--na", 1],
-        "refused solver": ["fit", good, *ORDERS, "--solver", "osqp"],
+        "missing order": ["fit", good, "--na", 1], "refused solver": ["fit", good, *ORDERS, "--solver", "osqp"],
         "truncated model": ["validate", folder / "model.json", good],
         "no folder": ["fit", good, *ORDERS, "--report", folder / "nowhere" / "r.html"],
         "contradiction": ["fit", good, *ORDERS, "--constraint", "coefficients:a,low=0.5", "stable:0.3"],
@@ -363,28 +328,18 @@ def bad(folder: Path, kind: str) -> list[object]:
 @pytest.mark.parametrize(
     ("kind", "code", "words"),
     [
-        ("infinite", 2, ["bad.csv", "'u'", "7"]),
-        ("constant", 2, ["'u'", "constant", "excite"]),
-        ("binary", 2, ["'u'", "binary", "arx"]),
-        ("levels", 2, ["'u'", "levels", "basis"]),
-        ("short", 2, ["rows"]),
-        ("empty", 2, ["empty.csv"]),
-        ("no file", 2, ["nothing.csv"]),
-        ("no data", 2, ["--example"]),
-        ("column", 2, ["no column 'v'"]),
-        ("stamps", 2, ["stamped.csv", "50"]),
+        ("infinite", 2, ["bad.csv", "'u'", "7"]), ("constant", 2, ["'u'", "constant", "excite"]),
+        ("binary", 2, ["'u'", "binary", "arx"]), ("levels", 2, ["'u'", "levels", "basis"]), ("short", 2, ["rows"]),
+        ("empty", 2, ["empty.csv"]), ("no file", 2, ["nothing.csv"]), ("no data", 2, ["--example"]),
+        ("column", 2, ["no column 'v'"]), ("stamps", 2, ["stamped.csv", "50"]),
         ("formulation", 2, ["'hammerstein_arx.exakt'", "Did you mean 'hammerstein_arx.exact'?"]),
         ("solver", 2, ["'clarabell'", "Did you mean 'clarabel'?"]),
         ("constraint", 2, ["'monoton'", "Did you mean 'monotone'?"]),
         ("example", 2, ["'thrster'", "Did you mean 'thruster'?"]),
-        ("basis", 2, ["'triangle'", "Did you mean 'triangular'?"]),
-        ("order", 2, ["--nb two", "whole number"]),
-        ("missing order", 2, ["needs --nb, --basis"]),
-        ("refused solver", 2, ["osqp", "not convex", "gauss_newton"]),
-        ("truncated model", 2, ["model.json", "truncated"]),
-        ("no folder", 2, ["nowhere"]),
-        ("contradiction", 3, ["contradict"]),
-        ("not installed", 4, ["pip install"]),
+        ("basis", 2, ["'triangle'", "Did you mean 'triangular'?"]), ("order", 2, ["--nb two", "whole number"]),
+        ("missing order", 2, ["needs --nb, --basis"]), ("refused solver", 2, ["osqp", "not convex", "gauss_newton"]),
+        ("truncated model", 2, ["model.json", "truncated"]), ("no folder", 2, ["nowhere"]),
+        ("contradiction", 3, ["contradict"]), ("not installed", 4, ["pip install"]),
         ("pair", 2, ["--set weight", "key=value"]),
     ],
 )

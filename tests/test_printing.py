@@ -18,13 +18,8 @@ def rows(text: str, title: str) -> dict[str, list[str]]:
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: example_fit("thruster"),
-        lambda: example_fit("two_inputs"),
-        mimo_fit,
-        linear_fit,
-        feedback_fit,
-        output_error_fit,
-        lambda: example_fit("dead_zone", "hammerstein_arx.nuclear", weight=0.5),
+        lambda: example_fit("thruster"), lambda: example_fit("two_inputs"), mimo_fit, linear_fit, feedback_fit,
+        output_error_fit, lambda: example_fit("dead_zone", "hammerstein_arx.nuclear", weight=0.5),
     ],
 )
 def test_no_line_is_wider_than_80_columns(make):
@@ -45,13 +40,8 @@ def test_parameters_are_those_of_the_model_to_the_digits_of_their_errors():
     table = rows(describe(fit), "Parameters")
     a, b = fit.model.a, fit.model.b
     expected = {
-        "a1": a[0],
-        "a2": a[1],
-        "b0[valve]": b[0][0],
-        "b1[valve]": b[0][1],
-        "b0[heater]": b[1][0],
-        "b1[heater]": b[1][1],
-        "offset": fit.model.offset[0],
+        "a1": a[0], "a2": a[1], "b0[valve]": b[0][0], "b1[valve]": b[0][1], "b0[heater]": b[1][0],
+        "b1[heater]": b[1][1], "offset": fit.model.offset[0],
     }
     assert list(table) == list(expected)
     for name, value in expected.items():
@@ -116,11 +106,7 @@ def test_findings_of_the_examination_are_printed():
 def test_a_fit_without_a_point_is_described():
     data = example_fit("dead_zone").data
     fit = optid.fit(
-        data,
-        na=2,
-        nb=2,
-        basis="triangular:8",
-        raises=False,
+        data, na=2, nb=2, basis="triangular:8", raises=False,
         constraints=[lambda v: {"low": v["a"][0] <= -1}, lambda v: {"high": v["a"][0] >= 1}],
     )
     text = describe(fit)

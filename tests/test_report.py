@@ -9,7 +9,7 @@ from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, two_by_
 
 import optid
 from optid import report
-from optid.show.page import _extremes
+from optid.show.sections import extremes
 
 
 class Page(HTMLParser):
@@ -48,10 +48,8 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def pages() -> dict[str, str]:
     return {
-        "thruster": report.render(example_fit("thruster")),
-        "mimo": report.render(mimo_fit(), two_by_two(seed=5)),
-        "linear": report.render(linear_fit()),
-        "feedback": report.render(feedback_fit()),
+        "thruster": report.render(example_fit("thruster")), "mimo": report.render(mimo_fit(), two_by_two(seed=5)),
+        "linear": report.render(linear_fit()), "feedback": report.render(feedback_fit()),
     }
 
 
@@ -78,27 +76,14 @@ def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):
     fit, page = example_fit("thruster"), Page(pages["thruster"])
     text = page.text.replace("\N{NO-BREAK SPACE}", " ")
     for words in (
-        "Solution: optimal (proved)",
-        f"{fit.one_step_fit[0]:.2f} %",
-        f"{fit.simulation_fit[0]:.2f} %",
-        "monotone:increasing",
-        fit.model.equation(),
-        "optid.fit(data, 'hammerstein_arx.exact', na=2",
-        optid.__version__,
-        str(fit),
+        "Solution: optimal (proved)", f"{fit.one_step_fit[0]:.2f} %", f"{fit.simulation_fit[0]:.2f} %",
+        "monotone:increasing", fit.model.equation(), "optid.fit(data, 'hammerstein_arx.exact', na=2",
+        optid.__version__, str(fit),
     ):
         assert words in text
     sections = {value for tag, name, value in page.attributes if tag == "section" and name == "id"}
     assert sections == {
-        "trust",
-        "optimum",
-        "model",
-        "figures",
-        "constraints",
-        "certificate",
-        "validation",
-        "data",
-        "solver",
+        "trust", "optimum", "model", "figures", "constraints", "certificate", "validation", "data", "solver",
         "reproduce",
     }
     charts = json.loads(re.search(r'id="charts-data">(.*?)</script>', pages["thruster"], re.DOTALL)[1])
@@ -139,11 +124,7 @@ def test_write_returns_the_path(tmp_path):
 
 def test_a_fit_without_a_model_is_refused():
     fit = optid.fit(
-        example_fit("dead_zone").data,
-        na=2,
-        nb=2,
-        basis="triangular:8",
-        raises=False,
+        example_fit("dead_zone").data, na=2, nb=2, basis="triangular:8", raises=False,
         constraints=[lambda v: {"low": v["a"][0] <= -1, "high": v["a"][0] >= 1}],
     )
     with pytest.raises(optid.errors.DataError, match="infeasible"):
@@ -161,5 +142,5 @@ def test_long_curves_keep_their_peaks():
     values = np.sin(np.arange(1e5) / 500)
     values[[12_345, 54_321]] = 7.0, -9.0
     values[70_000:70_010] = np.nan
-    kept = _extremes(values, 1000)
+    kept = extremes(values, 1000)
     assert kept.size <= 2020 and {12_345, 54_321} <= set(kept) and np.isnan(values[kept]).any()

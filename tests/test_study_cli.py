@@ -338,12 +338,12 @@ def test_what_a_new_user_gets_wrong(folder, words, told):
 
 
 def test_a_place_that_takes_no_files_is_told_before_any_work(folder, monkeypatch):
-    from optid.cli import arguments
+    from optid.cli import results
 
-    monkeypatch.setattr(arguments.os, "access", lambda path, mode: Path(path) == folder / "rig.csv")
+    monkeypatch.setattr(results.os, "access", lambda path, mode: Path(path) == folder / "rig.csv")
     told = run("study", "report", "none.sqlite", "-o", "page.html").stderr
     assert f"page.html cannot be written: folder {folder} is read-only here; give a file in another folder" in told
-    arguments.check_folders(folder / "rig.csv")
+    results.check_folders(folder / "rig.csv")
 
 
 def test_names_from_files_reach_the_terminal_without_their_control_characters(capfd):

@@ -32,15 +32,12 @@ def poles(r, s):
 
 
 CASES = {
-    "arx": ("arx", ARX, gain),
-    "exact": ("hammerstein_arx.exact", ARX | HATS, curve),
+    "arx": ("arx", ARX, gain), "exact": ("hammerstein_arx.exact", ARX | HATS, curve),
     "exact, linear input": ("hammerstein_arx.exact", ARX | {"basis": "linear"}, gain),
     "overparametrised": ("hammerstein_arx.overparametrised", ARX | HATS, curve),
-    "huber": ("hammerstein_arx.exact", ARX | CUBIC | {"loss": "huber"}, curve),
-    "oe": ("oe.exact", ARX, gain),
+    "huber": ("hammerstein_arx.exact", ARX | CUBIC | {"loss": "huber"}, curve), "oe": ("oe.exact", ARX, gain),
     "hammerstein oe": ("hammerstein_oe.exact", ARX | CUBIC, curve),
-    "shooting": ("hammerstein_oe.shooting", ARX | CUBIC, curve),
-    "armax": ("armax.exact", ARX | {"nc": 2}, gain),
+    "shooting": ("hammerstein_oe.shooting", ARX | CUBIC, curve), "armax": ("armax.exact", ARX | {"nc": 2}, gain),
     "hammerstein armax": ("hammerstein_armax.exact", ARX | CUBIC | {"nc": 2}, curve),
     "bj": ("bj.exact", ARX | {"nc": 1, "nd": 1}, gain),
     "hammerstein bj": ("hammerstein_bj.exact", ARX | CUBIC | {"nc": 1, "nd": 1}, curve),
@@ -49,8 +46,7 @@ CASES = {
     "sid": ("hammerstein_ss.sid", STATES | CUBIC, curve),
     "sivid": ("hammerstein_ss.sivid", STATES | {"basis": "linear", "feedback_basis": "polynomial:2"}, None),
     "asivid": ("hammerstein_ss.asivid", STATES | CUBIC | {"feedback_basis": "polynomial:2"}, None),
-    "ss": ("ss.exact", STATES, None),
-    "hammerstein ss": ("hammerstein_ss.exact", STATES | CUBIC, None),
+    "ss": ("ss.exact", STATES, None), "hammerstein ss": ("hammerstein_ss.exact", STATES | CUBIC, None),
     "prediction": ("hammerstein_ss.exact", STATES | CUBIC | {"criterion": "prediction"}, None),
 }
 LOOSE = {

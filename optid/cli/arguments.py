@@ -2,8 +2,7 @@
 
 import inspect
 import json
-import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ def read_record(
 
     Args:
         files: paths; for a stream also of folders of Parquet files.
-        how: options: inputs, outputs and columns (words), dt, time, experiment, delimiter, decimal.
+        how: the options of `optid.cli.options.READING`.
         stream: read chunk by chunk.
         scheduler: address of a Dask scheduler whose workers read them, chunk by chunk.
 
@@ -28,15 +27,7 @@ def read_record(
     """
     from optid.data.readers import open_stream, read
 
-    time = how["time"]
-    options: dict[str, Any] = {
-        **how,
-        "inputs": listed(how["inputs"]),
-        "outputs": listed(how["outputs"]),
-        "columns": listed(how["columns"]),
-        "time": False if time == "none" else time,
-        "delimiter": how["delimiter"].replace("\\t", "\t"),
-    }
+    options = reading(how)
     if not stream and scheduler is None:
         return read([Path(name) for name in files], **options)
     if options.pop("experiment") is not None:
@@ -45,20 +36,29 @@ def read_record(
     return open_stream(paths if len(paths) > 1 else paths[0], scheduler=scheduler, **options)
 
 
+def reading(how: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a record as arguments of `optid.read`."""
+    return {
+        **how,
+        **{key: listed(how[key]) for key in ("inputs", "outputs", "columns")},
+        "time": False if how["time"] == "none" else how["time"],
+        "delimiter": how["delimiter"].replace("\\t", "\t"),
+    }
+
+
 def record(
     files: Sequence[Path | str] | None, how: Mapping[str, Any], example: str | None, seed: int,
-    *, asked: str = "a data file", stream: bool = False, scheduler: str | None = None,
-) -> tuple[Data | Stream, dict[str, Any]]:
+    *, asked: str = "a data file", **reading: Any,
+) -> tuple[Any, dict[str, Any]]:
     """Return the record of files, or a built-in one with the arguments of a fit that it suggests.
 
     Args:
-        files: paths, one experiment each.
+        files: as in `read_record`.
         how: as in `read_record`.
         example: name of a built-in record in their place.
         seed: of the noise of the example.
         asked: what the command takes in the way of files, for the messages.
-        stream: read chunk by chunk.
-        scheduler: as in `read_record`.
+        reading: other arguments of `read_record`.
 
     Raises:
         DataError: neither is given, or both are, or what `optid.read` refuses.
@@ -67,7 +67,7 @@ def record(
     if example is None:
         if not files:
             raise DataError(f"give {asked}, or --example NAME (optid examples lists them)")
-        return read_record(files, how, stream=stream, scheduler=scheduler), {}
+        return read_record(files, how, **reading), {}
     if files:
         raise DataError(f"give {asked} or --example, not both")
     from optid.examples import example as built_in
@@ -137,33 +137,20 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
-def split_record(record: Data | Stream, share: float) -> tuple[Data, Data]:
-    """Cut a record in an estimation and a validation part.
+def held_out(record: Any, share: float | None, files: Sequence[str] | None, how: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the record to fit and the one to validate on: files, or the rest of the record after a share, or None.
 
     Raises:
         DataError: an impossible share, or a stream.
     """
+    if files:
+        return record, read_record(files, how)
+    if share is None:
+        return record, None
     if isinstance(record, Stream):
         raise DataError("--split needs the record in memory; leave --stream and --scheduler out, or give --test "
                         "another file")
     return record.split(share)
-
-
-def check_folders(*paths: Path | None) -> None:
-    """Refuse a file that cannot be written, before any work is done.
-
-    Raises:
-        DataError: its folder is not there or takes no files, or it is a folder itself.
-    """
-    for path in (path for path in paths if path is not None):
-        folder = path.absolute().parent
-        if not folder.is_dir():
-            raise DataError(f"{path} cannot be written: there is no folder {folder}")
-        if path.is_dir():
-            raise DataError(f"{path} cannot be written: it is a folder; name a file in it")
-        if not os.access(path if path.exists() else folder, os.W_OK):
-            raise DataError(f"{path} cannot be written: {'it' if path.exists() else f'folder {folder}'} is read-only "
-                            "here; give a file in another folder")
 
 
 def listed(words: Sequence[str] | None) -> list[str] | None:
@@ -177,18 +164,23 @@ def one_or_all(values: list[Any] | None) -> Any:
 
 
 def whole_numbers(words: Sequence[str] | None, option: str) -> Any:
-    """Read one whole number or several.
-
-    Raises:
-        StructureError: naming the option and the word.
-    """
-    numbers = []
+    """Read one whole number or several; None stays None; a `StructureError` names the option and the word."""
+    found = []
     for word in listed(words) or []:
         try:
-            numbers.append(int(word))
+            found.append(int(word))
         except ValueError:
             raise StructureError(f"{option} {word}: a whole number is needed, or one per input") from None
-    return one_or_all(numbers) if words is not None else None
+    return one_or_all(found) if words is not None else None
+
+
+def numbers(words: Sequence[str] | None, option: str) -> list[float] | None:
+    """Read numbers, one per channel; None stays None; a `StructureError` names the option and the words."""
+    found = listed(words)
+    try:
+        return None if found is None else [float(part) for text in found for part in text.split()]
+    except ValueError:
+        raise StructureError(f"{option} {' '.join(found or [])}: numbers are needed, one per channel") from None
 
 
 def value(word: str) -> Any:
@@ -199,18 +191,18 @@ def value(word: str) -> Any:
         return word
 
 
-def pairs(words: Sequence[str] | None, option: str) -> dict[str, Any]:
-    """Read key=value words, the values as in `value`.
-
-    Raises:
-        StructureError: a word without an equals sign.
-    """
+def pairs(words: Sequence[str] | None, option: str, form: str = "key=value", read: Callable[[str], Any] = value
+          ) -> dict[str, Any]:
+    """Read key=value words, the values by `read`; for any other the `StructureError` names option, word and form."""
     found = {}
     for word in words or []:
         key, equals, text = word.partition("=")
-        if not equals or not key:
-            raise StructureError(f"{option} {word}: write key=value")
-        found[key] = value(text)
+        try:
+            found[key] = read(text)
+        except ValueError:
+            equals = ""
+        if not (key and equals):
+            raise StructureError(f"{option} {word}: write {form}")
     return found
 
 
@@ -226,28 +218,27 @@ def directions(words: Sequence[str] | None, option: str, model: Any = None) -> d
         LookupFailed: no such output.
         StructureError: a word that is something else, a direction of the wrong size.
     """
-    found: dict[str, Any] = {}
-    for word in words or []:
-        name, equals, numbers = word.partition("=")
-        parts = [part.rpartition(":") for part in numbers.split(",")]
-        try:
-            values = [float(value) for _, _, value in parts]
-        except ValueError:
-            equals = ""
-        named = [output for output, _, _ in parts if output]
-        if not (name and equals) or (named and (len(named) < len(parts) or model is None)):
-            raise StructureError(
-                f"{option} {word}: write NAME=E1,E2,..., one number per state, or NAME=OUTPUT:CHANGE,..."
-            )
-        if named and model is not None:
+    def read(text: str) -> Any:
+        parts = [part.rpartition(":") for part in text.split(",")]
+        values = [float(number) for _, _, number in parts]
+        outputs = [output for output, _, _ in parts if output]
+        if outputs and (len(outputs) < len(parts) or model is None):
+            raise ValueError
+        return dict(zip(outputs, values)) if outputs else values
+
+    form = "NAME=E1,E2,..., one number per state, or NAME=OUTPUT:CHANGE,..."
+    found = pairs(words, option, form, read)
+    if model is None:
+        return found
+    for name, change in found.items():
+        if isinstance(change, dict):
             from optid.faults.directions import direction_of
 
-            found[name] = direction_of(model, dict(zip(named, values)))
-            continue
-        if model is not None and len(values) != model.nx:
+            found[name] = direction_of(model, change)
+        elif len(change) != model.nx:
+            word = next(word for word in words or () if word.partition("=")[0] == name)
             raise StructureError(
-                f"{option} {word}: {len(values)} numbers for {model.nx} states. Give one per state, or say what it "
+                f"{option} {word}: {len(change)} numbers for {model.nx} states. Give one per state, or say what it "
                 f"does to the outputs: {name}={model.outputs[0]}:-1"
             )
-        found[name] = values
     return found

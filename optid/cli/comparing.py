@@ -4,88 +4,52 @@ import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Any
+from typing import Any
 
 import typer
-from rich import box
-from rich.table import Table
 from rich.text import Text
 
-from optid.cli.derived import DEFAULT, FittingCommand
-from optid.cli.options import MODEL, RECORD, SOLVER, Example, Files, Report, Seed, reads_a_record
-from optid.cli.startup import check_names
-from optid.cli.studies import NOTHING_SOLVED, Accept, Workers, follow_progress
-from optid.cli.terminal import note, output, say
+from optid.cli.derived import DEFAULT
+from optid.cli.options import File, Paths, Words
+from optid.cli.results import check_folders, check_names, command_line
+from optid.cli.studies import NOTHING_SOLVED, Workers, follow_progress
+from optid.cli.terminal import new_table, note, output, say
 from optid.errors import LookupFailed
 from optid.lazy import import_cvxpy
 from optid.registry import formulation as look_up
-
-STUDY = "The study"
 
 ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
 """What a formulation is given that needs it, where nobody says: which solver is the question, not which order."""
 
 
-class ComparingCommand(FittingCommand):
-    """Every argument of the formulation is an option derived from it."""
-
-    spelled_out = ""
-
-
-@reads_a_record
 def compare(
-    data: Files = None,
-    example: Example = None,
-    *,
-    how: dict[str, Any],
-    formulation: Annotated[
-        str, typer.Option("--formulation", "-f", metavar="NAME", rich_help_panel=MODEL, help="See optid formulations.")
-    ] = DEFAULT,
-    constraint: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--constraint", "-c", metavar="NAME:VALUE...", rich_help_panel=MODEL, help="See optid constraints."
-        ),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE...", rich_help_panel=MODEL, help="Any other argument."),
-    ] = None,
-    solvers: Annotated[
-        list[str] | None,
-        typer.Option("--solvers", "--solver", "-s", metavar="NAME...", rich_help_panel=SOLVER,
-                     help="all, or names: see optid solvers."),
-    ] = None,
-    accuracy: Annotated[
-        float, typer.Option("--accuracy", rich_help_panel=SOLVER, help="Relative, asked of every solver and verified.")
-    ] = 1e-8,
-    time_limit: Annotated[
-        float, typer.Option("--time-limit", metavar="SECONDS", rich_help_panel=SOLVER, help="For each run.")
-    ] = 60.0,
-    memory_limit: Annotated[
-        float, typer.Option("--memory-limit", metavar="MB", rich_help_panel=SOLVER, help="For each run.")
-    ] = 2000.0,
-    repetitions: Annotated[
-        int, typer.Option("--repetitions", rich_help_panel=STUDY, help="Runs of each solver; times are their median.")
-    ] = 3,
-    holdout: Annotated[
-        float, typer.Option("--holdout", metavar="SHARE", rich_help_panel=RECORD, help="Share kept out of the fit.")
-    ] = 0.3,
-    seed: Seed = 0,
-    db: Annotated[
-        Path | None,
-        typer.Option("--db", metavar="FILE", rich_help_panel=STUDY, help="Keep the rows; go on where it stopped."),
-    ] = None,
-    workers: Workers = 1,
-    accept_changed_data: Accept = False,
-    report: Report = None,
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
+    constraint: Words = None, settings: Words = None, solvers: Words = None, accuracy: float = 1e-8,
+    time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3, seed: int = 0,
+    db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None,
 ) -> None:
     """Compare solvers on one record at equal verified accuracy, and say which to use.
 
     Example: optid compare data.csv --inputs u --outputs y --formulation hammerstein_arx.exact --na 2 --nb 2
     --basis triangular:8 --solvers all
+
+    The record:
+        holdout (SHARE): Share kept out of the fit.
+    The model:
+        constraint (-c NAME:VALUE...): See optid constraints.
+        settings (--set KEY=VALUE...): Any other argument.
+    The solver:
+        solvers (--solvers --solver -s NAME...): all, or names: see optid solvers.
+        accuracy: Relative, asked of every solver and verified.
+        time_limit (SECONDS): For each run.
+        memory_limit (MB): For each run.
+    The study:
+        repetitions: Runs of each solver; times are their median.
+        db (FILE): Keep the rows; go on where it stopped.
+    Options:
+        accept_changed_data: Run cells again whose data file is not what it was at the last run.
     """
-    check_names(formulation, constraint)
+    check_names(constraint, formulation=formulation)
     from optid.cli import arguments as words
 
     import_cvxpy()
@@ -95,7 +59,7 @@ def compare(
     from optid.studies.verdicts.comparison import compare as side_by_side
     from optid.studies.verdicts.comparison import verdict_on_one_record
 
-    words.check_folders(report, db)
+    check_folders(report, db)
     entry, suggestion = _entry(data, how, example, seed)
     arguments = words.suited(suggestion, formulation) if suggestion else {}
     arguments |= words.pairs(settings, "--set")
@@ -121,7 +85,6 @@ def compare(
     if assumed:
         note(f"{', '.join(f'{key} = {value}' for key, value in assumed.items())} assumed; optid order finds orders")
     if report is not None:
-        from optid.cli.results import command_line
         from optid.studies.page import write_page
 
         write_page(verdict_on_one_record(rows), report, command=command_line())
@@ -148,10 +111,7 @@ def _entry(files: list[Path] | None, how: dict[str, Any], example: str | None, s
     if example is not None or not files:
         record, suggestion = words.record(files, how, example, seed)
         return {"name": example, "record": record}, suggestion
-    reading = {"inputs": words.listed(how["inputs"]), "outputs": words.listed(how["outputs"]),
-               "columns": words.listed(how["columns"]), "dt": how["dt"], "experiment": how["experiment"],
-               "time": False if how["time"] == "none" else how["time"],
-               "delimiter": how["delimiter"].replace("\\t", "\t"), "decimal": how["decimal"]}
+    reading = words.reading(how)
     entry = {"name": files[0].stem, "file": [str(path) for path in files]}
     return entry | {key: value for key, value in reading.items() if value is not None}, {}
 
@@ -185,8 +145,7 @@ def _show(found: Any, posed: str, record: str) -> None:
     def small(value: float) -> str:
         return "-" if value != value else f"{value:.0e}"
 
-    table = Table(title=f"{posed} on {record}, accuracy {found.accuracy:.0e}", box=box.SIMPLE_HEAD,
-                  title_justify="left", title_style="bold", pad_edge=False, padding=(0, 0, 0, 1))
+    table = new_table(f"{posed} on {record}, accuracy {found.accuracy:.0e}", padding=(0, 0, 0, 1))
     table.add_column("solver", no_wrap=True)
     table.add_column("verified", min_width=8, overflow="fold")
     for column in ("excess", "residual", "cold", "warm", "1-step", "simul."):

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from optid.cli.messages import option_of
+from optid.cli.options import descriptions, option_of
 from optid.cli.terminal import Command
-from optid.descriptions import Description, describe
+from optid.descriptions import describe
 from optid.errors import LookupFailed
-from optid.registry import FORMULATIONS, entry_point, registered
+from optid.registry import FORMULATIONS, entry_point
 
 DEFAULT = "hammerstein_arx.exact"
 
@@ -43,6 +43,12 @@ class FittingCommand(Command):
         return rest
 
 
+class ComparingCommand(FittingCommand):
+    """Every argument of the formulation is an option derived from it."""
+
+    spelled_out = ""
+
+
 def chosen(args: Sequence[str]) -> str:
     """Return the formulation that words of the command line name; the default where they name none."""
     found = DEFAULT
@@ -62,39 +68,25 @@ def derived_options(name: str, taken: set[str]) -> list[Any]:
         taken: option words of the command.
     """
     try:
-        found = _described(name)
+        found = describe(entry_point(FORMULATIONS, name))
     except LookupFailed:
         return []
     about, parameters = found.arguments(), []
     for key, parameter in found.options.items():
-        word = option_of(key)
-        if word in taken or key == "constraints":
+        if option_of(key) in taken or key == "constraints":
             continue
         flag = isinstance(parameter.default, bool) and parameter.annotation in (bool, "bool")
         hidden = parameter.default in (None, inspect.Parameter.empty, ()) or flag
         shown = "" if hidden else f" [default: {parameter.default}]"
-        text = about.get(key, "")
-        option = typer.Option(
-            f"{word}/--no-{word[2:]}" if flag else word,
-            metavar=None if flag else "VALUE...",
-            help=escape(f"{text[:1].upper()}{text[1:]}.{shown}"),
-            rich_help_panel=f"Arguments of {name}",
-            show_default=False,
-        )
-        kind = Annotated[bool | None if flag else list[str] | None, option]
-        parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind))
-    return _options(parameters) if parameters else []
+        parameters.append(_parameter(key, about.get(key, ""), shown, f"Arguments of {name}", flag))
+    return _options(parameters)
 
 
 def options_of_others(taken: set[str]) -> list[Any]:
     """Return one option for every argument that only formulations other than the default have, for the help text."""
     texts: dict[str, str] = {}
     having: dict[str, list[str]] = {}
-    for name, point in sorted(registered(FORMULATIONS).items()):
-        try:
-            found = describe(point)
-        except ImportError:  # a broken plug-in takes nothing away
-            continue
+    for name, found in descriptions():
         about = found.arguments()
         for key in found.options:
             if key != "constraints" and option_of(key) not in taken:
@@ -103,12 +95,17 @@ def options_of_others(taken: set[str]) -> list[Any]:
     parameters = []
     for key, text in sorted(texts.items()):
         names = ", ".join(having[key][:2]) + (f" and {len(having[key]) - 2} more" if len(having[key]) > 2 else "")
-        option = typer.Option(option_of(key), metavar="VALUE...", show_default=False, help=escape(
-            f"{text[:1].upper()}{text[1:]}. [{names}]"),
-            rich_help_panel="Arguments of other formulations")
-        parameters.append(inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None,
-                                            annotation=Annotated[list[str] | None, option]))
+        parameters.append(_parameter(key, text, f" [{names}]", "Arguments of other formulations"))
     return _options(parameters)
+
+
+def _parameter(key: str, text: str, more: str, panel: str, flag: bool = False) -> inspect.Parameter:
+    word = option_of(key)
+    option = typer.Option(
+        f"{word}/--no-{word[2:]}" if flag else word, metavar=None if flag else "VALUE...", show_default=False,
+        help=escape(f"{text[:1].upper()}{text[1:]}.{more}"), rich_help_panel=panel)
+    kind: Any = bool | None if flag else list[str] | None
+    return inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option])
 
 
 def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
@@ -129,23 +126,13 @@ def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
 def unknown(name: str, option: str) -> str:
     """Say that a formulation has no such option, what it has, and which formulations have it."""
     key = option.removeprefix("--").partition("=")[0].replace("-", "_")
-    having = []
-    for other, point in sorted(registered(FORMULATIONS).items()):
-        try:
-            if key in describe(point).options:
-                having.append(other)
-        except ImportError:  # a broken plug-in takes nothing away
-            continue
+    having = [other for other, found in descriptions() if key in found.options]
     try:
-        takes = " ".join(option_of(k) for k in _described(name).options if k != "constraints")
+        takes = " ".join(option_of(k) for k in describe(entry_point(FORMULATIONS, name)).options if k != "constraints")
     except LookupFailed as error:
         return f"there is no option {option}, and {error}"
     others = f" Formulations that do: {', '.join(having)}." if having else ""
     return f"formulation {name} takes no {option}; its own options are {takes}.{others}"
-
-
-def _described(name: str) -> Description:
-    return describe(entry_point(FORMULATIONS, name))
 
 
 def _json(words: Any) -> str:

@@ -1,109 +1,52 @@
-"""The command `optid design`: an excitation for the plant of a record, with what it promises."""
+"""The commands before a fit: an excitation for the plant of a record, and the order that a record asks for."""
 
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
-from optid.cli.options import MODEL, RECORD, RESULT, Example, FeedbackBasis, reads_a_record
-from optid.cli.results import conclude
-from optid.cli.terminal import FILES, Waiting, hearing
-
-EXCITATION = "The excitation"
+from optid.cli.options import File, Paths, Words
+from optid.cli.results import working
 
 
-@reads_a_record
 def design(
-    like: Annotated[
-        list[str] | None,
-        typer.Option("--like", metavar=FILES, rich_help_panel=RECORD, help="Record of the plant, one file or several."),
-    ] = None,
-    example: Example = None,
-    *,
-    how: dict[str, Any],
-    kind: Annotated[
-        str,
-        typer.Option(
-            "--kind", "-k", metavar="NAME", rich_help_panel=EXCITATION, help="multisine, chirp, noise or levels."
-        ),
-    ] = "multisine",
-    samples: Annotated[
-        int | None,
-        typer.Option("--samples", "-n", rich_help_panel=EXCITATION, help="Samples; as many as the record has."),
-    ] = None,
-    levels: Annotated[
-        int | None,
-        typer.Option("--levels", rich_help_panel=EXCITATION, help="Equally spaced values each input may take."),
-    ] = None,
-    band: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--band",
-            metavar="LOW HIGH",
-            rich_help_panel=EXCITATION,
-            help="Lowest and highest frequency; from the measured response.",
-        ),
-    ] = None,
-    amplitude: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--amplitude",
-            metavar="LOW HIGH...",
-            rich_help_panel=EXCITATION,
-            help="Range of all inputs, or one pair per input; the range of the record.",
-        ),
-    ] = None,
-    shaped: Annotated[
-        bool,
-        typer.Option(
-            "--shaped", rich_help_panel=EXCITATION, help="Weight the spectrum by the inverse of the measured gain."
-        ),
-    ] = False,
-    hold: Annotated[
-        int, typer.Option("--hold", rich_help_panel=EXCITATION, help="Samples for which levels are held.")
-    ] = 5,
-    periods: Annotated[int, typer.Option("--periods", rich_help_panel=EXCITATION, help="Periods of a multisine.")] = 1,
-    candidates: Annotated[
-        int, typer.Option("--candidates", rich_help_panel=EXCITATION, help="Realisations to choose the best from.")
-    ] = 8,
-    seed: Annotated[int, typer.Option("--seed", rich_help_panel=EXCITATION, help="Seed of the first of them.")] = 0,
-    basis: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--basis",
-            "-b",
-            metavar="NAME:SIZE...",
-            rich_help_panel=MODEL,
-            help="Basis of the nonlinearity to be identified, one or one per input. [dim]polynomial:4[/]",
-        ),
-    ] = None,
-    feedback_basis: FeedbackBasis = None,
-    rows: Annotated[
-        int, typer.Option("--rows", rich_help_panel=MODEL, help="Lags of every function: block rows, or nb.")
-    ] = 10,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="FILE", rich_help_panel=RESULT, help="Write time and inputs to a CSV file."
-        ),
-    ] = None,
+    like: Words = None, example: str | None = None, *, how: dict[str, Any], kind: str = "multisine",
+    samples: int | None = None, levels: int | None = None, band: list[float] | None = None,
+    amplitude: list[float] | None = None, shaped: bool = False, hold: int = 5, periods: int = 1, candidates: int = 8,
+    seed: int = 0, basis: Words = None, feedback_basis: Words = None, rows: int = 10, output: File = None,
 ) -> None:
     """Design an excitation for the plant of a record, with a promise about the expanded regressor.
 
     Example: optid design --like data.csv --inputs u --outputs y --kind multisine --levels 12 -o excitation.csv
+
+    The record:
+        like (FILE...): Record of the plant, one file or several.
+    The excitation:
+        kind (-k NAME): multisine, chirp, noise or levels.
+        samples (-n): Samples; as many as the record has.
+        levels: Equally spaced values each input may take.
+        band (LOW HIGH): Lowest and highest frequency; from the measured response.
+        amplitude (LOW HIGH...): Range of all inputs, or one pair per input; the range of the record.
+        shaped: Weight the spectrum by the inverse of the measured gain.
+        hold: Samples for which levels are held.
+        periods: Periods of a multisine.
+        candidates: Realisations to choose the best from.
+        seed: Seed of the first of them.
+    The model:
+        basis (-b NAME:SIZE...): Basis of the nonlinearity to be identified, one or one per input.
+            [dim]polynomial:4[/]
+        rows: Lags of every function: block rows, or nb.
+    The result:
+        output (-o FILE): Write time and inputs to a CSV file.
     """
     from optid.cli import arguments as words
     from optid.errors import StructureError
-    from optid.identify.design import design as designed
 
     for name, value in (("--band", band), ("--amplitude", amplitude)):
         if value is not None and (len(value) % 2 or (name == "--band" and len(value) != 2)):
             raise StructureError(f"{name} {' '.join(f'{v:g}' for v in value)}: give two numbers, low and high.")
-    words.check_folders(output)
-    with hearing() as heard, Waiting() as waiting:
-        waiting.step("reading")
+    with working(excitation=output) as work:
         record: Any = words.record(like, how, example, seed, asked="--like FILE")[0]
-        waiting.step(f"designing a {kind}")
+        work.step(f"designing a {kind}")
+        from optid.identify.design import design as designed
+
         pairs = None if amplitude is None else list(zip(amplitude[::2], amplitude[1::2]))
         found = designed(
             record, kind, n=samples, levels=levels, band=None if band is None else (band[0], band[1]),
@@ -113,4 +56,37 @@ def design(
         )
         if output is not None:
             found.save(output)
-    conclude(str(found), heard, excitation=output)
+        work.text = str(found)
+
+
+def order(
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], basis: Words = None,
+    feedback_basis: Words = None, block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6,
+    nk: int = 8, holdout: float = 0.3, level: float | None = None, seed: int = 0, picture: File = None,
+) -> None:
+    """Find the order of a record: singular values, thresholds, criteria, a recommendation with its reasons.
+
+    Example: optid order data.csv --inputs u1 u2 --outputs y1 y2 --picture order.png
+
+    The model:
+        basis (-b NAME:SIZE...): Basis of the nonlinearity, one or one per input, e.g. polynomial:4. [dim]linear[/]
+        block_rows: Future block rows, above the order. [dim]10, or fewer[/]
+        nx: Largest number of states of interest.
+        na: Most output lags compared.
+        nb: Most input lags compared.
+        nk: Largest delay compared.
+        holdout (SHARE): Share that is held out.
+        level: Probability of rejecting the true order. [dim]at most 0.01[/]
+    """
+    with working(picture=picture) as work:
+        from optid.cli import arguments as words
+
+        record: Any = words.record(data, how, example, seed)[0]
+        work.step("comparing orders")
+        from optid.identify.order import order as study
+
+        found = study(record, basis=words.one_or_all(words.listed(basis)),
+                      feedback_basis=words.one_or_all(words.listed(feedback_basis)), block_rows=block_rows, nx=nx,
+                      na=na, nb=nb, nk=nk, holdout=holdout, level=level)
+        work.draw(found.plot, picture)
+        work.text = str(found)

@@ -96,21 +96,16 @@ class Followed:
         self._tail = b""
 
     def _go_on(self, found: Path, old: Mapping[str, Any]) -> None:
-        with open(found, "rb") as file:
-            file.seek(max(int(old["offset"]) - MARK, 0))
-            self._tail = file.read(min(MARK, int(old["offset"])))
+        self._tail = _before(found, int(old["offset"]))
         self.place |= {"offset": int(old["offset"]), "inode": int(old["inode"]), "mark": old["mark"]}
 
     def _found(self, old: Mapping[str, Any]) -> Path | None:
         """The file that an earlier run read: under its name, or the name that a rotation gave it."""
         for path in (self._path, *sorted(self._path.parent.glob(self._path.name + "?*"))):
-            if not path.is_file() or path.stat().st_size < int(old["offset"]):
-                continue
-            with open(path, "rb") as file:
-                file.seek(max(int(old["offset"]) - MARK, 0))
-                if _hash(file.read(min(MARK, int(old["offset"])))) == old["mark"] and \
-                        (path == self._path or _inode(file) == old["inode"]):
-                    return path
+            if path.is_file() and path.stat().st_size >= int(old["offset"]) and \
+                    _hash(_before(path, int(old["offset"]))) == old["mark"] and \
+                    (path == self._path or path.stat().st_ino == old["inode"]):
+                return path
         return None
 
     def _of(self, path: Path, until_end: bool) -> Iterator[tuple[list[bytes], str]]:
@@ -120,24 +115,19 @@ class Followed:
             file.seek(self.place["offset"])
             self.place["inode"] = _inode(file)
             while True:
-                part = file.read(BLOCK)
-                if part:
+                if part := file.read(BLOCK):
                     *whole, rest = (rest + part).split(b"\n")
                     if whole:
                         yield whole, ""
                     continue
-                if until_end:
+                if until_end or self._remark:
                     break
                 self._remark = self._other(file)
-                if self._remark:
-                    more = file.read()  # what came between the last look and the rotation
-                    if more and "cut" not in self._remark:
-                        *whole, rest = (rest + more).split(b"\n")
-                        if whole:
-                            yield whole, ""
-                    break
-                clock.sleep(POLL)
-        if rest and "cut" not in self._remark and (self._partial or self._remark):
+                if not self._remark:
+                    clock.sleep(POLL)
+                elif "cut" in self._remark:
+                    return  # else what came between the last look and the rotation is read, too
+        if rest and (self._partial or self._remark):
             yield [rest], ""
 
     def _other(self, file: Any) -> str:
@@ -158,6 +148,13 @@ def _inode(file: Any) -> int:
 
 def _same(one: Path, other: Path) -> bool:
     return one.stat().st_ino == other.stat().st_ino
+
+
+def _before(path: Path, place: int) -> bytes:
+    """Return the bytes of a file before a place, at most `MARK`."""
+    with open(path, "rb") as file:
+        file.seek(max(place - MARK, 0))
+        return file.read(min(MARK, place))
 
 
 def _hash(part: bytes) -> str:

@@ -5,25 +5,11 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
-from optid.cli.options import (
-    MODEL,
-    RECORD,
-    RESULT,
-    Columns,
-    Decimal,
-    Delimiter,
-    Dt,
-    Inputs,
-    Load,
-    Outputs,
-    StateJump,
-    Time,
-)
-from optid.cli.terminal import FILES, Waiting, hearing, note
+from optid.cli.options import READING, File, Paths, Words
+from optid.cli.results import check_folders
+from optid.cli.terminal import Waiting, hearing, note
 
 LOUD = 20
 """Rows that cannot be read that are named for each block read; the others are counted."""
@@ -36,91 +22,12 @@ KEPT = 10_000
 
 
 def monitor(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (.json) of a state-space model.")],
-    follow: Annotated[
-        Path | None,
-        typer.Option(
-            "--follow", "-f", metavar="FILE", rich_help_panel=RECORD,
-            help="Read this file, and what is written to it later, instead of the standard input.",
-        ),
-    ] = None,
-    until_end: Annotated[
-        bool, typer.Option("--until-end", rich_help_panel=RECORD, help="With --follow: stop at the end of the file.")
-    ] = False,
-    inputs: Inputs = None,
-    outputs: Outputs = None,
-    dt: Dt = None,
-    time: Time = None,
-    columns: Columns = None,
-    delimiter: Delimiter = ",",
-    decimal: Decimal = ".",
-    fill_gaps: Annotated[
-        int | None,
-        typer.Option(
-            "--fill-gaps", metavar="N", rich_help_panel=RECORD,
-            help="Count up to N samples that the time stamps skip as missing; of a longer gap N.",
-        ),
-    ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", rich_help_panel=RECORD, help="Stop at a row that cannot be read.")
-    ] = False,
-    kinds: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--kinds", "-k", metavar="NAME...", rich_help_panel=MODEL,
-            help="bias, loss, stuck, drift, spike. [dim]bias, loss, spike[/]",
-        ),
-    ] = None,
-    load: Load = None,
-    state_jump: StateJump = True,
-    arl0: Annotated[
-        float | None,
-        typer.Option(
-            "--arl0", metavar="N", rich_help_panel=MODEL,
-            help="Mean samples between false alarms. [dim]10000, or that of --thresholds[/]",
-        ),
-    ] = None,
-    window: Annotated[
-        int, typer.Option("--window", "-w", metavar="N", rich_help_panel=MODEL, help="Samples of the window.")
-    ] = 100,
-    identified: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--identified", metavar=FILES, rich_help_panel=MODEL,
-            help="The record that the model was identified from: the uncertainty of its parameters counts.",
-        ),
-    ] = None,
-    healthy: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--healthy", metavar=FILES, rich_help_panel=MODEL,
-            help="A later healthy record: the noise that it shows is used, and the thresholds keep it quiet.",
-        ),
-    ] = None,
-    thresholds: Annotated[
-        Path | None,
-        typer.Option(
-            "--thresholds", metavar="FILE", rich_help_panel=MODEL,
-            help="Thresholds of an earlier run (.json); written there when there is no such file.",
-        ),
-    ] = None,
-    extrapolate: Annotated[
-        bool,
-        typer.Option(
-            "--extrapolate", rich_help_panel=MODEL, help="Allow thresholds beyond what a simulation supports."
-        ),
-    ] = False,
-    seed: Annotated[int, typer.Option("--seed", rich_help_panel=MODEL, help="Seed of simulated thresholds.")] = 0,
-    state: Annotated[
-        Path | None,
-        typer.Option(
-            "--state", metavar="FILE", rich_help_panel=RESULT,
-            help="Go on from this state (.npz) where there is one, and keep it there.",
-        ),
-    ] = None,
-    lines: Annotated[
-        bool, typer.Option("--json", rich_help_panel=RESULT, help="One JSON object per line instead of words.")
-    ] = False,
+    model: Path, follow: File = None, until_end: bool = False, inputs: Words = None, outputs: Words = None,
+    dt: float | None = None, time: str | None = None, columns: Words = None, delimiter: str = ",", decimal: str = ".",
+    fill_gaps: int | None = None, strict: bool = False, kinds: Words = None, load: Words = None,
+    state_jump: bool = True, arl0: float | None = None, window: int = 100, identified: Paths = None,
+    healthy: Paths = None, thresholds: File = None, extrapolate: bool = False, seed: int = 0, state: File = None,
+    lines: bool = False,
 ) -> None:
     """Watch a stream: one line for every alarm, every fault that is named, and everything that is over.
 
@@ -129,23 +36,37 @@ def monitor(
     statistic and note.
 
     Example: optid monitor model.json --arl0 10000 < stream.csv
+
+    The record:
+        follow (-f FILE): Read this file, and what is written to it later, instead of the standard input.
+        until_end: With --follow: stop at the end of the file.
+        fill_gaps (N): Count up to N samples that the time stamps skip as missing; of a longer gap N.
+        strict: Stop at a row that cannot be read.
+    The model:
+        kinds (-k NAME...): bias, loss, stuck, drift, spike. [dim]bias, loss, spike[/]
+        arl0 (N): Mean samples between false alarms. [dim]10000, or that of --thresholds[/]
+        window (-w N): Samples of the window.
+        identified (FILE...): The record that the model was identified from: the uncertainty of its parameters counts.
+        healthy (FILE...): A later healthy record: the noise that it shows is used, and the thresholds keep it quiet.
+        thresholds (FILE): Thresholds of an earlier run (.json); written there when there is no such file.
+        extrapolate: Allow thresholds beyond what a simulation supports.
+        seed: Seed of simulated thresholds.
+    The result:
+        state (FILE): Go on from this state (.npz) where there is one, and keep it there.
+        lines (--json): One JSON object per line instead of words.
     """
     from optid.cli import arguments as words
     from optid.data.reading.rows import RowReader
 
-    words.check_folders(state, thresholds)
+    check_folders(state, thresholds)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
         plant = words.state_space_model(model)
-        how = words.as_modelled(
-            {"inputs": words.listed(inputs), "outputs": words.listed(outputs), "dt": dt, "time": time,
-             "experiment": None, "columns": columns, "delimiter": delimiter, "decimal": decimal}, plant
-        )
-        reader = RowReader(
-            how["inputs"], how["outputs"], dt=how["dt"], time=False if time == "none" else time,
-            columns=words.listed(columns), delimiter=delimiter.replace("\\t", "\t"), decimal=decimal,
-            fill=fill_gaps or 0, label="standard input" if follow is None else follow.name,
-        )
+        given = (inputs, outputs, dt, time, None, columns, delimiter, decimal)
+        how = words.as_modelled(dict(zip(READING, given)), plant)
+        reading = words.reading(how)
+        del reading["experiment"]
+        reader = RowReader(**reading, fill=fill_gaps or 0, label="standard input" if follow is None else follow.name)
         if state is not None and state.exists():
             watcher = _resumed(state, plant, model)
         else:

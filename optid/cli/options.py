@@ -1,144 +1,143 @@
-"""Options that several commands share."""
+"""Options of the commands: types and defaults from the signature, words and help from the docstring.
+
+A docstring describes the parameters in sections, one for every panel of the help text ("Files" are arguments, "Options"
+have no panel), each as ``name (words METAVAR): help``. Words are given where the option is not the name of its
+parameter, or has a letter besides. What several commands share is described once, in `SHARED`.
+"""
 
 import functools
 import inspect
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_origin
 
 import typer
 
-RECORD, MODEL, SOLVER, RESULT = "The record", "The model", "The solver", "The result"
+from optid.descriptions import Description, describe
+from optid.registry import FORMULATIONS, registered
 
-Files = Annotated[
-    list[Path] | None,
-    typer.Argument(
-        metavar="DATA...", help="CSV, Parquet, MAT, NPZ or npy files, one experiment each.", show_default=False
-    ),
-]
-Example = Annotated[
-    str | None,
-    typer.Option(
-        "--example", metavar="NAME", rich_help_panel=RECORD, help="A built-in record instead: see optid examples."
-    ),
-]
-Seed = Annotated[int, typer.Option("--seed", rich_help_panel=RECORD, help="Seed of the noise of an example.")]
-Inputs = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--inputs",
-        "-u",
-        metavar="NAME...",
-        rich_help_panel=RECORD,
-        help="Columns of the inputs. [dim]u, u1, u2, ...[/]",
-    ),
-]
-Outputs = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--outputs",
-        "-y",
-        metavar="NAME...",
-        rich_help_panel=RECORD,
-        help="Columns of the outputs. [dim]y, y1, y2, ...[/]",
-    ),
-]
-Dt = Annotated[
-    float | None,
-    typer.Option("--dt", rich_help_panel=RECORD, help="Sampling time; from the time stamps where there are some."),
-]
-Time = Annotated[
-    str | None,
-    typer.Option(
-        "--time",
-        metavar="NAME",
-        rich_help_panel=RECORD,
-        help="Column of time stamps; 'none' ignores them. [dim]t, time[/]",
-    ),
-]
-Runs = Annotated[
-    str | None,
-    typer.Option(
-        "--experiment", metavar="NAME", rich_help_panel=RECORD, help="Column that names the experiment of each row."
-    ),
-]
-Columns = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--columns", metavar="NAME...", rich_help_panel=RECORD, help="Names of the columns of a file without a header."
-    ),
-]
-Delimiter = Annotated[str, typer.Option("--delimiter", rich_help_panel=RECORD, help="Between the cells of a CSV file.")]
-Decimal = Annotated[str, typer.Option("--decimal", rich_help_panel=RECORD, help="Decimal mark of a CSV file.")]
-Report = Annotated[
-    Path | None,
-    typer.Option("--report", "-o", metavar="FILE", rich_help_panel=RESULT, help="Write a self-contained HTML report."),
-]
-Picture = Annotated[
-    Path | None,
-    typer.Option("--picture", "-p", metavar="FILE", rich_help_panel=RESULT, help="Write the picture (PNG, PDF)."),
-]
-FeedbackBasis = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--feedback-basis",
-        metavar="NAME:SIZE...",
-        rich_help_panel=MODEL,
-        help="Basis of the functions of the outputs that are fed back, one or one per output.",
-    ),
-]
+Words = list[str] | None
+Paths = list[Path] | None
+File = Path | None
 
-Load = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--load",
-        "--process",
-        metavar="NAME=E1,E2,...",
-        rich_help_panel=MODEL,
-        help="Direction of a process fault: one number per state, or what it does to outputs, as leak=y1:-1.",
-    ),
-]
-Disturbance = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--disturbance",
-        metavar="NAME",
-        rich_help_panel=MODEL,
-        help="An input, an output or a --process direction that may do anything without being a fault.",
-    ),
-]
-StateJump = Annotated[
-    bool, typer.Option("--state-jump/--no-state-jump", rich_help_panel=MODEL, help="May the state jump?")
-]
+SHARED = """
+Files:
+    data (DATA...): CSV, Parquet, MAT, NPZ or npy files, one experiment each.
+    model (MODEL): Model file (.json) of a state-space model.
+The record:
+    example (NAME): A built-in record instead: see optid examples.
+    inputs (-u NAME...): Columns of the inputs. [dim]u, u1, u2, ...[/]
+    outputs (-y NAME...): Columns of the outputs. [dim]y, y1, y2, ...[/]
+    dt: Sampling time; from the time stamps where there are some.
+    time (NAME): Column of time stamps; 'none' ignores them. [dim]t, time[/]
+    experiment (NAME): Column that names the experiment of each row.
+    columns (NAME...): Names of the columns of a file without a header.
+    delimiter: Between the cells of a CSV file.
+    decimal: Decimal mark of a CSV file.
+    test (FILE...): Validate on these files.
+    seed: Seed of the noise of an example.
+The model:
+    formulation (-f NAME): See optid formulations.
+    feedback_basis (NAME:SIZE...): Basis of the functions of the outputs that are fed back, one or one per output.
+    load (--load --process NAME=E1,E2,...): Direction of a process fault: one number per state, or what it does to
+        outputs, as leak=y1:-1.
+    disturbance (NAME): An input, an output or a --process direction that may do anything without being a fault.
+    state_jump (--state-jump/--no-state-jump): May the state jump?
+The solver:
+    solver (-s NAME): See optid solvers.
+The result:
+    report (-o FILE): Write a self-contained HTML report.
+    saved (--model -m FILE): Write the model (JSON).
+    picture (-p FILE): Write the picture (PNG, PDF).
+"""
 
 READING: dict[str, tuple[Any, Any]] = {
-    "inputs": (Inputs, None),
-    "outputs": (Outputs, None),
-    "dt": (Dt, None),
-    "time": (Time, None),
-    "experiment": (Runs, None),
-    "columns": (Columns, None),
-    "delimiter": (Delimiter, ","),
-    "decimal": (Decimal, "."),
+    "inputs": (Words, None),
+    "outputs": (Words, None),
+    "dt": (float | None, None),
+    "time": (str | None, None),
+    "experiment": (str | None, None),
+    "columns": (Words, None),
+    "delimiter": (str, ","),
+    "decimal": (str, "."),
 }
-"""How the files of a record are read: the type of each option and its default."""
+"""How the files of a record are read: the type of each option and its default, in place of a parameter ``how``."""
+
+_ENTRY = re.compile(r"(\w+)(?: \((.*?)\))?: (.*)")
 
 
-def reads_a_record(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `READING` in place of its keyword-only parameter `how`, which gets them all.
-
-    `optid.cli.arguments.record` turns them into a record.
-    """
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    options = [inspect.Parameter(key, keyword, default=d, annotation=kind) for key, (kind, d) in READING.items()]
+def register(app: typer.Typer, function: Callable[..., None], kind: Any) -> None:
+    """Make a function a command of a class; what its docstring says before the sections is the help text."""
+    about, own = described(inspect.getdoc(function) or "")
+    entries = described(SHARED)[1] | own
     parameters = []
-    for parameter in inspect.signature(command).parameters.values():
-        parameters += options if parameter.name == "how" else [parameter]
+    for parameter in inspect.signature(function).parameters.values():
+        if parameter.name == "how":
+            parameters += [inspect.Parameter(key, parameter.kind, default=default, annotation=type_)
+                           for key, (type_, default) in READING.items()]
+        else:
+            parameters.append(parameter)
+    reads = "how" in inspect.signature(function).parameters
+    parameters = [p if get_origin(p.annotation) is Annotated else
+                  p.replace(annotation=Annotated[p.annotation, _option(p, *entries[p.name])]) for p in parameters]
 
-    @functools.wraps(command)
+    @functools.wraps(function)
     def run(**given: Any) -> None:
-        command(how={key: given.pop(key) for key in READING}, **given)
+        how = {"how": {key: given.pop(key) for key in READING}} if reads else {}
+        function(**how, **given)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {p.name: p.annotation for p in parameters}
-    return run
+    app.command(cls=kind, help=about)(run)
+
+
+def described(text: str) -> tuple[str, dict[str, tuple[str, str, str]]]:
+    """Return what a docstring says before the sections, and {parameter: (panel, words, help)}."""
+    about, *sections = re.split(r"(?:\n|^)(?=[A-Z][\w ]*:\n    )", text)
+    found = {}
+    for section in sections:
+        panel, _, body = section.partition(":\n")
+        for entry in re.split(r"\n(?=    \S)", body):
+            match = _ENTRY.fullmatch(" ".join(entry.split()))
+            if match is None:
+                raise ValueError(f"no option: {entry}")
+            found[match[1]] = panel, match[2] or "", match[3]
+    return about.strip(), found
+
+
+def option_of(argument: str) -> str:
+    """Return the option word of an argument."""
+    return "--" + argument.replace("_", "-")
+
+
+def descriptions() -> Iterator[tuple[str, Description]]:
+    """Yield the name and the description of every formulation that can be loaded."""
+    for name, point in sorted(registered(FORMULATIONS).items()):
+        with suppress(ImportError):  # a broken plug-in takes nothing away
+            yield name, describe(point)
+
+
+def in_options(text: str) -> str:
+    """Write a message about arguments of Python with the options of the command."""
+    known = {"solver", "accuracy", "time_limit"}.union(*(found.options for _, found in descriptions()))
+    word = "|".join(sorted(known, key=len, reverse=True))
+
+    def several(match: re.Match[str]) -> str:
+        return match[1] + ", ".join(option_of(one) for one in match[2].split(", ") if one != "constraints")
+
+    text = re.sub(rf"(takes no )argument '({word})'(?=\.)", lambda m: m[1] + option_of(m[2]), text)
+    text = re.sub(rf"( needs |Known: )((?:{word})(?:, (?:{word}))*)(?=$|\.)", several, text)
+    text = re.sub(rf"(?<![\w.-])({word})=(?=['\w\[(.-])", lambda m: option_of(m[1]) + " ", text)
+    return re.sub(rf"^({word})(?=,| must| is )", lambda m: option_of(m[1]), text)
+
+
+def _option(parameter: inspect.Parameter, panel: str, words: str, text: str) -> Any:
+    flags = [word for word in words.split() if word.startswith("-")]
+    metavar = " ".join(word for word in words.split() if not word.startswith("-")) or None
+    if panel == "Files":
+        return typer.Argument(metavar=metavar, help=text, show_default=False)
+    if not any(flag.startswith("--") for flag in flags):
+        flags.insert(0, option_of(parameter.name))
+    return typer.Option(*flags, metavar=metavar, help=text, rich_help_panel=None if panel == "Options" else panel)

@@ -1,17 +1,17 @@
 """The commands of studies: run, report, export, systems, schema."""
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
-from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from optid.cli.results import command_line
+from optid.cli.options import File, Words, register
+from optid.cli.results import check_folders, command_line
 from optid.cli.terminal import Command, SafeConsole, output, say
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
@@ -24,52 +24,28 @@ Workers = Annotated[
     int | None,
     typer.Option("--workers", "-w", metavar="N", min=1, help="Processes that run cells; one per core if not given."),
 ]
-Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:8786.")
-]
-Accept = Annotated[
-    bool,
-    typer.Option("--accept-changed-data", help="Run cells again whose data file is not what it was at the last run."),
-]
-Database = Annotated[Path, typer.Argument(metavar="DATABASE", help="Written by optid study run.", show_default=False)]
-OneStudy = Annotated[
-    str | None, typer.Option("--study", metavar="TITLE", help="Of a database that holds several: this study.")
-]
-Accuracy = Annotated[
-    float | None, typer.Option("--accuracy", help="Compare at this accuracy; that of most cells if not given.")
-]
-Clock = Annotated[
-    str, typer.Option("--time", metavar="WORD", help="Time to compare: solve (cold), fit (whole) or warm.")
-]
 
 
-@study.command(cls=Command)
 def run(
-    file: Annotated[
-        Path | None, typer.Argument(metavar="STUDY.toml", help="The study file.", show_default=False)
-    ] = None,
-    example: Annotated[bool, typer.Option("--example", help="A built-in study of half a minute instead.")] = False,
-    db: Annotated[
-        Path | None,
-        typer.Option("--db", metavar="FILE", help="Database of the rows; the study file's name with .sqlite."),
-    ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    accept_changed_data: Accept = False,
-    retry: Annotated[
-        list[str] | None,
-        typer.Option("--retry", metavar="OUTCOME...", help="Run cells of these outcomes again, e.g. 'time limit'."),
-    ] = None,
-    export: Annotated[
-        Path | None, typer.Option("--export", metavar="FILE", help="Also write the rows (.parquet, .csv) at the end.")
-    ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would be run, and run nothing.")] = False,
+    file: File = None, example: bool = False, db: File = None, workers: Workers = None,
+    scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
+    dry_run: bool = False,
 ) -> None:
     """Run a study, or what is left of it; stop it whenever you like, the same command goes on.
 
     Example: optid study run study.toml --db study.sqlite
+
+    Files:
+        file (STUDY.toml): The study file.
+    Options:
+        example: A built-in study of half a minute instead.
+        db (FILE): Database of the rows; the study file's name with .sqlite.
+        scheduler (ADDRESS): Run on a Dask cluster: tcp://host:8786.
+        accept_changed_data: Run cells again whose data file is not what it was at the last run.
+        retry (OUTCOME...): Run cells of these outcomes again, e.g. 'time limit'.
+        export (FILE): Also write the rows (.parquet, .csv) at the end.
+        dry_run: Say what would be run, and run nothing.
     """
-    from optid.cli.arguments import check_folders
     from optid.errors import StudyError
     from optid.studies.definition.built_in import example_study
     from optid.studies.definition.description import Study
@@ -97,21 +73,21 @@ def run(
         raise typer.Exit(NOTHING_SOLVED)
 
 
-@study.command(cls=Command)
 def report(
-    db: Database,
-    page: Annotated[
-        Path | None, typer.Option("--report", "-o", metavar="FILE", help="Write a self-contained HTML page.")
-    ] = None,
-    title: OneStudy = None,
-    accuracy: Accuracy = None,
-    clock: Clock = "solve",
+    db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve",
 ) -> None:
     """Print the verdict of a study, and write its page.
 
     Example: optid study report study.sqlite -o study.html
+
+    Files:
+        db (DATABASE): Written by optid study run.
+    Options:
+        page (--report -o FILE): Write a self-contained HTML page.
+        title (--study TITLE): Of a database that holds several: this study.
+        accuracy: Compare at this accuracy; that of most cells if not given.
+        clock (--time WORD): Time to compare: solve (cold), fit (whole) or warm.
     """
-    from optid.cli.arguments import check_folders
     from optid.cli.study_summary import print_former, print_models, print_reasons
     from optid.studies.page import write_page
     from optid.studies.storage.store import rows_of_one
@@ -128,17 +104,17 @@ def report(
         say(f"report written to {page}")
 
 
-@study.command(cls=Command)
-def export(
-    db: Database,
-    target: Annotated[Path, typer.Argument(metavar="FILE", help="A .parquet or .csv file.", show_default=False)],
-    title: OneStudy = None,
-) -> None:
+def export(db: Path, target: Path, title: str | None = None) -> None:
     """Write the rows of a database, of one study or of all, to a Parquet or CSV file.
 
     Example: optid study export study.sqlite rows.parquet
+
+    Files:
+        db (DATABASE): Written by optid study run.
+        target (FILE): A .parquet or .csv file.
+    Options:
+        title (--study TITLE): Of a database that holds several: this study.
     """
-    from optid.cli.arguments import check_folders
     from optid.studies.storage import export as exporting
     from optid.studies.storage.store import read_rows, rows_of_one
 
@@ -149,53 +125,42 @@ def export(
     say(f"{count} rows{f' of {studies} studies' if studies > 1 else ''} written to {target}")
 
 
-@study.command(cls=Command)
-def problems(
-    db: Database,
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="FOLDER", help="Folder for the problems.")],
-    title: OneStudy = None,
-) -> None:
+def problems(db: Path, out: Path, title: str | None = None) -> None:
     """Write every convex programme of a study in standard form (.npz, MPS), and a script that solves them.
 
     Example: optid study problems study.sqlite --out problems
+
+    Files:
+        db (DATABASE): Written by optid study run.
+    Options:
+        out (-o FOLDER): Folder for the problems.
+        title (--study TITLE): Of a database that holds several: this study.
     """
     from optid.studies.problem_set import write_problems
 
     lines = write_problems(db, out, title)
-    kinds: dict[str, int] = {}
-    for line in lines:
-        kinds[line["kind"]] = kinds.get(line["kind"], 0) + 1
+    kinds = Counter(line["kind"] for line in lines)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "none is convex"
     say(f"{len(lines)} problems written to {out} ({listed}); solve_problems.py there solves them without optid")
 
 
-@study.command(cls=Command)
 def systems() -> None:
     """List the simulated systems that a study file may name."""
-    from optid.studies.sources.systems import SYSTEMS
+    from optid.cli import listings
 
-    table = Table(title="Simulated systems", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold",
-                  pad_edge=False)
-    table.add_column("system", no_wrap=True)
-    table.add_column("samples", justify="right")
-    for column in ("noise", "na", "nb", "nk"):
-        table.add_column(column, justify="right")
-    table.add_column("what it is")
-    for name, system in SYSTEMS.items():
-        orders = (str(system.suggestion.get(key, default)) for key, default in (("na", "-"), ("nb", "-"), ("nk", 0)))
-        table.add_row(Text(name, "bold"), str(system.samples), f"{system.noise:.3g}", *orders, system.about)
-    output().print(table)
-    output().print(Text("samples and noise are those used where a study names none; noise is relative to the "
-                        "noise-free output. na, nb and nk suit the system; with other ones a model may be "
-                        "far from the truth.", "dim"))
+    for part in listings.systems():
+        output().print(part)
 
 
-@study.command(cls=Command)
 def schema() -> None:
     """Print what a row of the database holds, as Markdown."""
     from optid.studies.storage.rows import markdown
 
     typer.echo(markdown(), nl=False)
+
+
+for function in (run, report, export, problems, systems, schema):
+    register(study, function, Command)
 
 
 @contextmanager
@@ -245,14 +210,11 @@ def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
 def _now(row: dict[str, Any] | None) -> str:
     if row is None:
         return "cells"
-    word = row["status_verified"] or row["outcome"]
-    return f"[dim]{_short(row['formulation'])} · {_short(row['solver'])}: {word}[/]"
-
-
-def _short(text: str) -> str:
     from rich.markup import escape
 
-    return escape(text if len(text) <= 28 else text[:27] + "…")
+    formulation, solver = (escape(text if len(text) <= 28 else text[:27] + "…")
+                           for text in (row["formulation"], row["solver"]))
+    return f"[dim]{formulation} · {solver}: {row['status_verified'] or row['outcome']}[/]"
 
 
 def _plan(described: Any, db: Path, **settings: Any) -> None:
@@ -262,11 +224,7 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
     every, left, former = running.plan(described, db, **settings)
     say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
         f"{len(described.solvers)} solvers; {len(every):,} cells, {len(left):,} of them to run")
-    refusals: dict[str, int] = {}
-    for cell in every:
-        if cell.refusal:
-            refusals[cell.refusal] = refusals.get(cell.refusal, 0) + 1
-    for refusal, count in refusals.items():
+    for refusal, count in Counter(cell.refusal for cell in every if cell.refusal).items():
         say(f"{count:,} cells that cannot be run here: {refusal}")
     if former:
         say(former)

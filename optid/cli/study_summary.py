@@ -1,15 +1,14 @@
 """What the commands of studies print about rows: how cells ended, why, and which rows are kept apart."""
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 from rich.text import Text
 
-from optid.cli.terminal import output, say
+from optid.cli.terminal import new_table, output, say
 from optid.program.solution import Status
 from optid.studies.storage.rows import DONE, REFUSED
 
@@ -18,13 +17,8 @@ LISTED = 12
 
 
 def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
-    """Print a table of how the cells ended, by solver.
-
-    Args:
-        title: of the table.
-        rows: {column: (rows,) array}.
-    """
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False)
+    """Print a table of how the cells ended, by solver; rows are {column: (rows,) array}."""
+    table = new_table(title)
     table.add_column("solver", no_wrap=True)
     for column in ("cells", "accuracy reached", "proved", "false claims", "refused"):
         table.add_column(column, justify="right")
@@ -39,11 +33,8 @@ def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
 
 def _others(mine: Mapping[str, Any]) -> str:
     """The outcomes, and the statuses of those that ended, that are neither a success nor a refusal."""
-    counts: dict[str, int] = {}
-    for word in _failures(mine):
-        if word and word != REFUSED:
-            counts[word] = counts.get(word, 0) + 1
-    return ", ".join(f"{word} {count:,}" for word, count in sorted(counts.items(), key=lambda item: -item[1])) or "-"
+    counts = Counter(word for word in _failures(mine) if word and word != REFUSED)
+    return ", ".join(f"{word} {count:,}" for word, count in counts.most_common()) or "-"
 
 
 def _failures(rows: Mapping[str, Any]) -> list[str]:
@@ -56,9 +47,6 @@ def print_reasons(rows: Mapping[str, Any]) -> None:
     """Print why cells did not reach their accuracy: every reason once, with its solvers and how often it came.
 
     Sentences that differ in their numbers alone count as one. Refusals come last.
-
-    Args:
-        rows: {column: (rows,) array}.
     """
     from optid.studies.verdicts.choice import listed
     from optid.studies.verdicts.verdict import without_numbers
@@ -78,18 +66,13 @@ def print_reasons(rows: Mapping[str, Any]) -> None:
 
 
 def print_models(verdict: Any) -> None:
-    """Print the figures of the formulations, where a study of one solver compares them.
-
-    Args:
-        verdict: of the study.
-    """
+    """Print the figures of the formulations, where the study of a verdict compares them with one solver."""
     if len(verdict.overall.standings) != 1 or len(verdict.quality.formulations) < 2:
         return
     from optid.studies.page import quality_table
 
     found = quality_table(verdict.quality)
-    table = Table(title=found.title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False,
-                  padding=(0, 1, 0, 0))
+    table = new_table(found.title, padding=(0, 1, 0, 0))
     for number, name in enumerate(found.head):
         table.add_column(name, justify="left" if number < 2 else "right", overflow="fold",
                          min_width=max(map(len, name.split())))

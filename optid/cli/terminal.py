@@ -5,11 +5,13 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from threading import Timer
-from typing import Any
+from typing import Any, Self
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
@@ -121,6 +123,11 @@ def say(text: str | Text) -> None:
     output().print(Text(text) if isinstance(text, str) else text, soft_wrap=True)
 
 
+def new_table(title: str, **settings: Any) -> Table:
+    """Return an empty table in the style of all commands."""
+    return Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False, **settings)
+
+
 def coloured(text: str) -> Text:
     """Return a printed result with its headings and its verdict in colour."""
     result = Text(text)
@@ -139,7 +146,7 @@ def complain(error: BaseException) -> None:
     """Print one message for an error, on the error stream."""
     text = str(error) or type(error).__name__
     if isinstance(error, OptidError):
-        from optid.cli.messages import in_options
+        from optid.cli.options import in_options
 
         text = in_options(text)
     if exit_code(error) == 1:
@@ -201,7 +208,7 @@ class Waiting:
         """Say what is being done now."""
         self._progress.update(self._task, description=text)
 
-    def __enter__(self) -> "Waiting":
+    def __enter__(self) -> Self:
         self._timer.start()
         return self
 

@@ -2,46 +2,28 @@
 
 from collections import Counter
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
-from optid.data.reading.columns import (
-    TIME_TOLERANCE,
-    Wanted,
-    agreed_step,
-    as_stamps,
-    choose,
-    column_name,
-    seconds,
-    time_column,
-    uniform_step,
-)
-from optid.data.reading.tables import Table, open_table
+from optid.data.reading import columns as known
+from optid.data.reading.columns import TIME_TOLERANCE, Wanted, as_stamps, choose, seconds
+from optid.data.reading.sources import Table, open_table
 from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError
 
 __all__ = ["Stream", "open_stream", "read"]
 
+
 def read(
-    source: Any,
-    inputs: Wanted = None,
-    outputs: Wanted = None,
-    dt: float | None = None,
-    time: str | int | bool | None = None,
-    experiment: str | int | None = None,
-    *,
-    columns: Sequence[str] | None = None,
-    input_units: str | Sequence[str] | None = None,
-    output_units: str | Sequence[str] | None = None,
-    name: str | None = None,
-    delimiter: str = ",",
-    decimal: str = ".",
+    source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None,
+    time: str | int | bool | None = None, experiment: str | int | None = None, *,
+    columns: Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
+    output_units: str | Sequence[str] | None = None, name: str | None = None, delimiter: str = ",", decimal: str = ".",
     time_tolerance: float = TIME_TOLERANCE,
 ) -> Data:
     """Read a record; blank, NaN and NA cells are missing samples.
@@ -84,7 +66,8 @@ def read(
         if run.names != runs[0].names:
             raise DataError(f"{run.label} has channels {run.names}, {runs[0].label} has {runs[0].names}.")
         if run.stamps is not None:
-            step = agreed_step(uniform_step(run.stamps, time_tolerance, run.label), step, time_tolerance, run.label)
+            found = known.uniform_step(run.stamps, time_tolerance, run.label)
+            step = known.agreed_step(found, step, time_tolerance, run.label)
     first = sources[0]
     starts = [0.0 if run.stamps is None else float(seconds(run.stamps[:1])[0]) for run in runs]
     return Data.of_experiments(
@@ -94,8 +77,7 @@ def read(
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
+class _Run(NamedTuple):
     """One experiment of one source; names of inputs and outputs, stamps (N,) or None."""
 
     label: str
@@ -111,12 +93,12 @@ def _runs(
     label = table.label
     ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
     signals = [*ins.values(), *outs.values()]
-    clock = time_column(table.names, time, signals, label, table.index)
-    group = None if experiment is None else column_name(table.names, experiment, label)
+    clock = known.time_column(table.names, time, signals, label, table.index)
+    group = None if experiment is None else known.column_name(table.names, experiment, label)
     loaded = table.load(list(dict.fromkeys([*signals, *(name for name in (clock, group) if name is not None)])),
                         clock, group)
-    stamps = None if clock is None else as_stamps(loaded[clock], f"{label}, column {clock!r}")
-    groups = None if group is None else loaded[group]
+    stamps = None if clock is None else as_stamps(np.ravel(loaded[clock]), f"{label}, column {clock!r}")
+    groups = None if group is None else np.ravel(loaded[group])
     loaded = {name: loaded[name] for name in signals}
     y_names, y = _stacked(outs, loaded, label, kept=set(ins.values()))
     u_names, u = _stacked(ins, loaded, label)

@@ -62,16 +62,9 @@ class Data(Ports):
     transform: Transform = field(repr=False)
 
     def __init__(
-        self,
-        u: Any,
-        y: Any,
-        dt: float = 1.0,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
-        input_units: str | Sequence[str] | None = None,
-        output_units: str | Sequence[str] | None = None,
-        name: str = "",
-        start: float | Sequence[float] = 0.0,
+        self, u: Any, y: Any, dt: float = 1.0, inputs: str | Sequence[str] | None = None,
+        outputs: str | Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
+        output_units: str | Sequence[str] | None = None, name: str = "", start: float | Sequence[float] = 0.0,
     ) -> None:
         """Copy and check the record.
 
@@ -176,12 +169,11 @@ class Data(Ports):
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
         """Range, mean, standard deviation, distinct values and missing share of each channel, inputs first."""
-        units = self.input_units + self.output_units
-        summaries = []
-        for c, (name, unit) in enumerate(zip(self.inputs + self.outputs, units)):
-            x = np.concatenate([e.u[:, c] if c < self.m else e.y[:, c - self.m] for e in self.experiments])
-            summaries.append(Channel.of(x, name, unit, "input" if c < self.m else "output"))
-        return tuple(summaries)
+        named = zip(self.inputs + self.outputs, self.input_units + self.output_units)
+        return tuple(Channel.of(np.concatenate([e.u[:, c] if c < self.m else e.y[:, c - self.m]
+                                                for e in self.experiments]),
+                                name, unit, "input" if c < self.m else "output")
+                     for c, (name, unit) in enumerate(named))
 
     def ranges(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest sample of every input, (m,) each; NaN where every sample is missing."""
@@ -249,15 +241,16 @@ class Data(Ports):
         whole = isinstance(at, int | np.integer)
         if not whole and not 0 < at < 1:
             raise DataError(f"split at {at}: a share lies between 0 and 1; write int({at}) for a number of samples.")
-        cuts = [int(at) if whole else round(float(at) * e.n_samples) for e in self.experiments]
-        for k, (cut, e) in enumerate(zip(cuts, self.experiments)):
+        first, second = [], []
+        for k, e in enumerate(self.experiments):
+            cut = int(at) if whole else round(float(at) * e.n_samples)
             if not 0 < cut < e.n_samples:
                 raise DataError(
                     f"split at {at} leaves an empty part of experiment {k + 1}, which has {e.n_samples} samples."
                 )
-        first = tuple(self._cut(e, 0, cut) for e, cut in zip(self.experiments, cuts))
-        second = tuple(self._cut(e, cut, e.n_samples) for e, cut in zip(self.experiments, cuts))
-        return self._with(experiments=first), self._with(experiments=second)
+            first.append(self._cut(e, 0, cut))
+            second.append(self._cut(e, cut, e.n_samples))
+        return self._with(experiments=tuple(first)), self._with(experiments=tuple(second))
 
     def window(self, first: int, last: int) -> "Data":
         """Return samples first to last - 1 of every experiment.
@@ -304,12 +297,8 @@ class Data(Ports):
                             f"from time {', '.join(f'{e.start:g}' for e in self.experiments)}.")
         return self._with(experiments=tuple(kept))
 
-    def select(
-        self,
-        inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None,
-        experiments: int | Sequence[int] | None = None,
-    ) -> "Data":
+    def select(self, inputs: str | Sequence[str] | None = None, outputs: str | Sequence[str] | None = None,
+               experiments: int | Sequence[int] | None = None) -> "Data":
         """Keep some channels and some experiments, in the order given.
 
         Args:
@@ -332,9 +321,7 @@ class Data(Ports):
         t = self.transform
         return self._with(
             experiments=tuple(Experiment(_frozen(e.u[:, i]), _frozen(e.y[:, o]), e.start) for e in kept),
-            inputs=_take(self.inputs, i),
-            outputs=_take(self.outputs, o),
-            input_units=_take(self.input_units, i),
+            inputs=_take(self.inputs, i), outputs=_take(self.outputs, o), input_units=_take(self.input_units, i),
             output_units=_take(self.output_units, o),
             transform=Transform(_take(t.u_scale, i), _take(t.u_offset, i), _take(t.y_scale, o), _take(t.y_offset, o)),
         )

@@ -50,13 +50,8 @@ def mapped(function: Callable[[One], Result], parts: Iterable[One], threads: int
             yield running.popleft().result()
 
 
-def reduced(
-    parts: Sequence[Part],
-    leaf: Callable[[Part], Result],
-    merge: Callable[[Sequence[Result]], Result],
-    scheduler: Any = None,
-    threads: int = 1,
-) -> Result:
+def reduced(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callable[[Sequence[Result]], Result],
+            scheduler: Any = None, threads: int = 1) -> Result:
     """Return the merged results of all parts.
 
     Args:

@@ -10,11 +10,10 @@ import numpy as np
 
 from optid.arrays import check_integer
 from optid.data.channels import Ports, Transform, channel_fields, sampling_time
-from optid.data.reading.chunks import Channels, Chunk
+from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surveyed
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
 from optid.data.reading.parts import Part
 from optid.data.reading.sources import Source, open_source
-from optid.data.reading.survey import Survey, joined, surveyed, widened
 from optid.data.reduction import available_threads, fetched, reduced
 from optid.errors import DataError
 
@@ -47,28 +46,38 @@ class Stream(Ports):
     name: str
     n_samples: int | None
     _channels: Channels = field(repr=False, compare=False)
-    _whole: Source = field(repr=False, compare=False)
+    _whole: Part | None = field(repr=False, compare=False)
     parts: tuple[Part, ...] = field(default=(), repr=False)
     scheduler: Any = field(default=None, repr=False)
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        if not self.parts:
-            return _not_empty(self._channels.read(self._whole), self._whole.label)
         if self.n_experiments > 1:
             raise DataError(f"this stream has {self.n_experiments} experiments; one at a time can be read in order.")
-        return _not_empty(self._in_order(), self.name)
+        return self._in_order()
 
-    def _in_order(self) -> Iterator[Chunk]:
-        """Chunks of all parts of the one experiment; the clock must run on from each part to the next."""
-        last, before = None, ""
-        for part in self.parts:
+    def _in_order(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Samples of all parts of the one experiment; the clock must run on from each part to the next."""
+        last, done = None, 0
+        for part in self._sources():
             begun = False
-            for u, y, stamps in self._channels.read(fetched(part, self.scheduler)):
+            for u, y, stamps in self._channels.read(part):
                 if stamps is not None and stamps.size:
-                    if last is not None and not begun:
-                        self._channels.check_border(last, before, stamps[:1], part.label)
-                    begun, last, before = True, stamps[-1:].copy(), part.label
-                yield u, y, stamps
+                    if not begun:
+                        self._channels.check_border(last, End(part.label, part.experiment, stamps[:1]))
+                    begun, last = True, End(part.label, part.experiment, stamps[-1:].copy())
+                done += len(u)
+                yield u, y
+        if not done:
+            raise self._no_rows()
+
+    def _no_rows(self) -> DataError:
+        return DataError(f"{self.name if self._whole is None else self._whole.label} has no rows.")
+
+    def _sources(self) -> Iterator[Part]:
+        """Parts with what Dask computes of them, or the whole record where it is read in one go."""
+        yield from (fetched(part, self.scheduler) for part in self.parts)
+        if not self.parts and self._whole is not None:
+            yield self._whole
 
     @property
     def n_experiments(self) -> int:
@@ -89,33 +98,28 @@ class Stream(Ports):
 
     def first_chunk(self) -> tuple[np.ndarray, np.ndarray]:
         """Return (u, y) of the first chunk in which every output has a sample; of the last one where none has."""
-        source = fetched(self.parts[0], self.scheduler) if self.parts else self._whole
         found = np.empty((0, self.m)), np.empty((0, self.l))
-        for u, y, _ in self._channels.read(source):
+        for u, y, _ in self._channels.read(next(self._sources())):
             found = u, y
             if not np.isnan(y).all(axis=0).any():
                 break
         return found
 
-    def reduced(
-        self,
-        leaf: Callable[[Part, Iterable[Chunk]], Result],
-        merge: Callable[[Sequence[Result]], Result],
-        threads: int = 1,
-    ) -> Result:
+    def reduced(self, leaf: Callable[[Part, Iterable[Chunk]], Result], merge: Callable[[Sequence[Result]], Result],
+                threads: int = 1) -> Result:
         """Reduce the parts, each with its chunks, where they are read; see `optid.data.reduction.reduced`."""
         return reduced(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
 
     @property
     def lengths(self) -> tuple[int, ...]:
         """Samples of each experiment; a pass is made where only that can tell."""
+        if self.n_samples is None:
+            return tuple(self._survey.lengths[i] for i in range(self.n_experiments))
         if not self.parts:
-            return (sum(len(u) for u, _ in self) if self.n_samples is None else self.n_samples,)
+            return (self.n_samples,)
         totals = [0] * self.n_experiments
         for part in self.parts:
-            if part.n_samples is None:
-                return tuple(self._survey.lengths[i] for i in range(self.n_experiments))
-            totals[part.experiment] += part.n_samples
+            totals[part.experiment] += part.n_samples or 0
         return tuple(totals)
 
     def ranges(self) -> tuple[np.ndarray, np.ndarray]:
@@ -124,38 +128,32 @@ class Stream(Ports):
         Raises:
             DataError: every sample of an input is missing.
         """
-        return self._ranges[0].copy(), self._ranges[1].copy()
-
-    @cached_property
-    def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
-        lo = hi = np.full(self.m, np.nan)
-        for u in [np.array([self._survey.lo, self._survey.hi])] if self.parts else (u for u, _ in self):
-            lo, hi = widened(lo, hi, u)
-        for name, value in zip(self.inputs, lo):
+        for name, value in zip(self.inputs, self._survey.lo):
             if np.isnan(value):
                 raise DataError(f"channel {name!r}: every sample is missing. Check the column, or leave it out.")
-        return lo, hi
+        units = self._channels.units or self.transform
+        return units.apply_u(self._survey.lo), units.apply_u(self._survey.hi)
 
     @cached_property
     def _survey(self) -> Survey:
-        return self.reduced(surveyed, partial(joined, self._channels), available_threads(None))
+        """Lengths, and ranges in raw units."""
+        channels = replace(self._channels, units=None)
+        if self.parts:
+            found = reduced(self.parts, partial(_of_part, surveyed, channels), partial(joined, channels),
+                            self.scheduler, available_threads(None))
+        else:
+            whole = next(self._sources())
+            found = surveyed(whole, channels.read(whole))
+        if not any(found.lengths.values()):
+            raise self._no_rows()
+        return found
 
 
 def open_stream(  # noqa: D417 - the others stand with `read`
-    source: Any,
-    inputs: Wanted = None,
-    outputs: Wanted = None,
-    dt: float | None = None,
-    chunk: int = CHUNK,
-    *,
-    time: str | int | bool | None = None,
-    columns: Sequence[str] | None = None,
-    input_units: str | Sequence[str] | None = None,
-    output_units: str | Sequence[str] | None = None,
-    name: str | None = None,
-    delimiter: str = ",",
-    decimal: str = ".",
-    time_tolerance: float = TIME_TOLERANCE,
+    source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None, chunk: int = CHUNK, *,
+    time: str | int | bool | None = None, columns: Sequence[str] | None = None,
+    input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
+    name: str | None = None, delimiter: str = ",", decimal: str = ".", time_tolerance: float = TIME_TOLERANCE,
     scheduler: Any = None,
 ) -> Stream:
     """Open a record that need not fit into memory; nothing but headers is read yet.
@@ -197,24 +195,21 @@ def open_stream(  # noqa: D417 - the others stand with `read`
             pass
     parts: list[Part] = []
     read = [*ins.values(), *outs.values(), *([clock] if clock else [])]
-    if scheduler is not None or len(opened) > 1 or opened[0].blocks is None:
+    if scheduler is not None or len(opened) > 1 or opened[0].whole is None:
         parts = [replace(part, experiment=i) for i, one in enumerate(opened) for part in one.parts(read)]
         if len({part.experiment for part in parts}) < len(opened):
             raise DataError("a source of the list has no rows.")
     if clock is not None:
-        found, where = _step((fetched(part, scheduler) for part in parts) if parts else opened, clock, time_tolerance)
+        sources = (fetched(part, scheduler) for part in parts) if parts else (one.whole for one in opened)
+        found, where = _step(sources, clock, time_tolerance)
         dt = agreed_step(found, dt, time_tolerance, where)
     step = 1.0 if dt is None else dt
     lengths = [one.n_samples for one in opened]
     label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
     return Stream(
-        **names,
-        dt=step,
-        name=label if name is None else name,
+        **names, dt=step, name=label if name is None else name,
         n_samples=None if None in lengths else sum(n for n in lengths if n is not None),
-        _channels=Channels(ins, outs, clock, step, time_tolerance),
-        _whole=opened[0],
-        parts=tuple(parts),
+        _channels=Channels(ins, outs, clock, step, time_tolerance), _whole=opened[0].whole, parts=tuple(parts),
         scheduler=scheduler,
     )
 
@@ -247,12 +242,3 @@ def _step(sources: Iterable[Any], clock: str, tolerance: float) -> tuple[float |
 
 def _of_part(leaf: Callable[[Part, Iterable[Chunk]], Any], channels: Channels, part: Part) -> Any:
     return leaf(part, channels.read(part))
-
-
-def _not_empty(chunks: Iterable[Chunk], label: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    done = 0
-    for u, y, _ in chunks:
-        done += len(u)
-        yield u, y
-    if not done:
-        raise DataError(f"{label} has no rows.")

@@ -8,11 +8,12 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
+from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
 from optid.identify.validation.predictions import one_step, simulated
-from optid.models.functions import has_feedback, response_pairs, static_functions, step_length
+from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions, step_length
 from optid.show.estimates import uncertainty
-from optid.show.sections import Axis, Chart, Series
+from optid.show.sections import Axis, Chart, Series, decibels
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -28,7 +29,22 @@ def _unit(name: str, unit: str) -> Axis:
     return Axis(f"{name} ({unit})" if unit else name, unit=unit)
 
 
-def _free_run(model: Any, record: Data) -> list[Array] | None:
+def validated(model: Any, record: Data) -> "Validation":
+    """Validate a model without the warnings, which stand in the notes."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        return validate(model, record)
+
+
+def visited(function: StaticFunction, record: Data | None) -> Array:
+    """Where the argument of a function has been; nowhere where the simulation of a latent one runs away."""
+    try:
+        return np.zeros(0) if record is None else function.samples(record)
+    except DataError:
+        return np.zeros(0)
+
+
+def free_run(model: Any, record: Data) -> list[Array] | None:
     """Simulated outputs, or None where an input is missing or the model runs away."""
     if not (model.is_stable or has_feedback(model)):
         return None
@@ -43,7 +59,7 @@ def _free_run(model: Any, record: Data) -> list[Array] | None:
 def record_charts(models: dict[str, Any], data: Data, *, ahead: bool = True, group: str = "time") -> list[Chart]:
     """Measured outputs, simulations of models, and one-step predictions of a single one; inputs below, linked."""
     record, charts = data.raw(), []
-    runs = {name: _free_run(model, record) for name, model in models.items()}
+    runs = {name: free_run(model, record) for name, model in models.items()}
     predicted = one_step(next(iter(models.values())), record) if ahead else None
     for k, e in enumerate(record.experiments[:MOST_EXPERIMENTS]):
         t = e.start + record.dt * np.arange(e.n_samples, dtype=float)
@@ -72,10 +88,7 @@ def nonlinearity_charts(fit: "Fit") -> list[Chart]:
         if function.is_linear:
             continue
         f = function.nonlinearity
-        try:
-            samples = np.zeros(0) if record is None else function.samples(record)
-        except DataError:  # the run of a latent signal leaves the range of the record
-            samples = np.zeros(0)
+        samples = visited(function, record)
         samples = samples[np.isfinite(samples)]
         ends = f.basis.interval or ((samples.min(), samples.max()) if samples.size else (-1.0, 1.0))
         low, high = map(float, ends)
@@ -112,11 +125,11 @@ def dynamics_charts(models: dict[str, Any], fit: "Fit | None" = None) -> list[Ch
             name = " ".join(part for part in (label, f"{u} to {y}" if len(pairs) > 1 else "") if part) or "response"
             if size is not None and turn is not None:
                 lower, upper = (edge.reshape(w.size, -1)[:, k] for edge in (size.lower, size.upper))
-                magnitude.append(Series("95 % band" if len(pairs) == 1 else "", w, _decibels(upper), "area", colour,
-                                        _decibels(lower)))
+                magnitude.append(Series("95 % band" if len(pairs) == 1 else "", w, decibels(upper), "area", colour,
+                                        decibels(lower)))
                 lower, upper = (np.degrees(edge.reshape(w.size, -1)[:, k]) for edge in (turn.lower, turn.upper))
                 phase.append(Series("95 % band" if len(pairs) == 1 else "", w, upper, "area", colour, lower))
-            magnitude.append(Series(name, w, _decibels(np.abs(curves[:, k])), colour=colour, width=2.0))
+            magnitude.append(Series(name, w, decibels(np.abs(curves[:, k])), colour=colour, width=2.0))
             phase.append(Series(name, w, np.degrees(np.unwrap(np.angle(curves[:, k]))), colour=colour, width=2.0))
             steps.append(Series(name, t, response[:, k], colour=colour, width=2.0))
     frequency = Axis("frequency (rad per unit of time)", log=True, low=float(w[0]), high=float(w[-1]))
@@ -223,7 +236,3 @@ def order_charts(study: "OrderStudy") -> list[Chart]:
                   Axis("number of states"), Axis("size", log=True), tails),
             Chart("Prediction errors", "Criteria per window above the best; the smallest is preferred.",
                   Axis("number of states"), Axis("above the best"), best)]
-
-
-def _decibels(magnitude: Array) -> Array:
-    return 20 * np.log10(np.maximum(magnitude, 1e-12))

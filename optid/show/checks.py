@@ -16,16 +16,8 @@ if TYPE_CHECKING:
 def validation_tables(checked: "Validation") -> list[Table]:
     """Errors of prediction and simulation, by experiment where there are several, and the tests."""
     errors = [
-        (
-            f"{name}, {word}",
-            f"{q.fit:.2f}",
-            f"{q.vaf:.2f}",
-            number(q.rmse, 4),
-            number(q.e_n, 4),
-            number(q.snr, 4),
-            number(q.snr_amplitude, 3),
-            str(q.samples),
-        )
+        (f"{name}, {word}", f"{q.fit:.2f}", f"{q.vaf:.2f}", number(q.rmse, 4), number(q.e_n, 4), number(q.snr, 4),
+         number(q.snr_amplitude, 3), str(q.samples))
         for name in checked.one_step
         for word, table in checked.predictors.items()
         for q in (table[name],)
@@ -101,12 +93,9 @@ def comparison_table(found: "Comparison") -> Table:
 def facts_table(found: "Comparison") -> Table:
     """Kind, orders, number of coefficients and largest pole of every model."""
     rows = [
-        (
-            name,
-            model.title,
-            str(len(model.coefficients()) + sum(f.nonlinearity.mu.size for f in static_functions(model))),
-            number(float(np.max(np.abs(model.poles), initial=0.0)), 4),
-        )
+        (name, model.title,
+         str(len(model.coefficients()) + sum(f.nonlinearity.mu.size for f in static_functions(model))),
+         number(float(np.max(np.abs(model.poles), initial=0.0)), 4))
         for name, model in zip(found.names, found.models)
     ]
     return Table("Models", ("model", "kind", "numbers", "largest pole"), rows)

@@ -1,29 +1,16 @@
 """What every result has to say, most important first: the documents that terminal, notebook and page render."""
 
-import warnings
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning
-from optid.identify.validation import Validation, validate
+from optid.errors import DataError
+from optid.identify.validation import Validation
 from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT, POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
-from optid.show.order_table import describe as describe_order
-from optid.show.sections import (
-    TONES,
-    Banner,
-    Charts,
-    Code,
-    Columns,
-    Document,
-    Fold,
-    Heading,
-    Notes,
-    Pair,
-    Section,
-)
+from optid.show.sections import TONES, Banner, Charts, Code, Columns, Document, Fold, Heading, Notes, Pair, Section
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -31,6 +18,9 @@ if TYPE_CHECKING:
     from optid.identify.search import Identification
     from optid.identify.validation import Comparison
     from optid.identify.verdict import Verdict
+
+ORDERS = 12
+"""Orders listed of a study, where the recommended one is not larger."""
 
 ADVISED = ("poor", "useless")
 """Verdicts with which a page says what would help; to know it, neighbouring structures are fitted."""
@@ -90,7 +80,7 @@ def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Se
     which = ", lowest output" if fit.model.l > 1 else ""
     fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
     if test is not None:
-        simulated = [q.fit for q in _validated(fit, test).simulation.values()]
+        simulated = [q.fit for q in charts.validated(fit.model, test).simulation.values()]
         fits.append(("simulation fit, test record", np.array(simulated or np.nan)))
     cards = tuple((label + which, wording.percent(np.min(values))) for label, values in fits)
     advice = [str(one) for one in fit.advice] if advise and judged.word in ADVISED else []
@@ -114,12 +104,6 @@ def _optimum(fit: "Fit") -> Section:
                                    *([Notes(fit.findings)] if fit.findings else [])])
 
 
-def _validated(fit: "Fit", record: Data) -> Validation:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # they stand in the notes
-        return validate(fit.model, record)
-
-
 def _fit_charts(fit: "Fit") -> list[Any]:
     parts: list[Any] = []
     if isinstance(fit.data, Data):
@@ -139,7 +123,7 @@ def _validations(fit: "Fit", test: Data | None) -> list[Any]:
     parts: list[Any] = []
     for title, record in (("Estimation record", fit.data), ("Test record, not seen by the fit", test)):
         if isinstance(record, Data):
-            parts += [Heading(title), *validation_parts(_validated(fit, record))]
+            parts += [Heading(title), *validation_parts(charts.validated(fit.model, record))]
             if record is test:
                 parts.append(Charts(charts.record_charts({"": fit.model}, record, group="test"), wide=True))
     return parts
@@ -220,10 +204,44 @@ def order_document(study: "OrderStudy") -> Document:
     return Document(f"Order of {study.data}" if study.data else "Order", f"recommended: nx = {study.nx}", [
         Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
                                             Charts(charts.order_charts(study)),
-                                            Fold("Tables", [Code(describe_order(study))])])])
+                                            Fold("Tables", [Code(order_text(study))])])])
 
 
 def require_model(fit: "Fit") -> None:
     """Refuse a fit that ended without a model (`DataError`)."""
     if fit.model is None:
         raise DataError(f"there is no model to report: the fit ended with status '{fit.solution.status}'")
+
+
+def order_text(study: "OrderStudy") -> str:
+    """Return tables, recommendation and reasons, at most 80 columns wide."""
+    ranks, states = study.ranks, study.states
+    lines = [f"Order of {study.data}" if study.data else "Order"]
+    lines.append(f"  {ranks.windows} windows, {study.block_rows} block rows, level {ranks.level:.2g}")
+    heads = f"{'s(n)':>11}{'s/s next':>10}{'tail':>11}{'threshold':>11}{'p':>9}{'BIC':>11}{'hold-out %':>12}"
+    lines.append(f"  {'n':>3}{heads}")
+    roots = np.sqrt(ranks.statistics), np.sqrt(ranks.thresholds)
+    bic = states.bic - states.bic.min()
+    for n in range(min(max(ORDERS, study.nx + 3), ranks.singular_values.size)):
+        single = f"{ranks.singular_values[n - 1]:11.4g}" if n else f"{'':11}"
+        ratio = f"{ranks.ratios[n - 1]:10.3g}" if 0 < n <= ranks.ratios.size else f"{'':10}"
+        cost = f"{bic[n]:11.1f}" if n < bic.size else f"{'':11}"
+        fit = f"{states.fit[n]:12.2f}" if n < bic.size and np.isfinite(states.fit[n]) else f"{'':12}"
+        mark = " <" if n == study.nx else ""
+        tail = f"{roots[0][n]:11.4g}{roots[1][n]:11.4g}{ranks.p_values[n]:9.2g}"
+        lines.append(f"  {n:>3}{single}{ratio}{tail}{cost}{fit}{mark}"[:80])
+    if study.lags is not None:
+        lines.append(f"  {'lags by':<10}{'':<34}{'BIC':>12}{'hold-out %':>12}")
+        for name in ("aicc", "bic", "fit"):
+            if name != "fit" or any(np.isfinite(c.fit) for c in study.lags.candidates):
+                one = study.lags.best(name)
+                fit = f"{one.fit:12.2f}" if np.isfinite(one.fit) else ""
+                word = {"fit": "hold-out", "aicc": "AICc", "bic": "BIC"}[name]
+                lines.append(f"  {word:<10}{str(one):<34}{one.bic:12.1f}{fit}"[:80])
+    said = f"nx = {study.nx}"
+    if study.lags is not None:
+        said += f"; {study.lags.best('bic')}"
+    lines.append(f"Recommended: {said}")
+    for reason in (*study.reasons, *(f"note: {note}" for note in study.notes)):
+        lines += textwrap.wrap(reason, 80, initial_indent="  - ", subsequent_indent="    ")
+    return "\n".join(lines)

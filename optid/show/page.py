@@ -18,8 +18,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from optid import __version__
-from optid.show.sections import Chart, Document, Series
-from optid.show.svg import inline
+from optid.show.sections import Chart, Document, Series, extremes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,24 +74,11 @@ def _series(one: Series) -> dict[str, Any]:
     xs, ys, lows = (None if v is None else np.asarray(v, dtype=float) for v in (one.xs, one.ys, one.lows))
     assert xs is not None and ys is not None
     if ys.size > MOST:
-        kept = _extremes(ys, MOST // 2)
+        kept = extremes(ys, MOST // 2)
         xs, ys, lows = xs[kept], ys[kept], None if lows is None else lows[kept]
     coded = {"name": one.name, "kind": one.kind, "colour": f"var(--{one.colour})", "dash": one.dash,
              "width": one.width, "aside": one.aside, "xs": _numbers(xs, "<f8"), "ys": _numbers(ys, "<f4")}
     return coded if lows is None else {**coded, "lows": _numbers(lows, "<f4")}
-
-
-def _extremes(values: np.ndarray, bins: int) -> np.ndarray:
-    """Return the indices of the smallest and the largest value of each of so many stretches."""
-    edges = np.linspace(0, values.size, bins + 1).astype(int)
-    kept = set()
-    for a, b in zip(edges[:-1], edges[1:]):
-        part = values[a:b]
-        here = np.isfinite(part)
-        kept |= {a} if not here.all() else set()
-        if here.any():
-            kept |= {a + int(np.nanargmin(part)), a + int(np.nanargmax(part))}
-    return np.array(sorted(kept))
 
 
 def _numbers(values: np.ndarray, kind: str) -> Any:
@@ -143,4 +129,6 @@ def figure(name: str, draw: Callable[[], "Figure"], caption: str) -> dict[str, A
         draw: makes the figure.
         caption: what stands below it, and for screen readers in place of it.
     """
+    from optid.show.svg import inline
+
     return {"svg": inline(draw(), name, caption), "caption": caption}

@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 
 from optid.arrays import Array
 from optid.identify.validation.correlations import Correlation
+from optid.show.sections import decibels, extremes
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
 BLUE, ORANGE, GREEN, RED = "#1063b5", "#a84e00", "#007a3e", "#b82e47"
@@ -98,14 +99,7 @@ def thinned(t: Array, y: Array) -> tuple[Array, Array]:
     """Keep the extremes of every bin of a long line, so that no peak is lost; t, y (N,) become `POINTS` long."""
     if y.size <= POINTS:
         return t, y
-    edges = np.linspace(0, y.size, POINTS // 2 + 1).astype(int)
-    picked = []
-    for a, b in zip(edges[:-1], edges[1:]):
-        part = y[a:b]
-        if np.isnan(part).all():
-            picked.append(a)
-            continue
-        picked += sorted({a + int(np.nanargmin(part)), a + int(np.nanargmax(part))})
+    picked = extremes(y, POINTS // 2)
     return t[picked], y[picked]
 
 
@@ -154,17 +148,8 @@ def draw_nonlinearity(
     here = u[(u >= low) & (u <= high)]
     if here.size:
         counts, edges = np.histogram(here, bins=40, range=(low, high))
-        ax.bar(
-            edges[:-1],
-            0.16 * counts / counts.max(),
-            np.diff(edges),
-            align="edge",
-            color=MUTED,
-            alpha=0.3,
-            linewidth=0,
-            transform=ax.get_xaxis_transform(),
-            label="samples",
-        )
+        ax.bar(edges[:-1], 0.16 * counts / counts.max(), np.diff(edges), align="edge", color=MUTED, alpha=0.3,
+               linewidth=0, transform=ax.get_xaxis_transform(), label="samples")
     ax.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
     ax.set_xlabel(name)
     ax.legend(loc="best", handlelength=1.4)
@@ -228,8 +213,8 @@ def draw_response(
     for k, (label, band) in enumerate(zip(labels, bands)):
         colour, dash = LINES[k % len(LINES)]
         if band is not None:
-            ax.fill_between(w, _decibels(band[0]), _decibels(band[1]), color=colour, alpha=0.2, linewidth=0)
-        ax.plot(w, _decibels(np.abs(response[:, k])), dash, color=colour, label=label)
+            ax.fill_between(w, decibels(band[0]), decibels(band[1]), color=colour, alpha=0.2, linewidth=0)
+        ax.plot(w, decibels(np.abs(response[:, k])), dash, color=colour, label=label)
     ax.set_xscale("log")
     ax.set_xlim(w[0], w[-1])
     ax.set(xlabel="frequency (rad per unit of time)", ylabel="magnitude (dB)")
@@ -238,55 +223,21 @@ def draw_response(
         ax.legend(loc="lower left", ncols=2, handlelength=1.6)
 
 
-def _decibels(magnitude: Array) -> Array:
-    return 20 * np.log10(np.maximum(magnitude, 1e-12))
-
-
 def draw_gap(ax: Axes, gap: float, threshold: float) -> None:
     """Draw the relative gap on a logarithmic scale, with the part of it that counts as a proof."""
-    low, high = 1e-16, 1.0
-    ax.axvspan(low, threshold, color=GREEN, alpha=0.14, linewidth=0)
-    ax.axvspan(threshold, high, color=ORANGE, alpha=0.12, linewidth=0)
-    ax.text(
-        np.sqrt(low * threshold),
-        0.83,
-        "proved",
-        color=GREEN,
-        ha="center",
-        va="center",
-        transform=ax.get_xaxis_transform(),
-    )
-    ax.text(
-        np.sqrt(threshold * high),
-        0.83,
-        "not proved",
-        color=ORANGE,
-        ha="center",
-        va="center",
-        transform=ax.get_xaxis_transform(),
-    )
+    low, high, across = 1e-16, 1.0, ax.get_xaxis_transform()
+    for word, start, end, colour, shade in (
+        ("proved", low, threshold, GREEN, 0.14), ("not proved", threshold, high, ORANGE, 0.12)
+    ):
+        ax.axvspan(start, end, color=colour, alpha=shade, linewidth=0)
+        ax.text(np.sqrt(start * end), 0.83, word, color=colour, ha="center", va="center", transform=across)
     if np.isfinite(gap):
         at = float(np.clip(gap, 2 * low, high))
-        ax.plot(
-            [at],
-            [0.42],
-            "D",
-            color=GREEN if gap <= threshold else ORANGE,
-            markersize=9,
-            transform=ax.get_xaxis_transform(),
-            clip_on=False,
-        )
-        left = at < threshold
-        ax.annotate(
-            f"{gap:.1e}" if gap else "0",
-            (at, 0.42),
-            xycoords=ax.get_xaxis_transform(),
-            xytext=(9 if left else -9, 0),
-            textcoords="offset points",
-            va="center",
-            ha="left" if left else "right",
-            fontweight="bold",
-        )
+        colour = GREEN if gap <= threshold else ORANGE
+        ax.plot([at], [0.42], "D", color=colour, markersize=9, transform=across, clip_on=False)
+        shift, side = (9, "left") if at < threshold else (-9, "right")
+        ax.annotate(f"{gap:.1e}" if gap else "0", (at, 0.42), xycoords=across, xytext=(shift, 0),
+                    textcoords="offset points", va="center", ha=side, fontweight="bold")
     ax.set_xscale("log")
     ax.set(xlim=(low, high), yticks=[], xlabel="relative gap between objective and certified bound")
     ax.spines["left"].set_visible(False)
@@ -298,36 +249,16 @@ def draw_ladder(ax: Axes, rungs: Sequence[str], reached: int, closed: bool) -> N
     ax.set_axis_off()
     ax.set(xlim=(0, len(rungs)), ylim=(0, 1))
     for i, rung in enumerate(rungs):
-        last = i == reached
+        last, taken = i == reached, i <= reached
         colour = (GREEN if closed else ORANGE) if last else MUTED
-        ax.add_patch(
-            FancyBboxPatch(
-                (i + 0.08, 0.2),
-                0.84,
-                0.6,
-                boxstyle="round,pad=0,rounding_size=0.1",
-                facecolor=colour if last else "none",
-                edgecolor=colour,
-                linewidth=1.1,
-                alpha=1.0 if i <= reached else 0.4,
-                mutation_aspect=0.5,
-            )
-        )
-        ax.text(
-            i + 0.5,
-            0.5,
-            rung,
-            ha="center",
-            va="center",
-            color=PANEL if last else (INK if i <= reached else MUTED),
-            fontsize=8.5,
-            fontweight="bold" if last else "normal",
-            alpha=1.0 if i <= reached else 0.6,
-        )
+        ax.add_patch(FancyBboxPatch(
+            (i + 0.08, 0.2), 0.84, 0.6, boxstyle="round,pad=0,rounding_size=0.1", facecolor=colour if last else "none",
+            edgecolor=colour, linewidth=1.1, alpha=1.0 if taken else 0.4, mutation_aspect=0.5))
+        ax.text(i + 0.5, 0.5, rung, ha="center", va="center", color=PANEL if last else INK if taken else MUTED,
+                fontsize=8.5, fontweight="bold" if last else "normal", alpha=1.0 if taken else 0.6)
         if i + 1 < len(rungs):
-            ax.annotate(
-                "", (i + 1.08, 0.5), (i + 0.92, 0.5), arrowprops={"arrowstyle": "-", "color": MUTED, "alpha": 0.6}
-            )
+            ax.annotate("", (i + 1.08, 0.5), (i + 0.92, 0.5),
+                        arrowprops={"arrowstyle": "-", "color": MUTED, "alpha": 0.6})
 
 
 def draw_singular_values(ax: Axes, values: Array, name: str, rank: int = 1) -> None:

@@ -3,7 +3,6 @@
 Long records are thinned to the extremes of every bin, so that figures stay small and no peak is lost.
 """
 
-import warnings
 from collections.abc import Sequence
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, cast
@@ -13,12 +12,13 @@ from matplotlib.figure import Figure
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning
-from optid.identify.validation import Validation, validate
-from optid.identify.validation.predictions import one_step, simulated
+from optid.errors import DataError
+from optid.identify.validation import Validation
+from optid.identify.validation.predictions import one_step
 from optid.lazy import public_names
-from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions, step_length
+from optid.models.functions import StaticFunction, response_pairs, static_functions, step_length
 from optid.show import panels, summary
+from optid.show.charts import free_run, validated, visited
 from optid.show.estimates import uncertainty
 from optid.show.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
 from optid.structures.least_squares import rank_one_of
@@ -61,7 +61,7 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
         left, right = rows[1].subfigures(1, 2, width_ratios=[1, 1.45])
         _nonlinearity_panels(left, fit)
         _dynamics_panels(right, fit)
-    _residual_panels(rows[-1], _checked(fit, record), record, outputs=1, inputs=min(model.m, 2))
+    _residual_panels(rows[-1], validated(fit.model, record), record, outputs=1, inputs=min(model.m, 2))
     return figure
 
 
@@ -106,7 +106,7 @@ def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | N
     """
     record = _record(fit, data)
     figure = Figure(figsize=(9.0, 2.5 * record.l), layout="constrained")
-    _residual_panels(figure, checked or _checked(fit, record), record, outputs=record.l, inputs=record.m)
+    _residual_panels(figure, checked or validated(fit.model, record), record, outputs=record.l, inputs=record.m)
     return figure
 
 
@@ -205,38 +205,19 @@ def _record(fit: "Fit", data: Data | None) -> Data:
     return record.raw()
 
 
-def _longest(record: Data) -> int:
-    return max(e.n_samples for e in record.experiments)
-
-
 def _needs_closeup(record: Data, factor: int) -> bool:
     """Whether a record is one long experiment, in which single samples cannot be told apart."""
     return record.n_experiments == 1 and record.n_samples > factor * CLOSEUP
-
-
-def _shown_simulation(fit: "Fit", record: Data) -> list[Array] | None:
-    """Simulated outputs, or None where an input is missing or the model runs away."""
-    if not (fit.model.is_stable or has_feedback(fit.model)):
-        return None
-    try:
-        return simulated(fit.model, record)
-    except DataError:
-        return None
 
 
 def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: bool = False) -> None:
     """Fill a figure with one row per output (two with close-ups), one column per experiment."""
     shown = record.experiments[:MOST_EXPERIMENTS]
     heights = [1.25, 1.0] * record.l if closeup else [1.0] * record.l
-    axes = figure.subplots(
-        len(heights),
-        len(shown),
-        squeeze=False,
-        sharey="row",
-        height_ratios=heights,
-        width_ratios=[max(e.n_samples, 0.25 * _longest(record)) for e in shown],
-    )
-    predicted, free = one_step(fit.model, record), _shown_simulation(fit, record)
+    longest = max(e.n_samples for e in record.experiments)
+    axes = figure.subplots(len(heights), len(shown), squeeze=False, sharey="row", height_ratios=heights,
+                           width_ratios=[max(e.n_samples, 0.25 * longest) for e in shown])
+    predicted, free = one_step(fit.model, record), free_run(fit.model, record)
     for k, e in enumerate(shown):
         t = e.start + record.dt * np.arange(e.n_samples, dtype=float)
         for o, name in enumerate(record.outputs):
@@ -278,30 +259,10 @@ def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
     for ax in list(axes.flat)[len(functions) :]:
         ax.set_axis_off()
     for ax, function in zip(axes.flat, functions):
-        panels.draw_nonlinearity(
-            ax,
-            function.nonlinearity,
-            np.zeros(0) if record is None else _samples(function, record),
-            _f_band(fit, function),
-            name=with_unit(function.name, function.unit),
-            label=plain(function.word),
-        )
+        panels.draw_nonlinearity(ax, function.nonlinearity, visited(function, record), _f_band(fit, function),
+                                 name=with_unit(function.name, function.unit), label=plain(function.word))
         ax.set_ylabel(plain(f"{function.word}({function.name})"))
         ax.set_title(function.what if len(functions) == 1 else with_unit(f"{function.what} of {function.name}", ""))
-
-
-def _samples(function: StaticFunction, record: Data) -> Array:
-    """Where the argument of a function has been; nowhere where the simulation of a latent one runs away."""
-    try:
-        return function.samples(record)
-    except DataError:
-        return np.zeros(0)
-
-
-def _checked(fit: "Fit", record: Data) -> Validation:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)
-        return validate(fit.model, record)
 
 
 def _residual_panels(figure: Any, checked: Validation, record: Data, outputs: int, inputs: int) -> None:

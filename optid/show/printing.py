@@ -8,6 +8,7 @@ from optid.show.terminal import WIDTH, facts_lines, set_table, text, wrapped
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
     from optid.identify.parameters import Parameters
+    from optid.identify.search import Identification
     from optid.identify.validation import Comparison, HorizonCurve, Validation
     from optid.identify.verdict import Verdict
 
@@ -48,3 +49,19 @@ def describe_comparison(found: "Comparison") -> str:
 def describe_parameters(found: "Parameters") -> str:
     """Return estimates with their intervals as text, at most 80 columns wide."""
     return "\n".join(set_table(estimates.parameters_table(found)))
+
+
+def describe_search(found: "Identification") -> str:
+    """Return the search and the fit it ended with as text, at most 80 columns wide."""
+    return "\n".join([*search_lines(found), "", describe(found.fit, found.verdict)])
+
+
+def search_lines(found: "Identification") -> list[str]:
+    """Return the table of the best structures by class, and the reasons of the choice, line by line."""
+    lines = set_table(checks.search_table(found))
+    lines += [line for reason in found.reasons for line in wrapped(f"- {reason}")]
+    chosen = found.chosen.candidate
+    lines += ["", *wrapped(f"Chosen: --formulation {chosen.formulation} {chosen.words}", "    ")]
+    if found.stopped:
+        lines += wrapped(f"Note: the search was ended by {found.stopped}; more time may find a better structure")
+    return lines

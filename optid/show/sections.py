@@ -4,6 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
 from optid.show.wording import Table
 
 Facts = list[tuple[str, str]]
@@ -159,3 +163,21 @@ class Document:
     title: str
     lead: str
     sections: Sequence[Section]
+
+
+def extremes(values: Array, bins: int) -> NDArray[np.intp]:
+    """Return the places of the smallest and the largest of each of so many stretches of values (N,), and of gaps."""
+    kept = set()
+    edges = np.linspace(0, values.size, bins + 1).astype(int)
+    for a, b in zip(edges[:-1], edges[1:]):
+        part = values[a:b]
+        here = np.isfinite(part)
+        kept |= {a} if not here.all() else set()
+        if here.any():
+            kept |= {a + int(np.nanargmin(part)), a + int(np.nanargmax(part))}
+    return np.array(sorted(kept))
+
+
+def decibels(magnitude: Array) -> Array:
+    """Return magnitudes in dB."""
+    return 20 * np.log10(np.maximum(magnitude, 1e-12))

@@ -88,15 +88,8 @@ def constraint_table(fit: "Fit") -> Table:
     for p in fit.prices:
         state = f"active ({p.active} of {p.rows})" if p.binding else "not active"
         priced = p.binding and not np.isnan(p.multiplier)
-        rows.append(
-            (
-                p.name,
-                state,
-                "-" if p.binding else number(p.slack, 3),
-                number(p.multiplier, 3) if priced else "-",
-                number(p.points_per_step, 3) if priced else "-",
-            )
-        )
+        rows.append((p.name, state, "-" if p.binding else number(p.slack, 3),
+                     *(number(value, 3) if priced else "-" for value in (p.multiplier, p.points_per_step))))
     return Table("Constraints", ("constraint", "state", "slack", "multiplier", "price"), rows, PRICE_NOTE)
 
 
@@ -115,10 +108,8 @@ def certificate_facts(fit: "Fit") -> Facts:
     if r is not None:
         worst = f" in {r.worst!r}" if r.violation > 0 and r.worst else ""
         facts.append(("Largest violation", f"{gap_text(r.violation)}{worst}"))
-        facts.append(("Stationarity", f"{r.stationarity:.1e}" if np.isfinite(r.stationarity) else "not measured"))
-        facts.append(
-            ("Complementarity", f"{r.complementarity:.1e}" if np.isfinite(r.complementarity) else "not measured")
-        )
+        facts += [(name, f"{value:.1e}" if np.isfinite(value) else "not measured") for name, value in (
+            ("Stationarity", r.stationarity), ("Complementarity", r.complementarity))]
     return facts
 
 
@@ -138,12 +129,8 @@ def record_facts(fit: "Fit") -> Facts:
             facts.append(("Units", "detrended or scaled for the fit; everything here is in raw units"))
     if "rows" in figures:
         facts.append(("Rows used", f"{figures['rows']} of {figures['candidates']}"))
-        facts.append(
-            (
-                "Condition",
-                f"{figures['condition']:.1e} ({'Gram matrix' if figures['method'] == 'gram' else 'streamed QR'})",
-            )
-        )
+        method = "Gram matrix" if figures["method"] == "gram" else "streamed QR"
+        facts.append(("Condition", f"{figures['condition']:.1e} ({method})"))
     return facts
 
 
@@ -189,17 +176,8 @@ def channel_table(fit: "Fit") -> Table | None:
     if not isinstance(fit.data, Data):
         return None
     rows = [
-        (
-            c.name,
-            c.role,
-            c.unit or "-",
-            number(c.low, 4),
-            number(c.high, 4),
-            number(c.mean, 4),
-            number(c.std, 4),
-            str(c.levels) if c.levels <= 1000 else "many",
-            f"{c.missing:.2%}",
-        )
+        (c.name, c.role, c.unit or "-", *(number(value, 4) for value in (c.low, c.high, c.mean, c.std)),
+         str(c.levels) if c.levels <= 1000 else "many", f"{c.missing:.2%}")
         for c in fit.data.raw().channels
     ]
     return Table("Channels", ("channel", "role", "unit", "lowest", "highest", "mean", "std", "levels", "missing"), rows)
@@ -215,17 +193,8 @@ def solver_facts(fit: "Fit") -> Facts:
         facts.append(("Iterations", str(s.iterations)))
     if len(fit.steps) > 1:
         facts.append(("Programmes solved", str(len(fit.steps))))
-    facts += [
-        (name, seconds(value))
-        for name, value in (
-            ("Posing", s.times.build),
-            ("Solving", s.times.solve),
-            ("Judging", s.times.judge),
-            ("Proving", s.times.prove),
-            ("In all", fit.seconds),
-        )
-    ]
-    return facts
+    times = (s.times.build, s.times.solve, s.times.judge, s.times.prove, fit.seconds)
+    return facts + list(zip(("Posing", "Solving", "Judging", "Proving", "In all"), map(seconds, times)))
 
 
 def call(fit: "Fit") -> str:

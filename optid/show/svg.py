@@ -10,16 +10,8 @@ from matplotlib.figure import Figure
 
 from optid.show.panels import BLUE, GREEN, GRID, INK, MUTED, ORANGE, PANEL, RED
 
-VARIABLES = {
-    INK: "ink",
-    MUTED: "muted",
-    GRID: "grid",
-    PANEL: "panel",
-    BLUE: "blue",
-    ORANGE: "orange",
-    GREEN: "green",
-    RED: "red",
-}
+VARIABLES = {INK: "ink", MUTED: "muted", GRID: "grid", PANEL: "panel", BLUE: "blue", ORANGE: "orange", GREEN: "green",
+             RED: "red"}
 """Colours of the figures and the variables of the style sheet that take their place."""
 
 

@@ -1,8 +1,9 @@
 """From blocks of columns to checked chunks of a record: numbers that are finite, and a clock that is uniform."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,14 @@ Block = Mapping[str, np.ndarray]
 
 Chunk = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 """Inputs u (n, m), outputs y (n, l), time stamps (n,) or None."""
+
+
+class End(NamedTuple):
+    """Where a run of parts begins or ends: the part, its experiment and the stamp (1,)."""
+
+    label: str
+    experiment: int
+    stamp: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -38,55 +47,46 @@ class Channels:
     tolerance: float
     units: Transform | None = None
 
-    def read(self, source: Any) -> Iterator[Chunk]:
-        """Start a pass over a source or a part: what has a `label` and `blocks`.
+    def read(self, part: Any) -> Iterator[Chunk]:
+        """Start a pass over a part.
 
         Raises:
             DataError: an infinite sample, integers beyond the digits of float64, or a clock that is not uniform.
         """
-        return self._checked(source.blocks(self.columns, self.clock), source.label)
-
-    @property
-    def columns(self) -> list[str]:
-        """All columns that are read."""
-        return [*self.inputs.values(), *self.outputs.values(), *([self.clock] if self.clock else [])]
-
-    def check_border(self, last: np.ndarray, before: str, first: np.ndarray, behind: str) -> None:
-        """Refuse a part whose first stamp (1,) does not follow the last one (1,) of the part before it.
-
-        Args:
-            last: last stamp of the part before.
-            before: name of the part before.
-            first: first stamp of the part behind.
-            behind: name of the part behind.
-
-        Raises:
-            DataError: samples are lost between the parts, or they are not in the order of time.
-        """
-        if last.dtype.kind != first.dtype.kind:
-            raise DataError(f"{before} and {behind} have time stamps of different types: {last.dtype}, {first.dtype}.")
-        step = float(seconds(first - last)[0])
-        if not abs(step - self.step) <= self.tolerance * self.step:
-            raise DataError(
-                f"{behind} begins {step:.6g} after the last sample of {before}, the sampling time is {self.step:.6g}. "
-                "Parts must follow one another: sort them by time (files are taken in the order of their names), give "
-                "what is behind a gap as an experiment of its own (a list of sources), or pass time=False and dt=.")
-
-    def _checked(self, blocks: Iterable[Block], label: str) -> Iterator[Chunk]:
         done, last = 0, None
-        for block in blocks:
-            u, y = (_gathered(block, pairs, label, done) for pairs in (self.inputs, self.outputs))
+        columns = [*self.inputs.values(), *self.outputs.values(), *([self.clock] if self.clock else [])]
+        for block in part.blocks(columns, self.clock):
+            u, y = (_gathered(block, pairs, part.label, done) for pairs in (self.inputs, self.outputs))
             done += len(u)
             if self.units is not None:
                 u, y = self.units.apply_u(u), self.units.apply_y(y)
             if self.clock is None:
                 yield u, y, None
                 continue
-            stamps = as_stamps(block[self.clock], f"{label}, column {self.clock!r}")
+            stamps = as_stamps(block[self.clock], f"{part.label}, column {self.clock!r}")
             since = stamps if last is None else np.concatenate([last, stamps])
-            uniform_step(since, self.tolerance, label, self.step, done - since.size)
+            uniform_step(since, self.tolerance, part.label, self.step, done - since.size)
             last = stamps[-1:] if stamps.size else last
             yield u, y, stamps
+
+    def check_border(self, last: End | None, first: End | None) -> None:
+        """Refuse a part whose first stamp does not follow the last one of the part before, in the same experiment.
+
+        Raises:
+            DataError: samples are lost between the parts, or they are not in the order of time.
+        """
+        if last is None or first is None or last.experiment != first.experiment:
+            return
+        if last.stamp.dtype.kind != first.stamp.dtype.kind:
+            raise DataError(f"{last.label} and {first.label} have time stamps of different types: {last.stamp.dtype}, "
+                            f"{first.stamp.dtype}.")
+        step = float(seconds(first.stamp - last.stamp)[0])
+        if not abs(step - self.step) <= self.tolerance * self.step:
+            raise DataError(
+                f"{first.label} begins {step:.6g} after the last sample of {last.label}, the sampling time is "
+                f"{self.step:.6g}. Parts must follow one another: sort them by time (files are taken in the order of "
+                "their names), give what is behind a gap as an experiment of its own (a list of sources), or pass "
+                "time=False and dt=.")
 
 
 def _gathered(block: Block, pairs: Mapping[str, str], label: str, done: int) -> np.ndarray:
@@ -99,3 +99,49 @@ def _gathered(block: Block, pairs: Mapping[str, str], label: str, done: int) -> 
         samples[:, c] = column
     check_finite(samples, labels, done)
     return samples
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a pass over neighbouring parts found.
+
+    Attributes:
+        lengths: samples by experiment.
+        lo: (m,) smallest sample of each input, NaN where every one is missing; without samples one NaN.
+        hi: (m,) largest sample of each input.
+        first: where the run begins; None without a clock, or without samples.
+        last: where it ends.
+    """
+
+    lengths: Mapping[int, int]
+    lo: np.ndarray
+    hi: np.ndarray
+    first: End | None = None
+    last: End | None = None
+
+
+def surveyed(part: Any, chunks: Iterable[Chunk]) -> Survey:
+    """Survey one part."""
+    count, first, last = 0, None, None
+    lo = hi = np.asarray(np.nan)
+    for u, _, stamps in chunks:
+        count += len(u)
+        lo = np.fmin(lo, np.fmin.reduce(u, axis=0, initial=np.nan))
+        hi = np.fmax(hi, np.fmax.reduce(u, axis=0, initial=np.nan))
+        if stamps is not None and stamps.size:
+            first = first or End(part.label, part.experiment, stamps[:1].copy())
+            last = End(part.label, part.experiment, stamps[-1:].copy())
+    return Survey({part.experiment: count}, lo, hi, first, last)
+
+
+def joined(channels: Channels, surveys: Sequence[Survey]) -> Survey:
+    """Join the surveys of neighbours; a clock that does not run on from one to the next raises a `DataError`."""
+    lengths: Counter[int] = Counter()
+    lo = hi = np.asarray(np.nan)
+    first, last = None, None
+    for survey in surveys:
+        lengths.update(survey.lengths)
+        lo, hi = np.fmin(lo, survey.lo), np.fmax(hi, survey.hi)
+        channels.check_border(last, survey.first)
+        first, last = first or survey.first, survey.last or last
+    return Survey(dict(lengths), lo, hi, first, last)

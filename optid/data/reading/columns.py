@@ -26,11 +26,7 @@ MOST_LISTED = 40
 def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dict[str, str]:
     """Return {channel name: column} for the inputs (letter u) or the outputs (letter y).
 
-    Args:
-        known: names of the columns of the source.
-        wanted: what the user asked for; None takes the column `letter`, or `letter`1, `letter`2, ...
-        letter: "u" or "y".
-        label: name of the source, for the message.
+    None takes the column `letter`, or `letter`1, `letter`2, ... of the known columns of the source called `label`.
 
     Raises:
         DataError: no such column (the nearest is named), or none of the default names is present.
@@ -57,11 +53,7 @@ def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dic
 
 
 def column_name(known: Sequence[str], wanted: str | int, label: str) -> str:
-    """Return the name of a column given by name or by position.
-
-    Raises:
-        DataError: no such column; the message names the nearest one.
-    """
+    """Return the name of a column given by name or by position; a `DataError` names the nearest one."""
     if isinstance(wanted, int | np.integer) and not isinstance(wanted, bool):
         if not 0 <= wanted < len(known):
             raise DataError(f"{label} has {len(known)} columns, counted from 0; there is no column {wanted}.")
@@ -86,27 +78,24 @@ def time_column(known: Sequence[str], time: str | int | bool | None, taken: Sequ
     Raises:
         DataError: no such column.
     """
-    if time == index and time is not None:
-        return index
-    if time is None or time is True or time is False:
-        free = [c for c in (*known, *([index] if index is not None else [])) if c not in taken
-                and (c.lower() in TIME_NAMES or c == index)]
-        free.sort(key=lambda c: c.lower() not in TIME_NAMES)
-        if time and not free:
-            raise DataError(f"{label} has no column t or time. {_listing(known)}")
-        return free[0] if free and time is not False else None
-    return column_name(known, time, label)
+    if time is False:
+        return None
+    if time is not None and time is not True:
+        return index if time == index else column_name(known, time, label)
+    named = [c for c in known if c.lower() in TIME_NAMES and c not in taken]
+    named += [index] if index is not None and index not in taken else []
+    if time and not named:
+        raise DataError(f"{label} has no column t or time. {_listing(known)}")
+    return named[0] if named else None
 
 
 def as_stamps(values: Any, label: str) -> np.ndarray:
     """Return time stamps (N,) as float64, as dates or as durations (datetime64, timedelta64, in nanoseconds).
 
-    Args:
-        values: numbers, numpy dates or durations, or ISO 8601 text; blank text is a missing stamp.
-        label: name of the column, for the message.
+    Numbers, numpy dates and durations, and ISO 8601 text are read; blank text is a missing stamp.
 
     Raises:
-        DataError: neither numbers nor dates.
+        DataError: neither numbers nor dates; with the label of the column.
     """
     array = np.asarray(values)
     if array.dtype.kind in "UO":
@@ -177,6 +166,13 @@ def agreed_step(found: float | None, dt: float | None, tolerance: float, label: 
             "out to use the stamps (mind their unit), pass time=False to ignore them, or resample for the model."
         )
     return dt
+
+
+def position_names(columns: Sequence[str] | None, width: int, label: str) -> list[str]:
+    """Return the names of the columns of a plain array: those given (or a `DataError`), else their positions."""
+    if columns is not None and len(columns) != width:
+        raise DataError(f"{label} has {width} columns, columns= names {len(columns)}.")
+    return [str(c) for c in (range(width) if columns is None else columns)]
 
 
 def _parsed(text: np.ndarray, label: str) -> np.ndarray:

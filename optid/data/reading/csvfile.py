@@ -58,46 +58,37 @@ class CsvFile:
     decimal: str
 
     def columns(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Columns:
-        """Return the wanted columns whole; arguments and errors as of `blocks`.
-
-        Raises:
-            DataError: the table has no rows.
-        """
-        parts: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
-        for block in self._blocks(wanted, clock, group):
-            for name, part in block.items():
-                parts[name].append(part)
-        if not parts[wanted[0]]:
-            raise DataError(f"{self.path.name} has a header but no rows.")
-        return {name: np.concatenate(parts.pop(name)) for name in wanted}
-
-    def blocks(self, wanted: Sequence[str], clock: str | None, group: str | None, rows: int) -> Iterator[Columns]:
-        """Yield the wanted columns as float64, NaN where a cell says missing, `rows` rows at a time.
+        """Return the wanted columns whole as float64, NaN where a cell says missing.
 
         Args:
             wanted: names of columns.
             clock: the one of them that is returned as text where it does not hold numbers.
             group: the one of them that is returned as text.
-            rows: number of rows of every block but the last.
 
         Raises:
-            DataError: a cell that is not a number, a row of another width, a blank row inside the table, or text that
-                is not UTF-8.
+            DataError: no rows, a cell that is not a number, a row of another width, a blank row inside the table, or
+                text that is not UTF-8.
         """
+        whole = list(self._blocks(wanted, clock, group))
+        if not whole:
+            raise DataError(f"{self.path.name} has a header but no rows.")
+        return _joined(whole, wanted)
+
+    def blocks(self, rows: int, wanted: Sequence[str], clock: str | None) -> Iterator[Columns]:
+        """Yield the wanted columns `rows` rows at a time; arguments and errors as of `columns`."""
         kept: list[Columns] = []
         count = 0
-        for block in self._blocks(wanted, clock, group):
+        for block in self._blocks(wanted, clock, None):
             kept.append(block)
             count += len(block[wanted[0]])
             if count >= rows:
-                whole = {name: np.concatenate([part[name] for part in kept]) for name in wanted}
-                full = count - count % rows
+                whole, full = _joined(kept, wanted), count - count % rows
                 for first in range(0, full, rows):
                     yield {name: column[first : first + rows] for name, column in whole.items()}
                 count -= full
-                kept = [{name: column[full:] for name, column in whole.items()}] if count else []
+                kept = [{name: column[full:] for name, column in whole.items()}]
         if count:
-            yield {name: np.concatenate([part[name] for part in kept]) for name in wanted}
+            yield _joined(kept, wanted)
 
     def _blocks(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Iterator[Columns]:
         done = 0
@@ -135,11 +126,7 @@ class CsvFile:
     def _parsed(self, block: bytes, wanted: Sequence[str], as_text: Set[str], nulls: list[str]) -> Columns | None:
         """Return the columns of whole rows, None where polars refuses a cell or a row has other cells than the header.
 
-        Args:
-            block: rows in which nothing is quoted.
-            wanted: names of columns.
-            as_text: those of them that are not converted.
-            nulls: words besides nothing at all that mean a missing sample.
+        Nothing in the block is quoted; `as_text` are not converted; `nulls` mean a missing sample, as nothing does.
         """
         import polars as pl
 
@@ -194,21 +181,13 @@ class CsvFile:
                 raise ValueError
             return np.array(list(map(float, text)), dtype=np.float64)
         except ValueError:
-            return np.array([self._number(cell, column, first + k) for k, cell in enumerate(text)], dtype=np.float64)
-
-    def _number(self, cell: str, column: str, row: int) -> float:
-        if cell.strip().lower() in MISSING:
-            return np.nan
-        try:
-            if "_" in cell:
-                raise ValueError
-            return float(cell)
-        except ValueError:
-            comma = ' For decimal commas pass decimal=","' if "," in cell else ""
-            raise DataError(
-                f"{self.path.name}: column {column!r}, row {row + 1} after the header holds {cell!r}, not a number. "
-                f"Leave the cell blank where a sample is missing.{comma}"
-            ) from None
+            pass
+        for row, cell in enumerate(text, first + 1):
+            if not is_missing(cell) and ("_" in cell or not is_number(cell)):
+                comma = ' For decimal commas pass decimal=","' if "," in cell else ""
+                raise DataError(f"{self.path.name}: column {column!r}, row {row} after the header holds {cell!r}, not "
+                                f"a number. Leave the cell blank where a sample is missing.{comma}") from None
+        return np.array([np.nan if is_missing(cell) else float(cell) for cell in text], dtype=np.float64)
 
     def _without_tail(self, block: list[list[str]], reader: Any, done: int) -> list[list[str]]:
         """Accept blank lines at the end of the file; refuse any other row of the wrong width."""
@@ -223,21 +202,12 @@ class CsvFile:
 
 
 def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal: str) -> CsvFile:
-    """Read the header of a CSV file.
-
-    Args:
-        path: the file.
-        columns: names of the columns when the file has no header row.
-        delimiter: character between cells.
-        decimal: decimal mark.
+    """Read the header of a CSV file; `columns` are the names where it has none.
 
     Raises:
         DataError: empty file, no header, two columns of one name, not UTF-8, a delimiter that cannot be one.
     """
-    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter.isalnum() or delimiter in '"\r\n+-\0':
-        raise DataError(f"delimiter = {delimiter!r}: one character such as ',' or ';' or a tab is needed.")
-    if decimal not in (".", ",") or decimal == delimiter:
-        raise DataError(f"decimal = {decimal!r} with delimiter = {delimiter!r}: '.' or ',' and not the delimiter.")
+    check_marks(delimiter, decimal)
     with open(path, "rb") as file:
         start = 3 if file.read(3) == b"\xef\xbb\xbf" else 0
         file.seek(start)
@@ -258,7 +228,7 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
         raise DataError(f"{path.name} is empty: a header row and at least one row of numbers are needed.")
     if following is not None:
         raise DataError(f"{path.name} has quoted names and carriage returns as line ends: save it with line feeds.")
-    if columns is None and all(_is_number(cell) for cell in first):
+    if columns is None and all(is_number(cell) for cell in first):
         raise DataError(f"{path.name} has no header row (it starts with {first[:20]}): name the columns, "
                         "columns=[...].")
     names = [str(cell).strip() for cell in (first if columns is None else columns)]
@@ -268,6 +238,19 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
         if name and count > 1:
             raise DataError(f"{path.name} has two columns named {name!r}: rename one.")
     return CsvFile(path, names, start + len(line) if columns is None else start, delimiter, decimal)
+
+
+def check_marks(delimiter: Any, decimal: Any) -> None:
+    """Refuse a delimiter or a decimal mark that cannot be one (`DataError`)."""
+    if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter.isalnum() or delimiter in '"\r\n+-\0':
+        raise DataError(f"delimiter = {delimiter!r}: one character such as ',' or ';' or a tab is needed.")
+    if decimal not in (".", ",") or decimal == delimiter:
+        raise DataError(f"decimal = {decimal!r} with delimiter = {delimiter!r}: '.' or ',' and not the delimiter.")
+
+
+def _joined(blocks: list[Columns], wanted: Sequence[str]) -> Columns:
+    """Join blocks, each column freed as soon as it is copied."""
+    return {name: np.concatenate([block.pop(name) for block in blocks]) for name in dict.fromkeys(wanted)}
 
 
 def _whole_lines(file: BinaryIO | io.RawIOBase, start: int) -> Iterator[tuple[int, bytes]]:
@@ -296,9 +279,15 @@ def _is_plain(block: bytes) -> bool:
     return True
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Say whether float() reads a cell."""
     try:
         float(cell)
     except ValueError:
         return False
     return True
+
+
+def is_missing(cell: str) -> bool:
+    """Say whether a cell means a missing sample."""
+    return cell.strip().lower() in MISSING

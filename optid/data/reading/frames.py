@@ -1,6 +1,6 @@
 """Columns of pandas, polars and arrow tables, through narwhals; a time index counts as a column."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -64,13 +64,11 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None,
     """Return columns as (N,) arrays of a real type; clock and group may be text or dates.
 
     Raises:
-        DataError: no rows, a column that does not hold numbers, or integers beyond the digits of float64.
+        DataError: a column that does not hold numbers, or integers beyond the digits of float64.
     """
     import narwhals as nw
 
     table = nw.from_native(frame, eager_only=True)
-    if len(table) == 0:
-        raise DataError(f"{label} has no rows.")
     loaded = {}
     for name in wanted:
         column = table[name]
@@ -90,3 +88,17 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None,
                 check_integers(column.drop_nulls().to_numpy()[:, None], [f"{label}, column {name!r}"])
             loaded[name] = column.cast(nw.Float64).to_numpy()
     return loaded
+
+
+def partition_blocks(
+    label: str, names: Sequence[str], chunk: int, content: Any, wanted: Sequence[str], clock: str | None
+) -> Iterator[dict[str, np.ndarray]]:
+    """Yield columns of a computed partition of a Dask collection, `chunk` rows at a time; errors as of `load_frame`."""
+    if isinstance(content, np.ndarray):
+        if content.dtype.kind not in "iuf":
+            raise DataError(f"{label}: the samples are of type {content.dtype}; convert them to numbers first.")
+        whole = {name: content[:, names.index(name)] for name in wanted}
+    else:
+        whole = load_frame(label, content.set_axis(list(names), axis=1), wanted, clock, None)
+    for start in range(0, len(whole[wanted[0]]), chunk):
+        yield {name: column[start : start + chunk] for name, column in whole.items()}

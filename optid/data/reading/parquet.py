@@ -1,30 +1,89 @@
-"""Whole Parquet files, through polars."""
+"""Parquet files: whole through polars; block by block and in parts through pyarrow, whose memory can be bounded."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from optid.data.reading.parts import damaged_parquet
+from optid.data.reading.chunks import Block
+from optid.data.reading.frames import load_frame
+from optid.data.reading.parts import Part, file_parts
+from optid.errors import DataError
+
+SAMPLES = 1 << 20
+"""Row groups are taken together up to this many samples: smaller tasks do not pay."""
 
 
 def parquet_schema(path: Path) -> dict[str, Any]:
     """Return the names and types of the columns; `DataError` where the file is damaged."""
     import polars as pl
 
-    return dict(_guarded(path, lambda: pl.read_parquet_schema(path)))
+    with _undamaged(path, pl.exceptions.PolarsError, pl.exceptions.PanicException):
+        return dict(pl.read_parquet_schema(path))
 
 
-def parquet_frame(path: Path, wanted: Sequence[str]) -> Any:
-    """Return some columns as a polars frame; `DataError` where they are damaged."""
+def load_parquet(path: Path, wanted: Sequence[str], clock: str | None, group: str | None) -> dict[str, Any]:
+    """Return some columns whole; errors as of `load_frame`, and `DataError` where they are damaged."""
     import polars as pl
 
-    return _guarded(path, lambda: pl.read_parquet(path, columns=list(dict.fromkeys(wanted)), use_statistics=False))
+    with _undamaged(path, pl.exceptions.PolarsError, pl.exceptions.PanicException):
+        frame = pl.read_parquet(path, columns=list(dict.fromkeys(wanted)), use_statistics=False)
+    return load_frame(path.name, frame, wanted, clock, group)
 
 
-def _guarded(path: Path, read: Callable[[], Any]) -> Any:
-    import polars as pl
+def parquet_footer(path: Path) -> tuple[list[str], int]:
+    """Return the names of the columns and the number of rows.
 
+    Raises:
+        DataError: a damaged file, or pyarrow is not installed; with the pip line.
+    """
+    parquet = _pyarrow_parquet(path)
+    with _undamaged(path):
+        return list(parquet.read_schema(path).names), parquet.read_metadata(path).num_rows
+
+
+def parquet_blocks(
+    path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], clock: str | None
+) -> Iterator[Block]:
+    """Yield some columns of some row groups, of all for None, `chunk` rows at a time; errors as of `load_parquet`."""
+    parquet = _pyarrow_parquet(path)
+    import pyarrow as pa
+
+    # Both settings bound the memory: by default pyarrow fetches the whole file ahead, or a whole row group.
+    with _undamaged(path), parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as file:
+        for batch in file.iter_batches(chunk, row_groups=groups, columns=list(dict.fromkeys(wanted))):
+            yield load_frame(path.name, pa.Table.from_batches([batch]), wanted, clock, None)
+
+
+def parquet_parts(path: Path, chunk: int) -> list[Part]:
+    """Cut a Parquet file into parts of successive row groups."""
+    contents = _pyarrow_parquet(path).read_metadata(path)
+    parts, groups, rows = [], [], 0
+    for group in range(contents.num_row_groups):
+        groups.append(group)
+        rows += contents.row_group(group).num_rows
+        if rows >= SAMPLES or group == contents.num_row_groups - 1:
+            where = "" if len(groups) == contents.num_row_groups else f", row groups {groups[0]} to {groups[-1]}"
+            parts.append(Part(path.name + where, partial(parquet_blocks, path.absolute(), tuple(groups), chunk), rows))
+            groups, rows = [], 0
+    return file_parts(parts, path)
+
+
+@contextmanager
+def _undamaged(path: Path, *kinds: Any) -> Iterator[None]:
+    """Name the file where a library cannot read it."""
     try:
-        return read()
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError, ValueError, MemoryError) as error:
-        raise damaged_parquet(path, error) from error
+        yield
+    except DataError:
+        raise
+    except (OSError, ValueError, KeyError, IndexError, TypeError, NotImplementedError, MemoryError, *kinds) as error:
+        raise DataError(f"{path.name} is not a Parquet file, or it is damaged: {str(error)[:500]}") from error
+
+
+def _pyarrow_parquet(path: Path) -> Any:
+    try:
+        import pyarrow.parquet
+    except ImportError:
+        raise DataError(f'{path.name}: streaming Parquet needs pyarrow: pip install "optid[tables]"') from None
+    return pyarrow.parquet

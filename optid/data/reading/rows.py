@@ -8,7 +8,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.reading.columns import TIME_TOLERANCE, as_stamps, choose, seconds, time_column
-from optid.data.reading.csvfile import MISSING
+from optid.data.reading.csvfile import check_marks, is_missing, is_number
 from optid.errors import DataError
 
 LARGEST = 1e100
@@ -19,8 +19,8 @@ class Rows(NamedTuple):
     """What was read.
 
     Attributes:
-        u: (N, m) inputs, NaN where missing.
-        y: (N, l) outputs, NaN where missing.
+        values: (N, channels) samples, inputs first, NaN where missing.
+        m: number of inputs.
         lines: (N,) line of the stream, from 1; 0 for a sample that was put into a gap.
         stamps: (N,) text of the time stamps; empty without them.
         bad: (line, what is wrong) of the rows that could not be read, and count as missing samples.
@@ -28,13 +28,28 @@ class Rows(NamedTuple):
         stop: the line that does.
     """
 
-    u: Array
-    y: Array
+    values: Array
+    m: int
     lines: np.ndarray
     stamps: list[str]
     bad: list[tuple[int, str]]
     error: str = ""
     stop: int = 0
+
+    @property
+    def u(self) -> Array:
+        """Inputs (N, m)."""
+        return self.values[:, : self.m]
+
+    @property
+    def y(self) -> Array:
+        """Outputs (N, l)."""
+        return self.values[:, self.m :]
+
+    def cut(self, first: int, last: int | None = None) -> "Rows":
+        """Return rows first to last - 1."""
+        part = slice(first, last)
+        return self._replace(values=self.values[part], lines=self.lines[part], stamps=self.stamps[part])
 
 
 class RowReader:
@@ -66,18 +81,14 @@ class RowReader:
         Raises:
             DataError: a delimiter or decimal mark that cannot be used.
         """
-        if len(delimiter) != 1 or decimal not in (".", ",") or decimal == delimiter:
-            raise DataError(f"decimal = {decimal!r} with delimiter = {delimiter!r}: '.' or ',' and not the delimiter.")
-        self.line = 0
+        check_marks(delimiter, decimal)
         self._wanted, self._dt, self._fill, self._label, self._tolerance = (
             (list(inputs), list(outputs)), dt, fill, label, tolerance
         )
         self._time, self._delimiter, self._decimal = time, delimiter, decimal
         self._names: list[str] | None = None
-        self._blank: list[int] = []
-        self._last: np.ndarray | None = None
-        self._since = 0
         self._headed = columns is None
+        self.begin_file()
         if columns is not None:
             self._known([str(name) for name in columns])
 
@@ -88,8 +99,7 @@ class RowReader:
         ins, outs = (choose(names, wanted, letter, self._label) for wanted, letter in zip(self._wanted, "uy"))
         signals = [*ins.values(), *outs.values()]
         clock = time_column(names, self._time, signals, self._label)
-        self._names, self._m = names, len(ins)
-        self._places = [names.index(name) for name in signals]
+        self._names, self._places = names, [names.index(name) for name in signals]
         self._clock = None if clock is None else names.index(clock)
 
     @property
@@ -112,7 +122,9 @@ class RowReader:
         """Expect the header of another file; its time stamps may begin anew."""
         if self._headed:
             self._names = None
-        self.line, self._blank, self._last, self._since = 0, [], None, 0
+        self.line, self._since = 0, 0  # lines read, and rows since the last stamp
+        self._blank: list[int] = []
+        self._last: np.ndarray | None = None
 
     def read(self, lines: Sequence[str]) -> Rows:
         """Read complete lines, without their ends.
@@ -126,42 +138,39 @@ class RowReader:
                 del lines[0]
                 self.line += 1
             if not lines:
-                return self._empty()
+                return Rows(np.empty((0, sum(map(len, self._wanted)))), len(self._wanted[0]), np.empty(0, int), [], [])
             first = self._cells(lines[0].removeprefix("\ufeff"))
-            if all(_is_number(cell) for cell in first):
+            if all(map(is_number, first)):
                 raise DataError(
                     f"{self._label} has no header row (it starts with {lines[0][:60]!r}): name the columns, --columns."
                 )
             self._known([cell.strip() for cell in first])
             del lines[0]
             self.line += 1
-        return self._timed(*self._rows(lines))
-
-    def _empty(self) -> Rows:
-        widths = [len(part) for part in self._wanted]
-        return Rows(np.empty((0, widths[0])), np.empty((0, widths[1])), np.empty(0, dtype=int), [], [])
+        rows = self._rows(lines)
+        if self._clock is not None and len(rows.lines):
+            rows = self._timed(rows)
+        if rows.error:
+            self.line = rows.stop - 1
+        return rows
 
     def _cells(self, line: str) -> list[str]:
         if '"' in line:
             return next(csv.reader([line], delimiter=self._delimiter), [])
         return line.split(self._delimiter)
 
-    def _rows(self, lines: list[str]) -> tuple[Array, np.ndarray, list[str], list[tuple[int, str]]]:
-        """Values (N, channels), lines, stamps and what is wrong."""
+    def _rows(self, lines: list[str]) -> Rows:
         assert self._names is not None
-        first, width = self.line + 1, len(self._names)
+        first, m = self.line + 1, len(self._wanted[0])
         self.line += len(lines)
-        if not self._blank and all(lines) and self._decimal == ".":
-            cells = [line.split(self._delimiter) for line in lines]
-            try:
-                if any('"' in line or "_" in line for line in lines) or set(map(len, cells)) - {width}:
-                    raise ValueError
-                columns = list(zip(*cells)) or [()] * width
-                values = np.array([list(map(float, columns[place])) for place in self._places]).T
-                if np.any(np.abs(values) > LARGEST):
-                    raise ValueError
-                stamps = [] if self._clock is None else [cell.strip() for cell in columns[self._clock]]
-                return values.reshape(len(lines), -1), np.arange(first, first + len(lines)), stamps, []
+        cells = [line.split(self._delimiter) for line in lines]
+        if not self._blank and all(lines) and self._decimal == "." and {len(self._names)} >= set(map(len, cells)):
+            try:  # all at once, where nothing is wrong
+                values = np.array([[float(row[place]) for place in self._places] for row in cells])
+                if not any('"' in line or "_" in line for line in lines) and not np.any(np.abs(values) > LARGEST):
+                    stamps = [] if self._clock is None else [row[self._clock].strip() for row in cells]
+                    numbers = np.arange(first, first + len(lines))
+                    return Rows(values.reshape(len(lines), len(self._places)), m, numbers, stamps, [])
             except ValueError:
                 pass
         rows, numbers, stamps, bad = [], [], [], []
@@ -175,126 +184,84 @@ class RowReader:
                 stamps.append("")
                 bad.append((blank, f"line {blank} is blank; it counts as a missing sample."))
             self._blank = []
-            row, stamp, wrong = self._row(self._cells(line), number)
+            row, stamp, wrong = self._row(self._cells(line))
             rows.append(row)
             numbers.append(number)
             stamps.append(stamp)
-            bad += wrong
+            bad += [(number, f"line {number}{what}") for what in wrong]
         values = np.array(rows, dtype=float).reshape(len(rows), len(self._places))
-        return values, np.array(numbers, dtype=int), [] if self._clock is None else stamps, bad
+        return Rows(values, m, np.array(numbers, dtype=int), [] if self._clock is None else stamps, bad)
 
-    def _row(self, cells: list[str], number: int) -> tuple[list[float], str, list[tuple[int, str]]]:
+    def _row(self, cells: list[str]) -> tuple[list[float], str, list[str]]:
+        """Return the samples of a row, its stamp, and what is wrong with it."""
         assert self._names is not None
-        nothing = [np.nan] * len(self._places)
         if len(cells) != len(self._names):
-            return nothing, "", [(number, (
-                f"line {number} has {len(cells)} cells, the header has {len(self._names)}; it counts as a missing "
-                "sample."
-            ))]
+            return [np.nan] * len(self._places), "", [
+                f" has {len(cells)} cells, the header has {len(self._names)}; it counts as a missing sample."]
         row, wrong = [], []
         for place in self._places:
             cell = cells[place].strip()
             text = cell.replace(self._decimal, ".")
-            value = np.nan
-            if cell.lower() not in MISSING:
-                if _is_number(text) and abs(float(text)) <= LARGEST:
-                    value = float(text)
-                else:
-                    wrong.append((number, (
-                        f"line {number}, column {self._names[place]!r} holds {cell!r}, not a number; it counts as "
-                        "missing."
-                    )))
+            value = float(text) if is_number(text) and "_" not in text and abs(float(text)) <= LARGEST else np.nan
+            if value != value and not is_missing(cell):
+                wrong.append(f", column {self._names[place]!r} holds {cell!r}, not a number; it counts as missing.")
             row.append(value)
         return row, "" if self._clock is None else cells[self._clock].strip(), wrong
 
-    def _timed(self, values: Array, lines: np.ndarray, stamps: list[str], bad: list[tuple[int, str]]) -> Rows:
-        """Check the time stamps; cut before the first that is wrong, or fill the gaps."""
-        error, stop = "", 0
-        if self._clock is not None and len(lines):
-            values, lines, stamps, error, stop, unread = self._checked(values, lines, stamps)
-            bad = sorted([*bad, *unread])
-        if error:
-            bad = [(line, text) for line, text in bad if line < stop]
-            self.line = stop - 1
-        return Rows(values[:, : self._m], values[:, self._m :], lines, stamps, bad, error, stop)
-
-    def _checked(self, values: Array, lines: np.ndarray, stamps: list[str]) -> "_Checked":
-        there = np.array([bool(stamp) for stamp in stamps])
-        marks = np.flatnonzero(there)
+    def _timed(self, rows: Rows) -> Rows:
+        """Check the time stamps; cut before the first that is wrong, or fill the gap there and go on."""
+        marks = np.flatnonzero([bool(stamp) for stamp in rows.stamps])
         if not marks.size:
-            self._since += len(lines)
-            return _Checked(values, lines, stamps)
+            self._since += len(rows.lines)
+            return rows
         try:
-            read = as_stamps([stamps[k] for k in marks], f"{self._label}, time")
+            read = as_stamps([rows.stamps[k] for k in marks], f"{self._label}, time")
         except DataError:
-            read = None
-        if read is None or (self._last is not None and read.dtype != self._last.dtype) or not np.isfinite(read).all():
-            return self._one_by_one(values, lines, stamps)
-        before = read[:1] if self._last is None else self._last
-        steps = seconds(np.diff(np.concatenate([before, read])))
+            read = np.full(1, np.nan)
+        if not np.isfinite(read).all() or (self._last is not None and read.dtype != self._last.dtype):
+            return self._timed(self._without_odd_stamps(rows))
+        steps = seconds(np.diff(np.concatenate([read[:1] if self._last is None else self._last, read])))
         # samples since the stamp before; rows without a stamp count
-        rows = np.diff(np.concatenate([[marks[0] if self._last is None else -1 - self._since], marks]))
-        wrong = np.abs(steps - rows * self._dt) > self._tolerance * self._dt
+        since = np.diff(np.concatenate([[marks[0] if self._last is None else -1 - self._since], marks]))
+        wrong = np.abs(steps - since * self._dt) > self._tolerance * self._dt
         if not wrong.any():
-            self._last, self._since = read[-1:], len(lines) - 1 - int(marks[-1])
-            return _Checked(values, lines, stamps)
+            self._last, self._since = read[-1:], len(rows.lines) - 1 - int(marks[-1])
+            return rows
         at = int(np.argmax(wrong))
-        row, extra = int(marks[at]), steps[at] / self._dt - rows[at]
-        whole = int(round(extra))
-        if self._fill and whole >= 1 and abs(extra - whole) <= self._tolerance:
+        row, extra = int(marks[at]), steps[at] / self._dt - since[at]
+        lost = int(round(extra)) if abs(extra - round(extra)) <= self._tolerance else 0
+        if self._fill and lost >= 1:
             self._last, self._since = read[at : at + 1], 0
-            whole = min(whole, self._fill)
-            gap = np.full((whole, values.shape[1]), np.nan)
-            rest = self._checked(values[row + 1 :], lines[row + 1 :], stamps[row + 1 :])
-            return _Checked(
-                np.vstack([values[:row], gap, values[row : row + 1], rest.values]),
-                np.concatenate([lines[:row], np.zeros(whole, dtype=int), lines[row : row + 1], rest.lines]),
-                [*stamps[:row], *[""] * whole, stamps[row], *rest.stamps], rest.error, rest.stop,
-            )
-        advice = " Pass --fill-gaps to count lost samples as missing." if whole >= 1 and abs(extra - whole) <= \
-            self._tolerance and not self._fill else ""
-        return _Checked(values[:row], lines[:row], stamps[:row], (
-            f"{self._label}, line {lines[row]}: the time stamp {stamps[row]} comes {steps[at]:.6g} after the one "
+            count, rest = min(lost, self._fill), self._timed(rows.cut(row + 1))
+            return rest._replace(
+                values=np.vstack([rows.values[:row], np.full((count, rows.values.shape[1]), np.nan),
+                                  rows.values[row : row + 1], rest.values]),
+                lines=np.concatenate([rows.lines[:row], np.zeros(count, int), rows.lines[row : row + 1], rest.lines]),
+                stamps=[*rows.stamps[:row], *[""] * count, rows.stamps[row], *rest.stamps])
+        advice = " Pass --fill-gaps to count lost samples as missing." if lost >= 1 else ""
+        stop = int(rows.lines[row])
+        return rows.cut(0, row)._replace(bad=[one for one in rows.bad if one[0] < stop], stop=stop, error=(
+            f"{self._label}, line {stop}: the time stamp {rows.stamps[row]} comes {steps[at]:.6g} after the one "
             f"before, the sampling time of the model is {self._dt:g}. Resample the stream, or ignore the stamps with "
-            f"--time none.{advice}"
-        ), int(lines[row]))
+            f"--time none.{advice}"))
 
-    def _one_by_one(self, values: Array, lines: np.ndarray, stamps: list[str]) -> "_Checked":
+    def _without_odd_stamps(self, rows: Rows) -> Rows:
         """Take rows whose time stamp cannot be read as rows without one."""
         kind = None if self._last is None else self._last.dtype
-        kept, unread = list(stamps), []
-        for row, stamp in enumerate(stamps):
+        kept, bad = list(rows.stamps), list(rows.bad)
+        for row, stamp in enumerate(rows.stamps):
             try:
-                found = as_stamps([stamp], self._label) if stamp else None
+                found = as_stamps([stamp or "nan"], self._label)
             except DataError:
                 found = np.array([np.nan])
-            if found is None:
-                continue
-            if not np.isfinite(found).all() or (kind is not None and found.dtype != kind):
-                kept[row] = ""  # the row is there, its time is not known
-                unread.append((int(lines[row]), f"{self._label}, line {lines[row]}: {stamp!r} is no time stamp like "
-                               "those before; the row counts as one without a stamp."))
-            else:
+            if np.isfinite(found).all() and found.dtype == (kind or found.dtype):
                 kind = found.dtype
-        if not unread:
-            raise DataError(f"{self._label}: the time stamps of lines {lines[0]} to {lines[-1]} do not fit together.")
-        return self._checked(values, lines, kept)._replace(unread=tuple(unread))
-
-
-class _Checked(NamedTuple):
-    """Rows up to the first whose time stamp is wrong."""
-
-    values: Array
-    lines: np.ndarray
-    stamps: list[str]
-    error: str = ""
-    stop: int = 0
-    unread: tuple[tuple[int, str], ...] = ()
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return "_" not in text
+            elif stamp:
+                kept[row] = ""  # the row is there, its time is not known
+                line = int(rows.lines[row])
+                bad.append((line, f"{self._label}, line {line}: {stamp!r} is no time stamp like those before; the row "
+                            "counts as one without a stamp."))
+        if kept == rows.stamps:
+            raise DataError(f"{self._label}: the time stamps of lines {rows.lines[0]} to {rows.lines[-1]} do not fit "
+                            "together.")
+        return rows._replace(stamps=kept, bad=sorted(bad))

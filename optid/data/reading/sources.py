@@ -1,50 +1,156 @@
-"""Sources of records larger than memory: named columns of a file in blocks, and the parts that can be read apart."""
+"""Sources of records: named columns that are loaded whole, or read in blocks and in parts where they need not fit."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from optid.data.reading.chunks import Block
+import numpy as np
+
+from optid.data.reading.columns import position_names
 from optid.data.reading.csvfile import open_csv
-from optid.data.reading.npyfile import NpyFile, open_npy
-from optid.data.reading.parts import (
-    FilePart,
-    FramePart,
-    Part,
-    RowGroups,
-    damaged_parquet,
-    is_dask,
-    parquet_parts,
-    pyarrow_parquet,
-)
-from optid.data.reading.tables import existing, position_names
+from optid.data.reading.frames import frame_names, index_name, load_frame, only_clock, partition_blocks
+from optid.data.reading.npyfile import load_npy, npz_arrays, open_npy, side_by_side
+from optid.data.reading.parts import Part, file_parts
 from optid.errors import DataError
+
+TEXT = (".csv", ".txt", ".tsv")
 
 
 @dataclass(frozen=True)
-class Source:
-    """Named columns of one experiment.
+class Table:
+    """A source whose columns can be loaded by name.
 
     Attributes:
         label: name of the source, for messages.
-        names: names of its columns.
-        n_samples: number of samples, None where only a pass can tell.
-        blocks: function of (columns, the one of them that is the clock) that starts a new pass each time; None where
-            the source exists in parts only.
-        parts: function of the columns that will be read; returns what can be read apart, in the order of time.
+        names: names of its columns or variables.
+        load: function of (columns wanted, the clock among them, the column of experiments among them) returning
+            {name: array}; numeric columns are (N,) or (N, channels) of a real type, clock and experiments may be text
+            or dates.
+        index: name of a time index besides the columns, or of the only column of dates; None without one.
     """
 
     label: str
     names: list[str]
+    load: Callable[[Sequence[str], str | None, str | None], dict[str, Any]]
+    index: str | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """A source of one experiment that need not fit into memory.
+
+    Attributes:
+        names: names of its columns.
+        n_samples: number of samples, None where only a pass can tell.
+        whole: all of it; None where it exists in parts only.
+        parts: function of the columns that will be read; returns what can be read apart, in the order of time.
+        label: name of the source, for messages.
+    """
+
+    names: Sequence[str]
     n_samples: int | None
-    blocks: Callable[[Sequence[str], str | None], Iterator[Block]] | None
+    whole: Part | None
     parts: Callable[[Sequence[str]], Iterable[Part]]
+    label: str
+
+
+def existing(path: Path) -> Path:
+    """Return the path of a file that is there and not empty (else a `DataError`)."""
+    size, near = -1, []
+    with suppress(OSError, ValueError):  # a name too long, or with a null character
+        size = path.stat().st_size if path.is_file() else -1
+        near = [] if size >= 0 else sorted(p.name for p in path.parent.glob(f"*{path.suffix}"))[:5]
+    if size < 0:
+        raise DataError(f"no file {str(path)!r}." + (f" There: {', '.join(near)}." if near else ""))
+    if size == 0:
+        raise DataError(f"{path.name} is empty (0 bytes).")
+    return path
+
+
+# -- whole
+
+
+def open_table(source: Any, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
+    """Open a file, a frame, a dictionary of arrays or an array; arguments as of `optid.data.readers.read`.
+
+    Raises:
+        DataError: no such file, unknown format, a file that cannot be read, or a missing extra with its pip line.
+    """
+    if isinstance(source, str | Path):
+        path = Path(source)
+        kind = path.suffix.lower()
+        known = (*TEXT, ".parquet", ".mat", ".npz", ".npy")
+        if kind not in known:
+            raise DataError(f"{path.name}: unknown kind of file {kind!r}. Known: {', '.join(known)}.")
+        try:
+            return _file_table(existing(path), kind, columns, delimiter, decimal)
+        except OSError as error:
+            raise DataError(f"{path.name} cannot be read: {error.strerror}.") from error
+    if hasattr(source, "data_vars") and hasattr(source, "coords"):  # an xarray data set
+        return _of_arrays("the data set", {name: variable.values for name, variable in source.variables.items()})
+    if isinstance(source, Mapping):
+        return _of_arrays("the dictionary", source)
+    if isinstance(source, np.ndarray):
+        return _of_array("the array", source, columns)
+    names, table = frame_names("the frame", source)
+    if len(table) == 0:
+        raise DataError("the frame has no rows.")
+    return Table("the frame", names, partial(load_frame, "the frame", table),
+                 index_name(source, names) or only_clock(table.schema))
+
+
+def _file_table(path: Path, kind: str, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
+    if kind in TEXT:
+        file = open_csv(path, columns, "\t" if kind == ".tsv" else delimiter, decimal)
+        return Table(path.name, file.names, file.columns)
+    if kind == ".parquet":
+        from optid.data.reading.parquet import load_parquet, parquet_schema
+
+        schema = parquet_schema(path)
+        return Table(path.name, list(schema), partial(load_parquet, path), only_clock(schema))
+    if kind == ".npz":
+        return Table(path.name, list(npz_arrays(path)), lambda wanted, *_: npz_arrays(path, wanted))
+    if kind == ".npy":
+        return _of_array(path.name, load_npy(path, path.name), columns)
+    from optid.data.reading.matlab import mat_names, mat_variables
+
+    names = mat_names(path)
+    if not names:
+        raise DataError(f"{path.name} holds no arrays of numbers.")
+    return Table(path.name, names, lambda wanted, *_: mat_variables(path, wanted))
+
+
+def _of_arrays(label: str, variables: Mapping[Any, Any]) -> Table:
+    if not variables:
+        raise DataError(f"{label} holds no arrays.")
+    named = {str(name): value for name, value in variables.items()}
+    return Table(label, list(named), lambda wanted, *_: {name: named[name] for name in wanted})
+
+
+def _of_array(label: str, array: np.ndarray, columns: Sequence[str] | None) -> Table:
+    if array.ndim not in (1, 2):
+        raise DataError(f"{label} has shape {array.shape}; (samples, channels) is needed.")
+    table = array[:, None] if array.ndim == 1 else array
+    names = position_names(columns, table.shape[1], label)
+    return Table(label, names, _of_arrays(label, dict(zip(names, table.T))).load)
+
+
+# -- in blocks and parts
+
+
+def is_dask(thing: Any) -> bool:
+    """Say whether something is a Dask collection, without importing Dask."""
+    return hasattr(thing, "__dask_graph__") and hasattr(thing, "to_delayed")
 
 
 def open_source(source: Any, chunk: int, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Source:
     """Open a file, a folder of Parquet files, a mapping {channel: npy file or Dask array} or a Dask collection.
+
+    Arguments as of `optid.data.streams.open_stream`.
 
     Raises:
         DataError: no such file, unknown format, a file that cannot be read, or a missing extra with its pip line.
@@ -54,105 +160,73 @@ def open_source(source: Any, chunk: int, columns: Sequence[str] | None, delimite
     if isinstance(source, Mapping):
         if source and all(is_dask(item) for item in source.values()):
             return _of_dask(_stacked(source), chunk, list(map(str, source)))
-        if not source:
-            raise DataError("the mapping {channel: path of an npy file, or Dask array} is empty; give every channel.")
-        for name, item in source.items():
-            if not isinstance(item, str | Path):
-                raise DataError(f"channel {str(name)!r} is of type {type(item).__name__}: a stream takes paths of npy "
-                                "files for all channels, or Dask arrays for all; use read for what is in memory.")
-        return _of_npy({str(name): open_npy(existing(Path(path))) for name, path in source.items()}, chunk)
+        return _of_npy(source, chunk)
     if not isinstance(source, str | Path):
         raise DataError(f"a stream is opened from a path or a Dask collection, not from {type(source).__name__}; "
                         "use read for what is in memory.")
     if Path(source).is_dir():
         return _of_folder(Path(source), chunk)
-    return _of_file(existing(Path(source)), chunk, columns, delimiter, decimal)
-
-
-def _of_file(path: Path, chunk: int, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Source:
+    path = existing(Path(source)).absolute()
     kind = path.suffix.lower()
     if kind == ".parquet":
-        names, rows = _parquet_footer(path)
-        return Source(path.name, names, rows, RowGroups(path, None, chunk), lambda _: parquet_parts(path, chunk))
-    if kind in (".csv", ".txt", ".tsv"):
+        from optid.data.reading.parquet import parquet_blocks, parquet_footer, parquet_parts
+
+        names, rows = parquet_footer(path)
+        whole = Part(path.name, partial(parquet_blocks, path, None, chunk), rows)
+        return Source(names, rows, whole, lambda _: parquet_parts(path, chunk), path.name)
+    if kind in TEXT:
         file = open_csv(path, columns, "\t" if kind == ".tsv" else delimiter, decimal)
-        names, rows, blocks = file.names, None, _CsvBlocks(file, chunk)
-    elif kind == ".npy":
-        opened = open_npy(path)
-        names, rows = position_names(columns, opened.width, path.name), opened.rows
-        blocks = _NpyBlocks(opened, tuple(names), chunk)
-    else:
-        raise DataError(f"{path.name}: streams are read from .csv, .txt, .tsv, .parquet and .npy files, and from "
-                        "folders of .parquet files; use read.")
-    return Source(path.name, names, rows, blocks, lambda _: [FilePart.of((path,), rows, blocks)])
+        return _of_files(file.names, Part(path.name, partial(file.blocks, chunk)), path)
+    if kind == ".npy":
+        opened = open_npy(path, columns)
+        return _of_files(opened.names, Part(path.name, partial(opened.blocks, chunk), opened.rows), path)
+    raise DataError(f"{path.name}: streams are read from .csv, .txt, .tsv, .parquet and .npy files, and from "
+                    "folders of .parquet files; use read.")
 
 
-@dataclass(frozen=True)
-class _CsvBlocks:
-    file: Any
-    chunk: int
-
-    def __call__(self, wanted: Sequence[str], clock: str | None) -> Iterator[Block]:
-        return self.file.blocks(wanted, clock, None, self.chunk)
+def _of_files(names: Sequence[str], whole: Part, *paths: Path, label: str = "") -> Source:
+    return Source(names, whole.n_samples, whole, lambda _: file_parts([whole], *paths), label or whole.label)
 
 
-@dataclass(frozen=True)
-class _NpyBlocks:
-    file: NpyFile
-    names: tuple[str, ...]
-    chunk: int
-
-    def __call__(self, wanted: Sequence[str], _: str | None) -> Iterator[Block]:
-        places = {name: place for place, name in enumerate(self.names)}
-        for block in self.file.blocks(self.chunk):
-            yield {name: block[:, places[name]] for name in wanted}
-
-
-@dataclass(frozen=True)
-class _SeveralNpy:
-    files: Mapping[str, NpyFile]
-    chunk: int
-
-    def __call__(self, wanted: Sequence[str], _: str | None) -> Iterator[Block]:
-        for parts in zip(*(self.files[name].blocks(self.chunk) for name in wanted), strict=True):
-            yield {name: part[:, 0] for name, part in zip(wanted, parts)}
-
-
-def _of_npy(files: Mapping[str, NpyFile], chunk: int) -> Source:
-    lengths = {name: file.rows for name, file in files.items()}
+def _of_npy(paths: Mapping[Any, Any], chunk: int) -> Source:
+    if not paths:
+        raise DataError("the mapping {channel: path of an npy file, or Dask array} is empty; give every channel.")
+    for name, path in paths.items():
+        if not isinstance(path, str | Path):
+            raise DataError(f"channel {str(name)!r} is of type {type(path).__name__}: a stream takes paths of npy "
+                            "files for all channels, or Dask arrays for all; use read for what is in memory.")
+    files = {str(name): open_npy(existing(Path(path).absolute())) for name, path in paths.items()}
     for name, file in files.items():
-        if file.width != 1:
-            raise DataError(f"channel {name!r}: {file.path.name} has {file.width} columns, one is needed.")
-    if len(set(lengths.values())) != 1:
-        raise DataError(f"the channels have different lengths: {lengths}. Cut them to the common part.")
-    rows, blocks, paths = next(iter(lengths.values())), _SeveralNpy(files, chunk), [f.path for f in files.values()]
-    return Source("the npy files", list(files), rows, blocks, lambda _: [FilePart.of(paths, rows, blocks)])
+        if len(file.names) != 1:
+            raise DataError(f"channel {name!r}: {file.path.name} has {len(file.names)} columns, one is needed.")
+    rows = _one_length({name: file.rows for name, file in files.items()})
+    first = next(iter(files.values())).path.name
+    whole = Part(first, partial(side_by_side, files, chunk), rows)
+    return _of_files(list(files), whole, *(file.path for file in files.values()), label="the npy files")
 
 
-def _parquet_footer(path: Path) -> tuple[list[str], int]:
-    parquet = pyarrow_parquet(path.name)
-    try:
-        return list(parquet.read_schema(path).names), parquet.read_metadata(path).num_rows
-    except (ValueError, KeyError, OSError, MemoryError) as error:
-        raise damaged_parquet(path, error) from error
+def _one_length(lengths: Mapping[str, Any]) -> Any:
+    if len(set(map(str, lengths.values()))) != 1:
+        raise DataError(f"the channels have different lengths: {dict(lengths)}. Cut them to the common part.")
+    return next(iter(lengths.values()))
 
 
 def _of_folder(folder: Path, chunk: int) -> Source:
+    from optid.data.reading.parquet import parquet_footer, parquet_parts
+
     files = sorted(folder.glob("*.parquet"), key=_natural)
     if not files:
         below = sorted({path.parent.relative_to(folder).as_posix() for path in folder.rglob("*.parquet")}, key=_natural)
         hint = f" Folders below have: {', '.join(below[:5])}; give a list of folders, one per experiment." * bool(below)
         raise DataError(f"folder {str(folder)!r} has no .parquet file.{hint}")
-    names, _ = _parquet_footer(existing(files[0]))
-    rows = 0
-    for path in files:
-        there, count = _parquet_footer(existing(path))
-        rows += count
-        if set(there) != set(names):
-            odd = sorted(set(there) ^ set(names))
+    found = [parquet_footer(existing(path)) for path in files]
+    names = found[0][0]
+    for path, (there, _) in zip(files, found):
+        if odd := sorted(set(there) ^ set(names)):
             raise DataError(f"{path.name} has other columns than {files[0].name} (differing: {', '.join(odd)}): "
                             f"the files of {folder.name!r} are not parts of one table.")
-    return Source(folder.name, names, rows, None, lambda _: [p for path in files for p in parquet_parts(path, chunk)])
+    return Source(names, sum(rows for _, rows in found), None,
+                  lambda _: [part for path in files for part in parquet_parts(path, chunk)], folder.name)
 
 
 def _natural(path: Any) -> list[Any]:
@@ -168,33 +242,35 @@ def _stacked(arrays: Mapping[Any, Any]) -> Any:
         if getattr(array, "ndim", None) != 1:
             raise DataError(f"channel {str(name)!r}: a Dask array (N,) is needed, not of shape "
                             f"{getattr(array, 'shape', None)}.")
-    lengths = {str(name): array.shape[0] for name, array in arrays.items()}
-    if len({str(length) for length in lengths.values()}) != 1:
-        raise DataError(f"the channels have different lengths: {lengths}. Cut them to the common part.")
+    _one_length({str(name): array.shape[0] for name, array in arrays.items()})
     return dask.array.stack(list(arrays.values()), axis=1)
 
 
 def _of_dask(collection: Any, chunk: int, columns: Sequence[str] | None) -> Source:
     if hasattr(collection, "columns"):
-        known = {str(name): name for name in collection.columns}
+        label, rows, known = "the Dask data frame", None, {str(name): name for name in collection.columns}
+        names = list(known)
+    else:
+        label = "the Dask array"
+        if getattr(collection, "ndim", None) not in (1, 2):
+            raise DataError("a Dask data frame or array (N, channels) is needed; the array has "
+                            f"{getattr(collection, 'ndim', 'no')} dimensions.")
+        array = collection[:, None] if collection.ndim == 1 else collection
+        rows, width = array.shape
+        names, known = position_names(columns, width, label), None
+        if rows == rows and width > rows:
+            raise DataError(f"the Dask array has shape {array.shape}: more channels than samples. Transpose it (x.T).")
+        array = array.rechunk({1: -1})
 
-        def partitions(wanted: Sequence[str]) -> list[Part]:
-            columns = tuple(dict.fromkeys(wanted))  # the others are not even read where Dask can help it
-            contents = collection[[known[name] for name in columns]].to_delayed()
-            return [FramePart(f"the Dask data frame, partition {i}", columns, chunk, content)
-                    for i, content in enumerate(contents)]
+    def parts(wanted: Sequence[str]) -> list[Part]:
+        if known is not None:  # the other columns are not even read where Dask can help it
+            there, what = list(dict.fromkeys(wanted)), "partition"
+            contents = collection[[known[name] for name in there]].to_delayed()
+            lengths = [np.nan] * len(contents)
+        else:
+            there, what, contents, lengths = names, "chunk", array.to_delayed().ravel(), array.chunks[0]
+        labels = [f"{label}, {what} {i}" for i in range(len(contents))]
+        return [Part(one, partial(partition_blocks, one, there, chunk), None if n != n else int(n), content=content)
+                for one, content, n in zip(labels, contents, lengths)]
 
-        return Source("the Dask data frame", list(known), None, None, partitions)
-    if getattr(collection, "ndim", None) not in (1, 2):
-        raise DataError("a Dask data frame or array (N, channels) is needed; the array has "
-                        f"{getattr(collection, 'ndim', 'no')} dimensions.")
-    array = collection[:, None] if collection.ndim == 1 else collection
-    rows, width = array.shape
-    names = position_names(columns, width, "the Dask array")
-    if rows == rows and width > rows:
-        raise DataError(f"the Dask array has shape {array.shape}: more channels than samples. Transpose it (x.T).")
-    array = array.rechunk({1: -1})
-    lengths = [int(n) if n == n else None for n in array.chunks[0]]
-    return Source("the Dask array", names, None if rows != rows else int(rows), None, lambda _: (
-        FramePart(f"the Dask array, chunk {i}", tuple(names), chunk, content, n_samples=length)
-        for i, (content, length) in enumerate(zip(array.to_delayed().ravel(), lengths))))
+    return Source(names, None if rows is None or rows != rows else int(rows), None, parts, label)

@@ -72,7 +72,7 @@ class _Records:
 def _note_unreadable(path: Keys, entry: DataEntry, records: _Records, problems: Problems) -> None:
     """Note what is wrong with the files of one entry, at the key that is to blame."""
     from optid.data.reading.columns import choose
-    from optid.data.reading.tables import open_table
+    from optid.data.reading.sources import open_table
 
     options, at = dict(entry.options), (*path, "file")
     try:

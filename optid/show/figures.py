@@ -1,22 +1,63 @@
-"""The picture of a study of the order."""
+"""Figures of a record, of a comparison of models, and of a study of the order."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from optid.data.record import Data
 from optid.identify.order.study import OrderStudy
-from optid.show.panels import styled
+from optid.show import panels
+from optid.show.panels import CLOSEUP, INK, LINES, plain, styled, with_unit
+
+if TYPE_CHECKING:
+    from optid.identify.validation.comparison import Comparison
+
+
+def channels(data: Data) -> Figure:
+    """Draw one panel a channel, inputs first, and one curve an experiment."""
+    units = dict(zip(data.inputs + data.outputs, data.input_units + data.output_units))
+    figure = Figure(figsize=(8, 1 + 1.4 * len(units)), layout="constrained")
+    axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
+    for c, (panel, (name, unit)) in enumerate(zip(axes, units.items())):
+        for e, samples in zip(data.experiments, data.records):
+            t = e.start + data.dt * np.arange(e.n_samples)
+            panel.plot(*panels.thinned(t, samples[:, c]), lw=0.9, drawstyle="steps-post" if c < data.m else "default")
+        panel.set_ylabel(plain(f"{name} [{unit}]" if unit else name))
+    axes[-1].set_xlabel("time")
+    if data.name:
+        figure.suptitle(plain(data.name))
+    return figure
 
 
 @styled
-def draw(study: OrderStudy) -> Figure:
-    """Draw singular values with thresholds, criteria and hold-out by number of states, and the scan of lags.
+def simulations(found: "Comparison") -> Figure:
+    """Draw the measured outputs and every simulation; of a long record the stretch in which the outputs move most."""
+    record, several = found.data, sum(bool(arrays) for arrays in found.simulated)
+    figure = Figure(figsize=(9.0, 2.9 * record.l + 0.35 * several), layout="constrained")
+    axes = figure.subplots(record.l, 1, squeeze=False, sharex=True)[:, 0]
+    k = int(np.argmax([e.n_samples for e in record.experiments]))
+    e = record.experiments[k]
+    part = panels.liveliest(e.y) if len(e.y) > 2 * CLOSEUP else slice(len(e.y))
+    t = (e.start + record.dt * np.arange(e.n_samples, dtype=float))[part]
+    for o, (ax, name) in enumerate(zip(axes, record.outputs)):
+        thin: dict[str, Any] = {"color": INK, "linewidth": 1.0}
+        lines = [("measured", e.y[part, o], thin)]
+        for label, arrays, (colour, dash) in zip(found.names, found.simulated, LINES * len(found.names)):
+            if arrays:
+                lines.append((plain(label), arrays[k][part, o], {"color": colour, "linestyle": dash}))
+        panels.draw_record(ax, t, lines)
+        ax.set_ylabel(with_unit(name, record.output_units[o]))
+    axes[0].set_title("Simulations" + (f", experiment {k + 1}" if record.n_experiments > 1 else ""))
+    axes[-1].set_xlabel("time")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower left", ncols=1)
+    return figure
 
-    Args:
-        study: what `optid.order` returned.
-    """
+
+@styled
+def order_study(study: OrderStudy) -> Figure:
+    """Draw singular values with thresholds, criteria and hold-out by number of states, and the scan of lags."""
     ranks, states = study.ranks, study.states
     figure = Figure(figsize=(8.6, 6.0), layout="constrained")
     (values, tails), (criteria, lags) = figure.subplots(2, 2)

@@ -1,0 +1,197 @@
+"""The commands about faults: isolability before there are any, diagnose, and reformulate after one."""
+
+from pathlib import Path
+from typing import Any
+
+from optid.cli.options import File, Paths, Words
+from optid.cli.results import command_line, working
+
+ZERO = "INPUT=VALUE, the input at which the actuator does nothing"
+
+
+def isolability(
+    model: Path, window: int = 100, onset: str = "unknown", prob: float = 0.95, false_alarm: float = 0.01,
+    kinds: Words = None, load: Words = None, disturbance: Words = None, state_jump: bool = True, draws: int = 1000,
+    seed: int = 0, picture: File = None,
+) -> None:
+    """Find how large every fault must be to be noticed, and to be told from the others; no data are needed.
+
+    Example: optid isolability model.json --window 100 --load pump=0.5,-0.3,0.4,0.2 --picture isolability.png
+
+    The model:
+        window (-w N): Samples of a window.
+        onset (K): Sample of the onset, or unknown.
+        prob: Probability to be noticed, and to be named.
+        false_alarm: Probability that a healthy window raises an alarm.
+        kinds (-k NAME...): bias, drift. [dim]bias[/]
+        draws: Simulated windows per fault.
+        seed: Seed of the simulation.
+    """
+    from optid.cli import arguments as words
+    from optid.errors import StructureError
+
+    if onset != "unknown" and not onset.isdecimal():
+        raise StructureError(f"--onset {onset}: the number of a sample, or unknown, is needed")
+    with working(picture=picture) as work:
+        from optid.faults import dictionary
+
+        plant = words.state_space_model(model)
+        work.step("signatures")
+        found = dictionary(plant, kinds=words.listed(kinds) or ["bias"],
+                           process=words.directions(load, "--process", plant), state_jump=state_jump,
+                           disturbances=words.listed(disturbance) or ())
+        work.step("simulating faults")
+        study = found.isolability(window, onset=onset if onset == "unknown" else int(onset), prob=prob,
+                                  false_alarm=false_alarm, draws=draws, seed=seed)
+        work.draw(study.plot, picture)
+        work.text = str(study)
+
+
+def diagnose(
+    model: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any], healthy: Paths = None,
+    identified: Paths = None, rescale: bool = False, kinds: Words = None, load: Words = None,
+    disturbance: Words = None, zero: Words = None, state_jump: bool = True, max_faults: int = 1,
+    false_alarm: float = 0.01, coverage: float = 0.95, robust: bool = False, method: str = "exact",
+    solver: str = "auto", seed: int = 0, out: File = None, report: File = None, picture: File = None,
+) -> None:
+    """Find out whether a record is healthy, and if not, what broke, when, and how much of it.
+
+    Example: optid diagnose model.json faulty.csv --max-faults 2 --out d.json --report d.html
+
+    Files:
+        data (DATA): The record: a CSV, Parquet, MAT, NPZ or npy file.
+    The record:
+        healthy (FILE...): A healthy record: its innovations must be white and of the size that the model says.
+        identified (FILE...): The record that the model was identified from, or the name of a built-in one: the
+            uncertainty of the model counts as noise. [dim]the model is exact[/]
+        rescale: Take the scale of the noise from --healthy.
+    The model:
+        kinds (-k NAME...): bias, loss, stuck, drift, frozen, noise, spike. [dim]bias, loss, spike[/]
+        zero (INPUT=VALUE...): Where an actuator does nothing, for shares lost. [dim]not known[/]
+        max_faults: Faults that may be in the record.
+        false_alarm: Probability that a healthy record raises an alarm.
+        coverage: Of the set of answers and of the intervals.
+        robust: Bound the influence of outliers.
+    The solver:
+        method: exact, sparse, sparse+polish or set.
+        seed: Seed of simulated thresholds, and of an example.
+    The result:
+        out (FILE): Write the diagnosis (.json).
+    """
+    with working(diagnosis=out, report=report, picture=picture) as work:
+        from optid.cli import arguments as words
+        from optid.errors import DataError
+        from optid.faults import diagnose as judge
+        from optid.faults import dictionary, model_uncertainty
+        from optid.faults.diagnosis.diagnosing import KINDS
+
+        plant = words.state_space_model(model)
+        how = words.as_modelled(how, plant)
+        record: Any = words.record(data, how, example, seed)[0]
+        if record.n_experiments > 1:
+            raise DataError(
+                f"{record.n_experiments} experiments: diagnose one record at a time (give one file, and cut it to the "
+                "experiment)."
+            )
+        sound: Any = words.read_record(healthy, how) if healthy else None
+        origin = _origin(identified, how)
+        work.step("signatures")
+        found = dictionary(
+            plant, kinds=words.listed(kinds) or list(KINDS), process=words.directions(load, "--process", plant),
+            state_jump=state_jump, disturbances=words.listed(disturbance) or (),
+            zeros=words.pairs(words.listed(zero), "--zero", ZERO, float),
+        )
+        work.step("searching")
+        uncertainty: Any = "ignore"
+        if origin is not None:
+            silent = bool(found.predictor.silent)
+            uncertainty = model_uncertainty(found.model, origin, decoupled=found.predictor if silent else None)
+        answer = judge(
+            plant, record, found, false_alarm=false_alarm, max_faults=max_faults, method=method, coverage=coverage,
+            model_uncertainty=uncertainty, robust=robust, healthy=sound, rescale=rescale, seed=seed, solver=solver,
+        )
+        if out is not None:
+            answer.save(out)
+        if report is not None:
+            from optid.faults.diagnosis.page import write
+
+            work.step("report")
+            write(answer, report, record=record.name, command=command_line())
+        work.draw(answer.plot, picture)
+        if origin is None and answer.detected:
+            work.heard.append(
+                "The model counts as exact, so that its errors may look like a fault: --identified FILE (the record "
+                "that it was identified from) takes its uncertainty into account."
+            )
+        work.text = str(answer)
+
+
+def _origin(identified: list[Path] | None, how: dict[str, Any]) -> Any:
+    """Return the record that a model was identified from; a built-in one where no file has its name."""
+    from optid.cli import arguments as words
+
+    if not identified:
+        return None
+    name = str(identified[0])
+    if len(identified) == 1 and not identified[0].exists() and not identified[0].suffix:
+        from optid.examples import EXAMPLES
+
+        if name in EXAMPLES:
+            return EXAMPLES[name]().data
+    return words.read_record(identified, how)
+
+
+def reformulate(
+    model: Path, diagnosis: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any],
+    constraint: Words = None, stage: str = "auto", nodes: int = 7, low: Words = None, high: Words = None,
+    target: Words = None, if_ambiguous: str = "auto", solver: str = "auto", seed: int = 0, saved: File = None,
+    report: File = None, picture: File = None,
+) -> None:
+    """Turn a healthy model and a diagnosis into the damaged system: its model, what observes it, what it can still do.
+
+    Example: optid reformulate model.json d.json faulty.csv --model damaged.json --report r.html
+
+    Files:
+        model (MODEL): Model file (.json) of the healthy plant.
+        diagnosis (DIAGNOSIS): Written by optid diagnose --out.
+        data (DATA): The record of the diagnosis: CSV, Parquet, MAT, NPZ or npy.
+    The model:
+        constraint (-c NAME:VALUE...): Of a damaged nonlinearity; by default monotone and nowhere steeper than before;
+            'none' for none.
+        stage: 'affected only', 'all with prior' or auto (by hold-out).
+        nodes: Values of a damaged nonlinearity.
+        low (U...): Least inputs.
+        high (U...): Largest inputs.
+        if_ambiguous: wait, probe, robust or auto.
+    The solver:
+        seed: Seed of draws and probes, and of an example.
+    The result:
+        target (Y...): Can these outputs be held? One number each.
+        saved (--model -m FILE): Write the damaged model (JSON).
+    """
+    with working(model=saved, report=report, picture=picture) as work:
+        from optid.cli import arguments as words
+        from optid.faults import load_diagnosis
+        from optid.faults import reformulate as rebuild
+
+        plant = words.state_space_model(model)
+        found = load_diagnosis(diagnosis)
+        record: Any = words.record(data, words.as_modelled(how, plant), example, seed)[0]
+        given = words.listed(constraint)
+        work.step("refitting")
+        built = rebuild(
+            plant, found, record, constraints="default" if given is None else [] if given == ["none"] else given,
+            stage=stage, nodes=nodes, low=words.numbers(low, "--low"), high=words.numbers(high, "--high"),
+            if_ambiguous=if_ambiguous, solver=solver, seed=seed,
+        )
+        work.text = str(built)
+        if target is not None:
+            work.text += f"\ntarget {built.attainable(words.numbers(target, '--target') or [])}"
+        if saved is not None:
+            built.model.save(saved)
+        if report is not None:
+            from optid.faults.repair.page import write
+
+            work.step("report")
+            write(built, report, record=record.name or (data[0].name if data else ""), command=command_line())
+        work.draw(built.plot, picture)

@@ -1,0 +1,185 @@
+"""The commands that make models of records, and judge them: fit, identify, validate."""
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from optid.cli.derived import DEFAULT
+from optid.cli.options import File, Paths, Words
+from optid.cli.results import Work, check_names, command_line, working
+from optid.lazy import import_cvxpy
+
+BUDGET = 60.0
+
+
+def fit(
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
+    scheduler: str | None = None, split: float | None = None, test: Words = None, formulation: str = DEFAULT,
+    na: int | None = None, nb: Words = None, nk: Words = None, basis: Words = None, constraint: Words = None,
+    loss: str | None = None, ridge: float | None = None, curvature: float | None = None, holdout: str | None = None,
+    gauge: str | None = None, settings: Words = None, solver: str = "auto", accuracy: float = 1e-8,
+    time_limit: float | None = None, prove: bool = True, option: Words = None, seed: int = 0, report: File = None,
+    saved: File = None,
+) -> None:
+    """Fit a model to a record, prove it optimal, and report it; without orders, search for them as optid identify does.
+
+    Example: optid fit data.csv --inputs u --outputs y --dt 0.1 --na 2 --nb 2 --basis triangular:10
+    --constraint monotone:increasing --report report.html
+
+    The record:
+        stream: Read chunk by chunk: for a file larger than memory.
+        scheduler (ADDRESS): Let a Dask cluster (tcp://host:8786) read the row groups of Parquet files or folders.
+        split (SHARE): Fit on this share, validate on the rest, e.g. 0.7.
+    The model:
+        na: Number of past outputs in A.
+        nb (N...): Coefficients of B, one number or one per input.
+        nk (N...): Delay in samples, one number or one per input.
+        basis (NAME:SIZE...): Basis of the nonlinearity, one or one per input, e.g. triangular:10, polynomial:4,
+            trigonometric:5, bspline:8.
+        constraint (-c NAME:VALUE...): e.g. monotone:increasing; see optid constraints. 'none' drops those an example
+            suggests.
+        loss: squares, huber, huber:1.5 or l1.
+        ridge: Weight of the size of Theta.
+        curvature: Weight of the curvature of f.
+        holdout (PENALTY): Choose the weight of ridge, curvature or weight (nuclear norm) by hold-out.
+        gauge: Scale between f and B: norm, gain or b0.
+        settings (--set KEY=VALUE...): Any other argument of the formulation.
+    The solver:
+        accuracy: Relative, for any solver.
+        time_limit (SECONDS): Stop the solver after this time.
+        prove (--prove/--no-prove): Ask for a proof of global optimality.
+        option (KEY=VALUE...): Native options of the solver.
+    """
+    check_names(constraint, solver, formulation)
+    asked = (na, nb, nk, basis, loss, ridge, curvature, holdout, gauge, settings, option, time_limit, scheduler)
+    if data and formulation == DEFAULT and not stream and all(word is None for word in asked):
+        _search(data, example, how, seed, split, test, constraint, solver, saved, report, accuracy=accuracy)
+        return
+    with working(model=saved, report=report) as work:
+        from optid.cli import arguments as words
+
+        record, suggestion = words.record(data, how, example, seed, stream=stream, scheduler=scheduler)
+        import_cvxpy()
+        from optid.identify.fitting import fit as fit_model
+        from optid.identify.selection import fit_by_holdout
+        from optid.show.printing import describe
+
+        arguments = words.suited(suggestion, formulation) if suggestion else {}
+        given = {
+            "na": na, "nb": words.whole_numbers(nb, "--nb"), "nk": words.whole_numbers(nk, "--nk"),
+            "basis": words.one_or_all(words.listed(basis)), "constraints": constraint, "loss": loss, "ridge": ridge,
+            "curvature": curvature, "gauge": gauge,
+        }
+        arguments |= {key: value for key, value in given.items() if value is not None} | words.pairs(settings, "--set")
+        if arguments.get("constraints") == ["none"]:
+            del arguments["constraints"]
+        record, held_out = words.held_out(record, split, test, how)
+        work.step(f"fitting {formulation}")
+        found = (fit_model if holdout is None else partial(fit_by_holdout, penalty=holdout))(
+            record, formulation, solver=solver, accuracy=accuracy, time_limit=time_limit, prove=prove,
+            solver_options=words.pairs(option, "--option"), **arguments,
+        )
+        work.step("standard errors")
+        work.text = describe(found)
+        if found.verdict is not None and found.verdict.word in ("poor", "useless"):
+            work.step("looking for what would help")
+            work.text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
+        _finish(work, found, held_out, saved)
+        if report is not None:
+            from optid.show.report import write
+
+            work.step("writing the report")
+            write(found, report, held_out, command=command_line())
+
+
+def identify(
+    data: Paths = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
+    horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
+    workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0, report: File = None,
+    saved: File = None,
+) -> None:
+    """Find the structure of a record by cross-validation, and fit it: formulation, delay, orders, functions.
+
+    Example: optid identify data.csv --inputs u --outputs y --dt 0.1 --report report.html
+
+    The model:
+        budget (SECONDS): Time of the search.
+        horizon (N): Compare predictions so many samples ahead. [dim]free runs[/]
+        classes (NAME...): Classes of models to be tried: linear, 'input functions', feedback, 'latent signals'.
+            [dim]all[/]
+        constraint (-c NAME:VALUE...): What every model has to obey.
+    The solver:
+        workers (N): Processes. [dim]one per processor[/]
+    The record:
+        split (SHARE): Search on this share, validate on the rest.
+    """
+    _search(data, example, how, seed, split, test, constraint, solver, saved, report, budget=budget, horizon=horizon,
+            workers=workers, **({"classes": classes} if classes else {}))
+
+
+def _search(
+    data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
+    constraint: Words, solver: str, saved: File, report: File, **settings: Any,
+) -> None:
+    check_names(constraint, solver)
+    with working(model=saved, report=report) as work:
+        from optid.cli import arguments as words
+
+        record: Any = words.record(data, how, example, seed)[0]
+        import_cvxpy()
+        from optid.identify.search import identify as find
+
+        record, held_out = words.held_out(record, split, test, how)
+        found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
+        work.text = str(found)
+        _finish(work, found, held_out, saved, "search")
+        if report is not None:
+            from optid.show.report import write_search
+
+            work.step("writing the report")
+            write_search(found, report, held_out, command=command_line())
+
+
+def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, what: str = "fit") -> None:
+    """Validate on what was held out, and write the model."""
+    if held_out is not None:
+        from optid.identify.validation.checks import validate as check
+
+        work.step("validating")
+        work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{check(found.model, held_out)}"
+    if saved is not None:
+        found.model.save(saved)
+
+
+def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:
+    """Validate saved models on another record: fits, residual tests; several models side by side.
+
+    Inputs, outputs and sampling time are those of the first model where they are not given.
+
+    Files:
+        files (MODEL... DATA...): Model files (.json) written by fit --model, then files of the record.
+    The result:
+        horizon (N): Predict so many samples ahead, too.
+    """
+    with working(report=report) as work:
+        from optid.cli import arguments as words
+        from optid.identify.validation import compare_models
+        from optid.identify.validation import validate as check
+        from optid.models.files import load
+
+        paths, data = words.models_and_data(files)
+        models = dict(zip(words.distinct_names(paths), map(load, paths)))
+        first = next(iter(models.values()))
+        record: Any = words.read_record(data, words.as_modelled(how, first))
+        work.step("validating")
+        compared = len(models) > 1 or report is not None
+        found: Any = compare_models(models, record, horizon) if compared else None
+        if len(models) > 1:
+            work.text = str(found)
+        else:
+            work.text = f"{first}\n\n{found.validations[0] if compared else check(first, record, horizon=horizon)}"
+        if report is not None:
+            from optid.show.report import write_comparison
+
+            work.step("writing the report")
+            write_comparison(found, report, command=command_line())
