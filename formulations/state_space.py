@@ -135,6 +135,8 @@ class StateSpaceFit(TangentFit):
 
         matrix, errors = at.whole
         objective = cp.sum_squares(r) + at.remainder
+        if len(compressed.free):  # else the answer lies anywhere along what changes no output to first order
+            objective = objective + cp.sum_squares(compressed.free @ step)
         if damping:
             sizes = np.sqrt(damping) * np.linalg.norm(matrix, axis=0)
             objective = objective + cp.sum_squares(cp.multiply(sizes, step))

@@ -230,6 +230,7 @@ def test_equations_are_written_as_by_hand():
      (lambda: Equations(cubic, {"x0": 1.0}, {"a": 2.0}), "name of the formulation"),
      (lambda: Equations(cubic, {"x": 1.0}, {"a": 2.0}), "asks? for 'c'"),
      (lambda: Equations(cubic, {"u": 1.0}, {"a": 2.0}), "channel of the record"),
+     (lambda: Equations(first_order, {"x": 1.0}, {"a": 0.5, "b": 1.0, "k": 2.0}), "no equation uses the parameter 'k'"),
      (lambda: Equations(lambda v: {"x": v["a"]}, {"x": 1.0}, {"a": 2.0}), "nothing for 'y'"),
      (lambda: Equations(lambda v: {"x": v["a"], "y": v["x"], "z": 0}, {"x": 1.0}, {"a": 2.0}), "neither a state"),
      (lambda: Equations(lambda v: 3, {"x": 1.0}, {"a": 2.0}), "return a dictionary"),

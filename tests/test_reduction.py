@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from refusals import refuses
+from refusals import refused, refuses
 from test_regressors import assert_gram, cases, formed
 
 import optid

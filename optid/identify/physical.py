@@ -102,7 +102,11 @@ class PhysicalErrors(Criterion):
     @cached_property
     def _evaluated(self) -> dict[str, Any]:
         named = {one.name(): one for group in self._scalars for one in group}
-        return self.equations.evaluated(named, self.data.outputs)
+        found = self.equations.evaluated(named, self.data.outputs)
+        used = {one.id for value in found.values() if isinstance(value, cp.Expression) for one in value.variables()}
+        if idle := [one.name() for one in self._scalars[2] if one.id not in used]:
+            raise StructureError(f"no equation uses the parameter {idle[0]!r}: use it, or leave it out")
+        return found
 
     @cached_property
     def measured(self) -> dict[str, int]:

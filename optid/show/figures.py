@@ -12,7 +12,7 @@ from optid.show import panels
 from optid.show.panels import CLOSEUP, INK, LINES, plain, styled, with_unit
 
 if TYPE_CHECKING:
-    from optid.identify.validation.comparison import Comparison
+    from optid.identify.validation import Comparison
 
 
 def channels(data: Data) -> Figure:
