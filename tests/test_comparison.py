@@ -117,7 +117,7 @@ def test_the_three_simulators_of_a_model_with_feedback():
 def test_models_are_compared_over_the_samples_that_all_predict():
     model = siso()
     data = record(model)
-    short = HammersteinTF([-0.8], model.b, model.nonlinearities, (9,), model.offset, model.dt)  # looks back further
+    short = HammersteinTF([-0.8], model.b, model.nonlinearities, (9,), model.offset, dt=model.dt)  # looks back further
     found = compare_models({"true": model, "poor": worse(model), "late": short}, data, horizon=2)
     common = np.isnan(short.predict(data))
     for i, one in enumerate((model, worse(model), short)):
