@@ -33,7 +33,7 @@ def record(model, count=400, seed=1, noise=0.1):
 
 
 def worse(model: HammersteinTF) -> HammersteinTF:
-    return HammersteinTF(0.9 * model.a, model.b, model.nonlinearities, model.nk, model.offset, model.dt)
+    return HammersteinTF(0.9 * model.a, model.b, model.nonlinearities, model.nk, model.offset, dt=model.dt)
 
 
 def feedback_model() -> HammersteinSS:
@@ -138,7 +138,7 @@ def test_models_without_names_are_named_by_what_they_are():
 
 def test_a_model_that_runs_away_is_compared_by_what_it_predicts():
     model, data = siso(), record(siso())
-    unstable = HammersteinTF([-3.0, 2.3], model.b, model.nonlinearities, (0,), model.offset, model.dt)
+    unstable = HammersteinTF([-3.0, 2.3], model.b, model.nonlinearities, (0,), model.offset, dt=model.dt)
     u = np.vstack([data.u] * 5)
     long = Data(u, np.vstack([data.y] * 5), dt=model.dt)
     found = compare_models({"true": model, "wild": unstable}, long)
