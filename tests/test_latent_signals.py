@@ -316,6 +316,16 @@ def test_tables_figures_and_checks_show_the_latent_function():
     assert titles == ["Nonlinearity of u", "Latent nonlinearity of z"]
 
 
+@pytest.mark.parametrize("formulation", ["lfr.exact", "wiener_ss.exact"])
+def test_functions_without_effect_are_named(formulation):
+    rng = np.random.default_rng(2)
+    u = rng.uniform(-1, 1, 400)
+    data = Data(u, lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=400))
+    with pytest.warns(DataWarning, match="no effect that the record shows"):
+        fit = optid.fit(data, formulation, nx=1)
+    assert "leave them out" in fit.figures["effect of latent signals"]
+
+
 def test_words_are_refused():
     data = Data(inputs(60)[:, :1], inputs(60)[:, 1:])
     for arguments in ({"channels": 0}, {"latent": "outputs"}, {"latent_basis": "polynomial:1"},

@@ -60,11 +60,20 @@ def advise(fit: Any) -> tuple[Advice, ...]:
     if not isinstance(fit.data, Data) or fit.model is None:
         return ()
     on_record = list(_on_record(fit))
-    tried = sorted(_tried(fit), key=lambda one: -one.gain) if fit.data.n_samples <= LONG else []
+    tried = list(_tried(fit)) if fit.data.n_samples <= LONG else []
     found: dict[str, Advice] = {}
-    for one in (*on_record, *tried, *_on_model(fit)):
+    for one in (*on_record, *_best_first(tried), *_on_model(fit)):
         found.setdefault(one.step, one)
     return tuple(found.values())[:MOST]
+
+
+def _best_first(tried: list[Advice]) -> Iterator[Advice]:
+    """Yield steps by their gain; of those that bring nearly the same, the simplest, which was tried first."""
+    rest = list(tried)
+    while rest:
+        best = max(one.gain for one in rest)
+        rest.remove(first := next(one for one in rest if one.gain >= best - SPARED))
+        yield first
 
 
 def _on_record(fit: Any) -> Iterator[Advice]:
@@ -159,7 +168,7 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
         for delay in dict.fromkeys(found):
             if delay != tuple(fit.model.nk):
                 words = _words(delay)
-                yield f"a delay of {words} samples", f"--nk {words}", {"nk": list(delay)}
+                yield f"a delay of {words} sample{'s' * (words != '1')}", f"--nk {words}", {"nk": list(delay)}
     for more in (1, 2):
         if "na" in arguments and "nb" in arguments:
             na, nb = arguments["na"] + more, _more(arguments["nb"], more)
@@ -191,7 +200,7 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
 def _on_model(fit: Any) -> Iterator[Advice]:
     model, data = fit.model, fit.data.raw()
     if not model.is_stable and not has_feedback(model):
-        yield Advice("the model has a pole outside the unit circle", "--constraint max_pole_radius:0.99")
+        yield Advice("the model has a pole outside the unit circle", "--constraint stable:0.99")
     for function, x, share in shares_outside(model, data):
         if share > 0.01:
             yield Advice(f"{100 * share:.0f} % of {function.name} lies outside the interval of its basis",

@@ -5,6 +5,7 @@ best directions promise starts a short descent; the better half of those goes on
 few cells, which are halved with the function kept; long records begin with a part of their samples.
 """
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, product
@@ -16,7 +17,8 @@ from scipy.linalg import eigvals
 from optid.arrays import Array
 from optid.bases import BSpline, Linear
 from optid.data.record import Data
-from optid.errors import DataError, RankError
+from optid.errors import DataError, DataWarning, RankError
+from optid.identify.arguments import outputs_present
 from optid.identify.prediction_error.descent import COMPARED, Descent, descend
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
@@ -82,7 +84,7 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         pace = PACE["search" if size < total else "long" if size > STAGES[0] else "short"]
         end = descend(part, _finite(part, x), iterations=iterations, progress=pace, start=best.start)
         x, steps = end.x, steps + end.steps
-    return part, replace(end, steps=steps), figures
+    return part, replace(end, steps=steps), {**figures, **_idle(errors, best.x, part, end)}
 
 
 def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator, iterations: int
@@ -177,7 +179,7 @@ def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[La
 
     Arguments and errors as `add_channels`; ``functions`` has one for every output, of basis functions as they are.
     """
-    point, n = errors.unknowns.unpack(best.x), errors.unknowns.n
+    linear, point, n = errors, errors.unknowns.unpack(best.x), errors.unknowns.n
     signals = np.hstack([np.vstack(errors.visited(point)), np.vstack([e.u for e in errors.data.experiments])])
     measured, offsets, cs, rows = np.vstack([e.y for e in errors.data.experiments]), [], [], []
     for o, one in enumerate(functions):
@@ -194,7 +196,20 @@ def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[La
     errors = _widened(replace(errors, unknowns=unknowns), functions)
     start = _with(replace(point, offset=np.array(offsets)), np.array(rows), tuple(cs), Ez, Fz)
     found = descend(errors, errors.unknowns.pack(start), iterations=iterations, start=best.start)
-    return errors, replace(found, steps=best.steps + found.steps), {}
+    return errors, replace(found, steps=best.steps + found.steps), _idle(linear, best.x, errors, found)
+
+
+def _idle(before: StateErrors, x: Array, after: StateErrors, found: Descent) -> dict[str, Any]:
+    """Say, and warn, where functions save less of the errors than their parameters would of white noise (BIC)."""
+    rows, more = outputs_present(after.data), after.unknowns.size - before.unknowns.size
+    without, left = before.value(x), found.value
+    if not np.isfinite(without) or rows * np.log(max(without, 1e-300) / max(left, 1e-300)) > more * np.log(rows):
+        return {}
+    said = (f"they lower the squared errors by {max(100 * (1 - left / max(without, 1e-300)), 0.0):.2g} %, less than "
+            f"their {more} parameters are worth (BIC): leave them out")
+    warnings.warn(f"The functions of latent signals have no effect that the record shows: {said}.", DataWarning,
+                  stacklevel=2)
+    return {"effect of latent signals": said}
 
 
 def whitened(errors: StateErrors, x: Array) -> Array:
