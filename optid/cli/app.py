@@ -1,6 +1,5 @@
 """The command line: all commands, and the lists of what there is to choose from."""
 
-from collections.abc import Callable
 from typing import Annotated, Any
 
 import typer
@@ -47,35 +46,38 @@ def solvers() -> None:
     """List every back end: what it accepts and whether it is installed."""
     from optid.cli import listings
 
-    _show(listings.solvers, "asking the back ends")
+    with Waiting() as waiting:
+        waiting.step("asking the back ends")
+        found = listings.solvers()
+    _show(found)
 
 
 def formulations() -> None:
     """List the formulations, their arguments and the variables that constraints may use."""
     from optid.cli import listings
 
-    _show(listings.formulations, "loading the formulations")
+    with Waiting() as waiting:
+        waiting.step("loading the formulations")
+        found = listings.formulations()
+    _show(found)
 
 
 def constraints() -> None:
     """List the constraints by the words the command line takes."""
     from optid.cli import listings
 
-    _show(listings.constraints, "loading the constraints")
+    _show(listings.constraints())
 
 
 def examples() -> None:
     """List the built-in records."""
     from optid.cli import listings
 
-    _show(listings.examples, "loading the examples")
+    _show(listings.examples())
 
 
-def _show(listing: Callable[[], list[Any]], doing: str) -> None:
-    with Waiting() as waiting:
-        waiting.step(doing)
-        found = listing()
-    for part in found:
+def _show(tables: list[Any]) -> None:
+    for part in tables:
         output().print(part)
 
 

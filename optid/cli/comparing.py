@@ -46,8 +46,6 @@ def compare(
     The study:
         repetitions: Runs of each solver; times are their median.
         db (FILE): Keep the rows; go on where it stopped.
-    Options:
-        accept_changed_data: Run cells again whose data file is not what it was at the last run.
     """
     check_names(constraint, formulation=formulation)
     from optid.cli import arguments as words

@@ -5,6 +5,7 @@ have no panel), each as ``name (words METAVAR): help``. Words are given where th
 parameter, or has a letter besides. What several commands share is described once, in `SHARED`.
 """
 
+import ast
 import functools
 import inspect
 import re
@@ -26,6 +27,7 @@ SHARED = """
 Files:
     data (DATA...): CSV, Parquet, MAT, NPZ or npy files, one experiment each.
     model (MODEL): Model file (.json) of a state-space model.
+    db (DATABASE): Written by optid study run.
 The record:
     example (NAME): A built-in record instead: see optid examples.
     inputs (-u NAME...): Columns of the inputs. [dim]u, u1, u2, ...[/]
@@ -51,6 +53,9 @@ The result:
     report (-o FILE): Write a self-contained HTML report.
     saved (--model -m FILE): Write the model (JSON).
     picture (-p FILE): Write the picture (PNG, PDF).
+Options:
+    title (--study TITLE): Of a database that holds several: this study.
+    accept_changed_data: Run cells again whose data file is not what it was at the last run.
 """
 
 READING: dict[str, tuple[Any, Any]] = {
@@ -70,7 +75,11 @@ _ENTRY = re.compile(r"(\w+)(?: \((.*?)\))?: (.*)")
 
 def register(app: typer.Typer, function: Callable[..., None], kind: Any) -> None:
     """Make a function a command of a class; what its docstring says before the sections is the help text."""
-    about, own = described(inspect.getdoc(function) or "")
+    text = inspect.getdoc(function)
+    if text is None:  # python -OO
+        source: Any = ast.parse(inspect.getsource(function)).body[0]
+        text = ast.get_docstring(source) or ""
+    about, own = described(text)
     entries = described(SHARED)[1] | own
     parameters = []
     for parameter in inspect.signature(function).parameters.values():

@@ -41,7 +41,6 @@ def run(
         example: A built-in study of half a minute instead.
         db (FILE): Database of the rows; the study file's name with .sqlite.
         scheduler (ADDRESS): Run on a Dask cluster: tcp://host:8786.
-        accept_changed_data: Run cells again whose data file is not what it was at the last run.
         retry (OUTCOME...): Run cells of these outcomes again, e.g. 'time limit'.
         export (FILE): Also write the rows (.parquet, .csv) at the end.
         dry_run: Say what would be run, and run nothing.
@@ -80,11 +79,8 @@ def report(
 
     Example: optid study report study.sqlite -o study.html
 
-    Files:
-        db (DATABASE): Written by optid study run.
     Options:
         page (--report -o FILE): Write a self-contained HTML page.
-        title (--study TITLE): Of a database that holds several: this study.
         accuracy: Compare at this accuracy; that of most cells if not given.
         clock (--time WORD): Time to compare: solve (cold), fit (whole) or warm.
     """
@@ -110,10 +106,7 @@ def export(db: Path, target: Path, title: str | None = None) -> None:
     Example: optid study export study.sqlite rows.parquet
 
     Files:
-        db (DATABASE): Written by optid study run.
         target (FILE): A .parquet or .csv file.
-    Options:
-        title (--study TITLE): Of a database that holds several: this study.
     """
     from optid.studies.storage import export as exporting
     from optid.studies.storage.store import read_rows, rows_of_one
@@ -130,11 +123,8 @@ def problems(db: Path, out: Path, title: str | None = None) -> None:
 
     Example: optid study problems study.sqlite --out problems
 
-    Files:
-        db (DATABASE): Written by optid study run.
     Options:
         out (-o FOLDER): Folder for the problems.
-        title (--study TITLE): Of a database that holds several: this study.
     """
     from optid.studies.problem_set import write_problems
 
