@@ -210,3 +210,37 @@ def test_reading_goes_on_where_it_stopped():
     assert found.error == "" and found.lines.tolist() == [4]
     with pytest.raises(DataError, match="not the delimiter"):
         reader(delimiter=",", decimal=",")
+
+
+@pytest.mark.slow
+def test_a_model_file_names_the_record_that_calibrates_its_monitor(tmp_path):
+    """Two commands: noise and uncertainty come from the record of the fit, as if it had been named twice."""
+    rng = np.random.default_rng(4)
+    u, noise = rng.uniform(-1, 1, 1500), np.zeros(1500)
+    x = y = np.zeros(1500)
+    for k in range(1499):
+        x[k + 1] = 0.8 * x[k] + u[k] + 0.3 * u[k] ** 2
+        noise[k + 1] = 0.9 * noise[k] + 0.02 * rng.normal()
+    y = x + noise
+    np.savetxt(tmp_path / "healthy.csv", np.column_stack([u, y])[:1000], delimiter=",", header="u,y", comments="")
+    np.savetxt(tmp_path / "later.csv", np.column_stack([u, y])[1000:], delimiter=",", header="u,y", comments="")
+
+    def optid(*words):
+        done = subprocess.run([sys.executable, "-m", "optid", *words], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout, " ".join(done.stderr.split())
+
+    optid("fit", "healthy.csv", "--inputs", "u", "--outputs", "y", "--dt", "1", "--formulation",
+          "hammerstein_ss.sid", "--basis", "polynomial:2", "--set", "nx=1", "--model", "m.json")
+    words = ["monitor", "m.json", *QUICK, "--follow", "later.csv", "--until-end"]
+    out, told = optid(*words)
+    assert "are those of the record it was identified from, healthy.csv" in told
+    assert out == optid(*words, "--identified", "healthy.csv", "--healthy", "healthy.csv")[0]
+    (tmp_path / "healthy.csv").rename(tmp_path / "moved.csv")
+    told = optid(*words)[1]
+    assert "healthy.csv, from which the model was identified, is no longer there" in told
+    assert "take the model as exact" in told
+    content = json.loads((tmp_path / "m.json").read_text())
+    (tmp_path / "m.json").write_text(json.dumps({**content, "record": {"files": [3]}}))
+    done = subprocess.run([sys.executable, "-m", "optid", *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2 and "'record' lists no files" in done.stderr

@@ -84,7 +84,7 @@ def fit(
         if found.verdict is not None and found.verdict.word in ("poor", "useless"):
             work.step("looking for what would help")
             work.text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
-        _finish(work, found, held_out, saved)
+        _finish(work, found, held_out, saved, None if stream or scheduler else data, how)
         if report is not None:
             from optid.show.report import write
 
@@ -132,7 +132,7 @@ def _search(
         record, held_out = words.held_out(record, split, test, how)
         found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
         work.text = str(found)
-        _finish(work, found, held_out, saved, "search")
+        _finish(work, found, held_out, saved, data, how, "search")
         if report is not None:
             from optid.show.report import write_search
 
@@ -140,15 +140,18 @@ def _search(
             write_search(found, report, held_out, command=command_line())
 
 
-def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, what: str = "fit") -> None:
-    """Validate on what was held out, and write the model."""
+def _finish(
+    work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any], what: str = "fit"
+) -> None:
+    """Validate on what was held out, and write the model, with the place of a record that it is from as a whole."""
     if held_out is not None:
         from optid.identify.validation.checks import validate as check
 
         work.step("validating")
         work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{check(found.model, held_out)}"
     if saved is not None:
-        found.model.save(saved)
+        whole = data and held_out is None
+        found.model.save(saved, {**how, "files": [str(Path(name).resolve()) for name in data]} if whole else None)
 
 
 def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:

@@ -72,6 +72,8 @@ def monitor(
         else:
             waiting.step("simulating healthy plants for the thresholds")
             origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
+            if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
+                origin = sound = _identified_from(model)
             watcher = _new(
                 plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
                 window=window, seed=seed, healthy=sound, uncertainty=origin, extrapolate=extrapolate,
@@ -84,6 +86,26 @@ def monitor(
     for sentence in heard:
         note(sentence)
     _Watch(watcher, reader, follow, state, strict=strict, as_json=lines).run(until_end)
+
+
+def _identified_from(path: Path) -> Any:
+    """Read the record that a model file names, and say so; None where it names none or its files are gone."""
+    from optid.cli.arguments import read_record
+    from optid.errors import ModelFileError
+    from optid.models.files import record_of
+
+    named = record_of(path)
+    if named is None:
+        return None
+    files = named.pop("files")
+    if named.keys() != set(READING):
+        raise ModelFileError(f"{path} does not say how its record is read as this release does: fit the model again")
+    if gone := [name for name in files if not Path(name).is_file()]:
+        note(f"{gone[0]}, from which the model was identified, is no longer there")
+        return None
+    note("noise and uncertainty of the model are those of the record it was identified from, "
+         f"{', '.join(Path(name).name for name in files)}: name a later healthy one with --healthy FILE...")
+    return read_record(files, named)
 
 
 def _doubt(plant: Any, origin: Any) -> None:

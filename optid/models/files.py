@@ -34,6 +34,22 @@ def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
     return read(path, FORMAT, VERSION, lambda content: from_content(content, functions))
 
 
+def record_of(path: str | Path) -> dict[str, Any] | None:
+    """Return what a model file says of the record that the model was identified from; None where it says nothing.
+
+    That are ``files``, absolute paths, and how they are read. Errors as of `load`.
+    """
+    def build(content: dict[str, Any]) -> dict[str, Any] | None:
+        named = content.get("record")
+        if named is not None and not (
+                isinstance(named, dict) and isinstance(named.get("files"), list) and named["files"]
+                and all(isinstance(name, str) for name in named["files"])):
+            raise ValueError("'record' lists no files")
+        return named
+
+    return read(path, FORMAT, VERSION, build)
+
+
 def write(content: dict[str, Any], path: str | Path, form: str, version: int) -> Path:
     """Write JSON types to a file that says of what form ("optid model") and version it is; it replaces an older one."""
     path = Path(path)

@@ -323,9 +323,15 @@ class Model(ModelFields):
             given[name] = tuple(Nonlinearity.from_dict(f, functions) for f in given[name])
         return cls(**given)
 
-    def save(self, path: str | Path) -> Path:
-        """Write the model to a JSON file, from which `optid.load` restores it to the last bit."""
-        return files.write(self.to_dict(), path, files.FORMAT, files.VERSION)
+    def save(self, path: str | Path, record: Mapping[str, Any] | None = None) -> Path:
+        """Write the model to a JSON file, from which `optid.load` restores it to the last bit.
+
+        Args:
+            path: the file.
+            record: files of the record that it was identified from, and how they are read (`files.record_of`).
+        """
+        return files.write(self.to_dict() | ({"record": dict(record)} if record else {}), path, files.FORMAT,
+                           files.VERSION)
 
 
 def impulse_response(A: Array, B: Array, C: Array, D: Array, n: int) -> Array:

@@ -23,7 +23,7 @@ from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT, expand
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty
 from optid.faults.signatures import Dictionary, dictionary
-from optid.identify.recursive.intake import as_block
+from optid.identify.recursive.state import as_block
 from optid.models.experiments import state_like
 from optid.models.feedback_tables import tabulated
 
