@@ -115,7 +115,7 @@ def slicot(count: int, rows: int, rounds: int) -> None:
         statistics = hankel_statistics([record], 2 * rows)
         past, future = range(rows), range(rows, 2 * rows)
         z = np.concatenate([statistics.at([0, 1], future), statistics.at([0, 1, 2, 3], past)])
-        return rq(statistics, z, statistics.at([0, 1], future), statistics.at([2, 3], future)).singular_values
+        return rq(statistics, z, statistics.at([0, 1], future), statistics.at([2, 3], future)).decomposition[1]
 
     def there(route: str) -> np.ndarray:
         order, _, values, _, info = ctrlsys.ib01ad("M", route, "N", "O", "N", "N", rows, 2, 2, uf, yf, 0.0, -1.0)

@@ -36,9 +36,9 @@ from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.identify.arguments import enough_rows
 from optid.identify.gauges import FIXED, scale_fixed
-from optid.identify.prediction_error.refinement import refine
+from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.search import entry, search, starts_of
-from optid.identify.prediction_error.tangent_fit import CompressedErrors, TangentFit
+from optid.identify.prediction_error.tangent_fit import TangentFit, refine
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.expressions import tangent_product

@@ -37,13 +37,12 @@ from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
 from optid.identify.arguments import enough_rows, in_memory, outputs_present
+from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.latent_search import STAGES, first_samples
-from optid.identify.prediction_error.refinement import refine
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
-from optid.identify.prediction_error.state_uncertainty import CompressedStates
-from optid.identify.prediction_error.tangent_fit import TangentFit
+from optid.identify.prediction_error.tangent_fit import TangentFit, refine
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.models import HammersteinSS
 from optid.program.expressions import tangent_product

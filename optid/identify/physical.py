@@ -14,8 +14,8 @@ from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.data.stretches import interpolated, with_whole_inputs
 from optid.errors import RankError, StructureError
+from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Criterion
-from optid.identify.prediction_error.state_uncertainty import CompressedStates
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.tangent import constraint_rows
 from optid.models.equations import Equations

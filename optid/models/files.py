@@ -128,8 +128,8 @@ def write_state(path: str | Path, kind: str, version: int, head: Mapping[str, An
     return path
 
 
-def read_state(
-    path: str | Path, kind: str, version: int, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def read_state(path: str | Path, kind: str, version: int, names: Sequence[str]
+               ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read the head, and the arrays of these names, that `write_state` wrote; refuse others (`ModelFileError`)."""
     path = Path(path)
     try:

@@ -59,8 +59,14 @@ class HammersteinTF(Model):
     nonlinearities: tuple[Nonlinearity, ...]
     nk: tuple[int, ...]
     offset: Array
+    dt: float = 1.0
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
     c: Any = field(default=(), kw_only=True)
     d: Any = field(default=None, kw_only=True)
+    gauge: str = field(default="none", kw_only=True)
     GAUGES = GAUGES
     SIMULATORS = ("predict", "free")
     equation, coefficients = text.equations, text.coefficients

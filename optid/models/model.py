@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from html import escape
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -22,19 +22,7 @@ from optid.models.nonlinearity import Nonlinearity
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class ModelFields(Ports):
-    """The fields that every model has; see `Model`."""
-
-    dt: float = 1.0
-    inputs: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
-    input_units: tuple[str, ...] = ()
-    output_units: tuple[str, ...] = ()
-    gauge: str = "none"
-
-
-class Model(ModelFields):
+class Model(Ports):
     """A linear part between static functions, with named channels; the fields are those of its dataclasses.
 
     Attributes:
@@ -54,10 +42,15 @@ class Model(ModelFields):
     """
 
     nonlinearities: tuple[Nonlinearity, ...]
+    dt: float
+    input_units: tuple[str, ...]
+    output_units: tuple[str, ...]
+    gauge: str
     orders: Any
     poles: Any
     memory: int
     structure: Any
+    __dataclass_fields__: ClassVar[dict[str, Any]]
     GAUGES: ClassVar[tuple[str, ...]]
     SIMULATORS: ClassVar[tuple[str, ...]]
     c0: Any
@@ -179,11 +172,10 @@ class Model(ModelFields):
         fit = isinstance(x0, str) and x0 == "fit"
         states = [None] * len(records) if fit else self._states("predict", records, x0)
         predicted = [self.predict_record(u, y, horizon, state, label) for (u, y, label), state in zip(records, states)]
-        if self.structure not in ("arx", "armax") and all(np.isnan(p).all() for p in predicted) and any(
-            np.isnan(u).any() for u, _, _ in records):
-            raise DataError(
-                f"no stretch of {2 * self._state_shape[0] + 1} samples has every input: interpolate them, or leave an "
-                "input out")
+        gaps = any(np.isnan(u).any() for u, _, _ in records)
+        if gaps and self.structure not in ("arx", "armax") and all(np.isnan(p).all() for p in predicted):
+            raise DataError(f"no stretch of {2 * self._state_shape[0] + 1} samples has every input: interpolate them, "
+                            "or leave an input out")
         return one_or_all(predicted)
 
     def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:

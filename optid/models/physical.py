@@ -45,6 +45,12 @@ class PhysicalModel(Model):
     bounds: tuple[tuple[float, float], ...]
     steps: int = 1  # steps of integration in a sampling time; 0 for equations in discrete time
     hold: str = "zero"  # what an input does between its samples, "zero" (stays) or "first" (straight lines)
+    dt: float = 1.0
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    gauge: str = "none"
     GAUGES = ("none",)
     SIMULATORS = ("free", "predict")
     nonlinearities: ClassVar[tuple[Nonlinearity, ...]] = ()

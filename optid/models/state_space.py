@@ -84,6 +84,12 @@ class StateSpace(Model):
     offset_x: Any = None
     offset_y: Any = None
     noise: NoiseCovariances | None = None
+    dt: float = 1.0
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    gauge: str = field(default="none", kw_only=True)
     latent: tuple[Nonlinearity, ...] = field(default=(), kw_only=True)
     Ez: Any = field(default=None, kw_only=True)
     Fz: Any = field(default=None, kw_only=True)

@@ -43,11 +43,6 @@ class RQ:
         """Left vectors, singular values and right vectors (as rows) of r22."""
         return np.linalg.svd(self.r22)
 
-    @property
-    def singular_values(self) -> Array:
-        """Singular values of r22, largest first."""
-        return self.decomposition[1]
-
 
 def rq(statistics: HankelStatistics, instruments: Sequence[int] | NDArray[np.intp],
        regressors: Sequence[int] | NDArray[np.intp], outputs: Sequence[int] | NDArray[np.intp], *,

@@ -1,7 +1,7 @@
 """The unknowns of a state-space model: matrices, static functions and one initial state per experiment."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -108,20 +108,16 @@ class StateUnknowns(Unknowns):
     latent: tuple[Latent, ...] = ()  # functions of latent signals
     linear_output: bool = True  # whether C is unknown; where not, it is zero
 
-    @property
-    def innovations(self) -> bool:
-        """Whether K is unknown."""
-        return self.criterion == "prediction"
+    l: int = field(init=False)  # noqa: E741 - number of outputs, the field's letter
+    innovations: bool = field(init=False)  # whether K is unknown
+    # whether mu of every input is unknown: it is one where the basis has a single function
+    free: tuple[bool, ...] = field(init=False)
 
-    @property
-    def l(self) -> int:  # noqa: E743 - the field's letter
-        """Number of outputs."""
-        return self.expansion.l
-
-    @cached_property
-    def free(self) -> tuple[bool, ...]:
-        """Whether mu of every input is unknown: it is one where the basis has a single function."""
-        return tuple(size > 1 for size in self.expansion.input_sizes)
+    def __post_init__(self) -> None:
+        found = {"l": self.expansion.l, "innovations": self.criterion == "prediction",
+                 "free": tuple(size > 1 for size in self.expansion.input_sizes)}
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -24,4 +24,4 @@ def projected(r):
     past, future = range(rows), range(rows, 2 * rows)
     inputs = statistics.at(range(m), future)
     instruments = np.concatenate([inputs, statistics.at(range(width), past)])
-    return {"values": rq(statistics, instruments, inputs, statistics.at(range(m, width), future)).singular_values}
+    return {"values": rq(statistics, instruments, inputs, statistics.at(range(m, width), future)).decomposition[1]}

@@ -1,29 +1,111 @@
-"""The compressed errors of a state-space model near its optimum, and how far they let the estimate scatter.
+"""The compressed errors of a model near its optimum, and how far they let the estimate scatter.
 
-What the errors leave open, changes of the states and of the scale between mu and b, has weight in the factor and no
-part in the scatter: intervals hold for whatever does not depend on it. Errors of a free run are coloured where noise
-enters before the output; their long autoregression makes the sandwich form of the covariance (Ljung, System
-Identification, 1999, chapter 9).
+What the errors of a state-space model leave open, changes of the states and of the scale between mu and b, has weight
+in the factor and no part in the scatter: intervals hold for whatever does not depend on it. Errors of a free run are
+coloured where noise enters before the output; their long autoregression makes the sandwich form of the covariance
+(Ljung, System Identification, 1999, chapter 9).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.identify.noise import regression_lags
+from optid.identify.prediction_error.descent import Criterion
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.identify.prediction_error.tangent_fit import CompressedErrors, LeastSquares
-from optid.program.compressed import Spread, degrees_of_freedom
+from optid.identify.prediction_error.tangent_fit import Places
+from optid.program.compressed import Spread, degrees_of_freedom, white_spread
 from optid.program.program import Program
 from optid.program.units import energy_unit
 from optid.statistics.coloured import long_autoregression, response_of, scattered
 from optid.statistics.hankel import complete_runs
+from optid.statistics.linearised import Linearised
 
 LEAST = 8  # order of the noise, at least, for which the autoregression has lags
 NO_EFFECT = 1e-9  # size of an effect on the errors, relative to the largest, that is rounding
+
+
+class LeastSquares(NamedTuple):
+    """``‖root z - target‖² + remainder``."""
+
+    root: Array
+    target: Array
+    remainder: float
+
+
+class ErrorRows(NamedTuple):
+    """The triangular factor ``root`` (n + 1, n + 1) of [sensitivities | errors], and the rows it came from."""
+
+    root: Array
+    rows: int
+    candidates: int
+    condition: float
+    method: str
+
+
+@dataclass(eq=False)
+class CompressedErrors:
+    """The compressed errors near an iterate, for uncertainty, prices and figures."""
+
+    criterion: Criterion  # the errors
+    at: Linearised  # these near the iterate
+    reference: Array  # (n,) variables of the iterate, flattened: z
+
+    @cached_property
+    def places(self) -> Places:
+        """Where the variables stand in z."""
+        return Places.of(self.criterion)
+
+    @property
+    def energy(self) -> Array:
+        """Sum of squares of the output about its mean, (1,)."""
+        return np.array([self.criterion.energy])
+
+    @property
+    def problem(self) -> LeastSquares:
+        """The sum of squares in z."""
+        root, errors = self.at.whole
+        return LeastSquares(root, root @ self.reference - errors, self.at.remainder)
+
+    @property
+    def statistics(self) -> ErrorRows:
+        """The same as a factor of rows."""
+        size, (matrix, errors) = len(self.reference), self.at.whole
+        root = np.zeros((size + 1, size + 1))
+        root[:size, :size], root[:size, size] = matrix, matrix @ self.reference - errors
+        root[size, size] = np.sqrt(self.at.remainder)
+        candidates = sum(e.y.size for e in self.criterion.data.experiments)
+        return ErrorRows(root, self.at.rows, candidates, self.condition, self.at.method)
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the scaled sensitivities."""
+        return self.at.condition
+
+    @property
+    def columns(self) -> NDArray[np.intp]:
+        """Positions (n, 1) in z of the coefficients of the columns."""
+        return np.arange(len(self.reference))[:, None]
+
+    def lifted(self, values: Mapping[str, Array]) -> Array:
+        """Return z."""
+        return self.places.pack(values)
+
+    def one_step_fit(self, values: Mapping[str, Array]) -> Array | None:
+        """Return the fit in % on the record: one step ahead an output-error model predicts what it simulates."""
+        value = self.at.after(self.lifted(values) - self.reference)
+        return 100.0 * (1.0 - np.sqrt(value / np.maximum(self.energy, 1e-300)))
+
+    def spread(self, z: Array, moves: Array) -> Spread:
+        """Return the scatter under white errors."""
+        return white_spread(self, z, moves)
 
 
 @dataclass(eq=False)
