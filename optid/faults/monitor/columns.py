@@ -10,7 +10,7 @@ from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
-Matrices = tuple[Array, Array, Array, Array]  # transition, output, gain and root of the search
+Matrices = tuple[Array, ...]  # transition, output, gain and root of the search
 
 COURSES = {"bias": LASTING, "drift": DRIFT, "jump": JUMP, "spike": JUMP, "loss": DRIVEN, "stuck": LASTING}
 """The course of the columns of a kind; the loss of a stuck actuator, its last column, is driven."""
@@ -152,7 +152,7 @@ class Window:
         self.statistic, self.weight = np.zeros(len(self.peak)), np.full(len(self.peak), -1.0)
         self.peak[:] = 0
 
-    def _search(self, matrices: Matrices, signals: tuple[Array, Array], r: Array, limit: Array, tabled: bool
+    def _search(self, matrices: Matrices, signals: tuple[Array, ...], r: Array, limit: Array, tabled: bool
                 ) -> tuple[int, Array, Array]:
         statistic, weight = np.empty((2, len(r), len(limit)))
         done = search(matrices, self.columns.arrays, signals, r, limit, tabled, self.table, self.work,
@@ -168,7 +168,7 @@ class Window:
         rows = np.repeat(still[self.columns.first], self.columns.pairs)
         self.gram[rows] = self.products[rows][:, at]
 
-    def advance(self, signals: tuple[Array, Array], r: Array, limit: Array, matrices: Matrices | None = None,
+    def advance(self, signals: tuple[Array, ...], r: Array, limit: Array, matrices: Matrices | None = None,
                 shown: int = 0) -> tuple[int, Array, Array]:
         """Search samples until one exceeds a limit; return how many, their statistics and weights (T, C).
 
