@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.faults.monitor.search_kernel import DRIFT, DRIVEN, JUMP, LASTING, search
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
@@ -133,7 +133,7 @@ class Window:
         self.columns, self.length, self.steady = columns, length, steady
         D, C, l = len(columns.course), len(columns.size), len(steady.C)  # noqa: E741
         pairs = int(columns.pairs.sum())
-        self.matrices = tuple(np.ascontiguousarray(part) for part in (steady.A, steady.C, steady.K, steady.root))
+        self.matrices = tuple(compact(part) for part in (steady.A, steady.C, steady.K, steady.root))
         self.xi, self.b, self.gram = (np.zeros((*shape, length)) for shape in ((D, room), (D,), (pairs,)))
         self.grown, self.whitened, self.readings = np.zeros(length), np.zeros((length, l)), np.zeros(length)
         self.peak, self.clock, self.clean = (np.zeros(size, dtype=np.int64) for size in (C, 1, 1))
