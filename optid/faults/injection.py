@@ -194,7 +194,7 @@ def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slic
     for values, samples in ((plan.output, now), (plan.state, before)):
         for i in functions_of(model, fault.name):
             if fault.kind == "loss":
-                values[samples, i] = (1.0 - size) * values[samples, i] + fault.bias
+                values[samples, i] = (1.0 - np.asarray(size)) * values[samples, i] + fault.bias
             else:
                 values[samples, i] = 0.0 if size is None else model.nonlinearities[i](stop)
 

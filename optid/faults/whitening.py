@@ -83,8 +83,8 @@ class Predictor:
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
         response = np.empty(into_output.shape)
-        kernels.respond(*map(compact, (self.A, self.C, self.K, self.L)), shown, compact(into_state),
-                        compact(into_output), response)
+        A, C, K, L, state, output = map(compact, (self.A, self.C, self.K, self.L, into_state, into_output))
+        kernels.respond(A, C, K, L, shown, state, output, response)
         return response
 
     def run(self, model: "HammersteinSS", x0: Array, f: Array, fed: Array, y: Array,
@@ -111,7 +111,8 @@ class Predictor:
             direct += added[1]
         x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
         x[0] = x0
-        predict(*map(np.ascontiguousarray, (model.A, model.C, self.K, self.root)), drive, y, direct, x, r)
+        A, C, K, root = map(compact, (model.A, model.C, self.K, self.root))
+        predict(A, C, K, root, drive, y, direct, x, r)
         return x, r
 
     def whitened(self, innovations: Array, present: Array | None = None) -> Array:

@@ -37,9 +37,6 @@ CHUNK = 20_000
 RUNS = 4
 """Simulations that may run at the same time; the result does not depend on how many do."""
 
-HOLD = 5
-"""Samples over which the simulated input keeps its level."""
-
 NODES = 80
 """Nodes of the quadrature; the run lengths of the usual charts are right to ten digits."""
 
@@ -144,14 +141,9 @@ def calibrate(
 
 
 def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: Array) -> Array:
-    """Return the largest statistics (B, C) of blocks of W samples along whitened innovations.
+    """Return the largest statistics (B, C) of blocks of W samples along whitened innovations r (T, l).
 
-    Args:
-        columns: of the candidates.
-        steady: the predictor behind the innovations.
-        window: samples W of window and block; what is left over at the end does not count.
-        f: (T + 1, r) functions of the inputs, from one sample earlier on.
-        r: (T, l) whitened innovations.
+    The functions f (T + 1, r) of the inputs begin one sample earlier; what is left over at the end does not count.
     """
     kept = Window(columns, window, len(steady.A), steady)
     _, statistic, _ = kept.advance(columns.signals(f[:-1], f[1:]), np.ascontiguousarray(r),
@@ -163,10 +155,7 @@ def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: 
 def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
     """Return thresholds (C,) at one rate of their own, all together at the rate 1 / ARL0, and the alarms counted.
 
-    Args:
-        largest: (B, C) statistics of blocks.
-        length: samples of a block.
-        arl0: samples between alarms.
+    They belong to the largest statistics (B, C) of blocks of `length` samples.
     """
     goal = -np.expm1(-length / arl0)
     level = goal / largest.shape[1]  # as if the candidates had nothing in common
@@ -197,12 +186,6 @@ def tail(column: Array, level: float) -> float:
     start = ordered[count - base - 1]
     scale = float(np.mean(ordered[count - base :] - start))
     return float(start + scale * np.log(base / exceed))
-
-
-def held_levels(low: Array, high: Array, count: int, seed: int | None) -> Array:
-    """Return inputs (N, m), uniform between two bounds, every level held."""
-    drawn = np.random.default_rng(seed).uniform(low, high, (-(-count // HOLD), len(low)))
-    return np.repeat(drawn, HOLD, axis=0)[:count]
 
 
 def cusum_arl(shift: float, k: float = 0.5, h: float = 5.0, *, two_sided: bool = True) -> float:

@@ -4,13 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.faults.monitor.search_kernel import DRIFT, DRIVEN, JUMP, LASTING, search
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
-Matrices = tuple[Array, Array, Array, Array]  # transition, output, gain and root of the search
+Matrices = tuple[Array, ...]  # transition, output, gain and root of the search
 
 COURSES = {"bias": LASTING, "drift": DRIFT, "jump": JUMP, "spike": JUMP, "loss": DRIVEN, "stuck": LASTING}
 """The course of the columns of a kind; the loss of a stuck actuator, its last column, is driven."""
@@ -133,7 +133,7 @@ class Window:
         self.columns, self.length, self.steady = columns, length, steady
         D, C, l = len(columns.course), len(columns.size), len(steady.C)  # noqa: E741
         pairs = int(columns.pairs.sum())
-        self.matrices = tuple(np.ascontiguousarray(part) for part in (steady.A, steady.C, steady.K, steady.root))
+        self.matrices = tuple(compact(part) for part in (steady.A, steady.C, steady.K, steady.root))
         self.xi, self.b, self.gram = (np.zeros((*shape, length)) for shape in ((D, room), (D,), (pairs,)))
         self.grown, self.whitened, self.readings = np.zeros(length), np.zeros((length, l)), np.zeros(length)
         self.peak, self.clock, self.clean = (np.zeros(size, dtype=np.int64) for size in (C, 1, 1))
@@ -152,7 +152,7 @@ class Window:
         self.statistic, self.weight = np.zeros(len(self.peak)), np.full(len(self.peak), -1.0)
         self.peak[:] = 0
 
-    def _search(self, matrices: Matrices, signals: tuple[Array, Array], r: Array, limit: Array, tabled: bool
+    def _search(self, matrices: Matrices, signals: tuple[Array, ...], r: Array, limit: Array, tabled: bool
                 ) -> tuple[int, Array, Array]:
         statistic, weight = np.empty((2, len(r), len(limit)))
         done = search(matrices, self.columns.arrays, signals, r, limit, tabled, self.table, self.work,
@@ -168,7 +168,7 @@ class Window:
         rows = np.repeat(still[self.columns.first], self.columns.pairs)
         self.gram[rows] = self.products[rows][:, at]
 
-    def advance(self, signals: tuple[Array, Array], r: Array, limit: Array, matrices: Matrices | None = None,
+    def advance(self, signals: tuple[Array, ...], r: Array, limit: Array, matrices: Matrices | None = None,
                 shown: int = 0) -> tuple[int, Array, Array]:
         """Search samples until one exceeds a limit; return how many, their statistics and weights (T, C).
 

@@ -58,13 +58,14 @@ def load(monitor: "Monitor", path: str | Path, functions: dict[str, Any] | None 
         names += ["sines", *(f"predictor_{name}" for name in PREDICTOR)]
         names += [f"search_{name}" for name in Window.KEPT] + [f"plant_{name}" for name in RunningFilter.KEPT]
         _, arrays = read_state(path, "monitor", VERSION, names)
-        candidates = tuple(
-            Candidate(**{word: tuple(value) if isinstance(value, list) else value for word, value in c.items()},
-                      **{place: arrays[f"{place}_{i}"] for place in PLACES})
-            for i, c in enumerate(head["candidates"])
-        )
-        steady = Predictor(*(arrays[f"predictor_{name}"] for name in PREDICTOR), int(head["silent"]))
-        found = Dictionary(from_content(head["model"], functions), steady, candidates, head["excluded"],
+        candidates = []
+        for i, c in enumerate(head["candidates"]):
+            words: dict[str, Any] = {word: tuple(v) if isinstance(v, list) else v for word, v in c.items()}
+            candidates.append(Candidate(**words, into_state=arrays[f"into_state_{i}"],
+                                        into_output=arrays[f"into_output_{i}"]))
+        parts: dict[str, Any] = {name: arrays[f"predictor_{name}"] for name in PREDICTOR}
+        steady = Predictor(**parts, silent=int(head["silent"]))
+        found = Dictionary(from_content(head["model"], functions), steady, tuple(candidates), head["excluded"],
                            arrays["sines"], head["unknown"])
         monitor._set(found, head["window"], head["seed"], head["rules"])
         monitor.calibration = Calibration.from_dict(head["calibration"])

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
-from optid.faults.monitor.arl import Calibration, calibrate, held_levels
+from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 KINDS_BY_DEFAULT = ("bias", "loss", "spike")
 
-INPUTS = 20_000
-"""Samples of simulated input for the calibration."""
+INPUTS, HOLD = 20_000, 5
+"""Samples of simulated input for the calibration, and those over which it keeps its level."""
 
 BLOCK = 4096
 """Samples searched at a time."""
@@ -199,7 +199,8 @@ class Monitor:
         for c, nonlinearity in zip(model.input_of, model.nonlinearities):
             spans[c] = nonlinearity.basis.interval or spans[c]
         low, high = np.array(spans).T
-        return model.expanded(held_levels(low, high, INPUTS, self.seed))
+        drawn = np.random.default_rng(self.seed).uniform(low, high, (INPUTS // HOLD, model.m))
+        return model.expanded(np.repeat(drawn, HOLD, axis=0))
 
     # -- samples -------------------------------------------------------------------------------------------------
 

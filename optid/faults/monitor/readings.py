@@ -62,12 +62,12 @@ class ReadingChecks:
 
     def screen(self, u: Array, y: Array, start: int) -> Screened:
         """Check a block of inputs (T, m) and readings (T, l) that begins at the sample `start` of the stream."""
-        outside, blind = np.asarray((u < self.low) | (u > self.high)), np.isnan(u)
-        found = Screened(y.copy(), outside | blind, np.zeros(len(y), dtype=bool), [], {})
+        outside, blind = np.asarray((u < self.low) | (u > self.high)), np.asarray(np.isnan(u).any(axis=1))
+        found = Screened(y.copy(), outside | np.isnan(u), np.zeros(len(y), dtype=bool), [], {})
         for c in range(u.shape[1]):
             self._range(c, u[:, c], outside[:, c], start, found.events)
         for o in range(y.shape[1]):
-            self._sensor(o, blind.any(axis=1), start, found)
+            self._sensor(o, blind, start, found)
         found.events.sort(key=lambda e: e.sample)
         return found
 

@@ -293,9 +293,9 @@ class _Tests:
             statistics = hankel_statistics([record], 3 * self.alpha, centre="mean", method="gram")
             statistics.check()
         except RankError as error:
-            nothing = (tuple(ZeroTest(name, *3 * (np.nan,), healthy=0.0) for name in names)
-                       for names in (self.sensors, self.actuators))
-            return WindowVerdict(*place, None, str(error), float("nan"), *nothing)
+            rows, columns = (tuple(ZeroTest(name, *3 * (np.nan,), healthy=0.0) for name in names)
+                             for names in (self.sensors, self.actuators))
+            return WindowVerdict(*place, None, str(error), float("nan"), rows, columns)
         excitation = self.excitation(statistics, nominal.sizes) / nominal.excitation
         rows, columns, moving = self.channel_tests(statistics, nominal.sizes, nominal, self.level)
         order, least = None, 0
