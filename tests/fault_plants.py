@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from optid.bases import UserFunctions
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
@@ -32,3 +33,10 @@ def levels(count, seed, m=2, hold=5):
     """Inputs uniform on [-1.2, 1.2], every level held."""
     drawn = np.random.default_rng(seed).uniform(-1.2, 1.2, (-(-count // hold), m))
     return np.repeat(drawn, hold, axis=0)[:count]
+
+
+def refused(*cases):
+    """Every call (error, words, call) raises this error with these words."""
+    for error, words, call in cases:
+        with pytest.raises(error, match=words):
+            call()
