@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from optid.bases import UserFunctions
 from optid.data.record import Data
@@ -46,3 +47,10 @@ def record(model, seed, faults=(), missing=0.0, count=50):
     y = inject(model, u, faults, seed=seed, process={"load": LOAD})
     y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
     return Data(u, y)
+
+
+def refused(*cases):
+    """Every call (error, words, call) raises this error with these words."""
+    for error, words, call in cases:
+        with pytest.raises(error, match=words):
+            call()

@@ -12,16 +12,15 @@ from scipy.optimize import brentq
 from scipy.stats import norm
 from test_fault_injection import small
 
-from optid import Data
 from optid.errors import ModelFileError, StructureError
-from optid.faults import Answer, Certificate, Diagnosis, Estimate, dictionary, load_diagnosis, scan, thresholds, whiten
+from optid.faults import Answer, Certificate, Diagnosis, Estimate, dictionary, load_diagnosis, scan, thresholds
 from optid.faults.consistency.leftover import alarm_probability, left_over
 from optid.faults.diagnosis.answers import Remaining
 from optid.faults.diagnosis.intervals import mixture_intervals, onset_range
 from optid.faults.diagnosis.posterior import SPREADS, marginal, several, single, smallest_set
 from optid.faults.search.pair_search import pairs
 from optid.faults.search.sweeps import sweep
-from optid.faults.whitening import Whitened, predictor
+from optid.faults.whitening import Whitened
 
 LOAD = np.array([0.3, -0.2, 0.5])
 
@@ -284,10 +283,3 @@ def test_words_stay_within_eighty_columns_and_cut_shares_to_what_is_possible():
 def test_a_saved_diagnosis_has_no_picture():
     with pytest.raises(StructureError, match="record is not in"):
         example().plot()
-
-
-def test_innovations_are_those_of_the_predictor(found):
-    """The window by hand and by `whiten` are the same kind of thing."""
-    record = Data(np.zeros((30, 2)), np.zeros((30, 2)))
-    assert whiten(small(), record).r.shape == noise(found, 30).r.shape
-    np.testing.assert_allclose(predictor(small()).root, found.predictor.root)

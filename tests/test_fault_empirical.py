@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_plants import levels, noisy
+from fault_plants import levels, noisy, refused
 
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
@@ -133,14 +133,14 @@ def test_diagnosis_takes_the_thresholds_of_a_healthy_record(found):
 def test_refusals(found):
     data = record(200, 21)
     white = whiten(found.model, data)
-    with pytest.raises(DataError, match="does not fit"):
-        sliding_scan(found, white, 201)
-    with pytest.raises(StructureError, match="hop must be a positive integer; got 0"):
-        sliding_scan(found, white, WINDOW, hop=0)
-    with pytest.raises(DataError, match="u has 150 samples; the record has 200"):
-        sliding_scan(found, white, WINDOW, u=data.u[:150])
-    with pytest.raises(DataError, match="u is of 1 experiments, the record of 2"):
-        empirical_thresholds(found, [white, white], WINDOW, 0.2, u=[data.u])
+    refused(
+        (DataError, "does not fit", lambda: sliding_scan(found, white, 201)),
+        (StructureError, "hop must be a positive integer; got 0", lambda: sliding_scan(found, white, WINDOW, hop=0)),
+        (DataError, "u has 150 samples; the record has 200",
+         lambda: sliding_scan(found, white, WINDOW, u=data.u[:150])),
+        (DataError, "u is of 1 experiments, the record of 2",
+         lambda: empirical_thresholds(found, [white, white], WINDOW, 0.2, u=[data.u])),
+    )
     course, limits = sliding_scan(found, white, WINDOW), thresholds(found, 30, 0.05, draws=2000)
     with pytest.raises(StructureError, match="windows of 30 samples, not 25"):
         course.alarms(limits)

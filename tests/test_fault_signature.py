@@ -6,7 +6,7 @@ from itertools import combinations
 import cvxpy as cp
 import numpy as np
 import pytest
-from fault_plants import levels
+from fault_plants import levels, refused
 from test_fault_injection import small
 
 from optid import Data
@@ -369,14 +369,14 @@ def test_bad_input(found, limits):
     for most in (0, 1.5, -1):
         with pytest.raises(StructureError, match="max_faults must be"):
             polish(s, limits, max_faults=most)
-    with pytest.raises(StructureError, match="too many for an exact search"):
-        polish(s, limits, max_faults=6)
-    with pytest.raises(LookupFailed, match="fault.signature"):
-        fault_formulation("fault.signatur")
-    with pytest.raises(StructureError, match="not convex"):
-        signature_estimate(s, limits, constraints=[lambda v: cp.norm(v["size[sensor:y1]"]) >= 1])
-    with pytest.raises(StructureError, match="no fault|none|does not have|asks for"):
-        signature_estimate(s, limits, constraints=[lambda v: v["size[sensor:y9]"] >= 1])
+    refused(
+        (StructureError, "too many for an exact search", lambda: polish(s, limits, max_faults=6)),
+        (LookupFailed, "fault.signature", lambda: fault_formulation("fault.signatur")),
+        (StructureError, "not convex",
+         lambda: signature_estimate(s, limits, constraints=[lambda v: cp.norm(v["size[sensor:y1]"]) >= 1])),
+        (StructureError, "no fault|none|does not have|asks for",
+         lambda: signature_estimate(s, limits, constraints=[lambda v: v["size[sensor:y9]"] >= 1])),
+    )
     wide = replace(s, statistic=np.zeros((len(found.labels), 100_000)))
     with pytest.raises(StructureError, match="shorter window"):
         atoms_of(wide, limits)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_plants import levels, noisy, standard
+from fault_plants import levels, noisy, refused, standard
 from scipy.stats import chi2, ncx2
 from test_fault_injection import small
 from typer.testing import CliRunner
@@ -148,14 +148,12 @@ def test_it_prints_within_80_columns_and_draws(standard_study, found, tmp_path):
 
 
 def test_bad_input(found):
-    with pytest.raises(StructureError, match="at least 8 samples"):
-        found.isolability(7)
-    with pytest.raises(StructureError, match="prob="):
-        found.isolability(40, prob=1.0)
-    with pytest.raises(StructureError, match="false_alarm="):
-        found.isolability(40, false_alarm=0.0)
-    with pytest.raises(DataError, match="at least 50000000 draws"):
-        found.isolability(40, false_alarm=1e-6)
+    refused(
+        (StructureError, "at least 8 samples", lambda: found.isolability(7)),
+        (StructureError, "prob=", lambda: found.isolability(40, prob=1.0)),
+        (StructureError, "false_alarm=", lambda: found.isolability(40, false_alarm=0.0)),
+        (DataError, "at least 50000000 draws", lambda: found.isolability(40, false_alarm=1e-6)),
+    )
     for onset in ("middle", 40, -1):
         with pytest.raises(StructureError, match="onset="):
             found.isolability(40, onset=onset)

@@ -197,8 +197,8 @@ def study(
         raise StructureError(f"onset={known} lies outside the window of {window} samples.")
     space = sweep(found, window, u)
     if known is not None:
-        space = replace(space, tested=(space.blocks.sizes > 0)[:, None] & (np.arange(window) == known))
-    named = np.flatnonzero(space.blocks.sizes)
+        space = replace(space, tested=(space.tables.sizes > 0)[:, None] & (np.arange(window) == known))
+    named = np.flatnonzero(space.tables.sizes)
     candidates = [found.candidates[c] for c in named]
     first, second = np.random.SeedSequence(seed).generate_state(2)
     windows = space.simulated(calibration, np.random.default_rng(int(first)))
@@ -231,7 +231,7 @@ def study(
 def _scores(space: Sweep, windows: Array) -> list[Array]:
     """Coordinates (M, T, d) of windows along every candidate at the onsets that are searched."""
     found = np.stack([space.correlations(window) for window in windows])
-    return [space.coordinates(found, int(c))[:, space.tested[c]] for c in np.flatnonzero(space.blocks.sizes)]
+    return [space.coordinates(found, int(c))[:, space.tested[c]] for c in np.flatnonzero(space.tables.sizes)]
 
 
 class _Curves(NamedTuple):
@@ -255,7 +255,7 @@ class _Curves(NamedTuple):
 def _curves(
     space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
 ) -> _Curves:
-    c, draws, window = int(np.flatnonzero(space.blocks.sizes)[place]), len(noise[0]), space.window
+    c, draws, window = int(np.flatnonzero(space.tables.sizes)[place]), len(noise[0]), space.window
     low, high = (int(share * window) for share in MIDDLE)
     onsets = np.full(draws, known) if known is not None else rng.integers(low, max(high, low + 1), draws)
     sizes, unit = _directions(space, c, known, draws, rng)

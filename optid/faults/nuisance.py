@@ -17,7 +17,7 @@ are larger. A later healthy record shows by how much: `model_uncertainty(model, 
 largest factor that the record allows.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -98,13 +98,7 @@ class ModelUncertainty:
     @cached_property
     def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
         """Two models beside the model along every column of root, and what their difference is multiplied by."""
-        theta, steps, back = parameters(self.model)
-        largest = np.abs(self.root / steps[:, None]).max(axis=0, initial=0.0)
-        largest[largest == 0] = 1.0
-        found = []
-        for column, size in zip(self.root.T, largest):
-            found.append((back(theta + column / size), back(theta - column / size), float(size / 2)))
-        return found
+        return list(moved_models(self.model, self.root))
 
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
         """Return what the uncertainty leaves in the whitened innovations of a record.
@@ -150,23 +144,18 @@ def model_uncertainty(
         DataError: fewer than two readings for each direction of the parameters that changes the predictions.
         StructureError: no noise covariances.
     """
-    raw = in_units_of(model, data)
-    steady = _forgetting(model, sum(len(part.y) for part in raw.experiments)) if decoupled is None else decoupled
+    count = sum(len(part.y) for part in data.experiments)
+    steady = _forgetting(model, count) if decoupled is None else decoupled
     gained = replace(model, K=steady.K)
-    given = gained.initial_state(raw, "predict")
-    starts = given if isinstance(given, tuple) else (given,)
-    count = len(parameters(gained)[0])
-    information, readings, energy = np.zeros((count, count)), 0, 0.0
-    for part, x0 in zip(raw.experiments, starts):
-        present = ~np.isnan(part.y)
-        by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(count))
+    size = len(parameters(gained)[0])
+    information, readings, energy = np.zeros((size, size)), 0, 0.0
+    for part, x0, present, white in _predicted(gained, steady, data):
+        by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
         rest = by_parameter - basis @ (basis.T @ by_parameter)
         information += rest.T @ rest
         readings += int(present.sum()) - basis.shape[1] - steady.silent * int(present.all(axis=1).sum())
-        errors = np.where(present, part.y - simulation.run(_job(gained, part), x0), 0.0)
-        white = steady.whitened(errors, present).ravel()
         energy += float(np.sum((white - basis @ (basis.T @ white)) ** 2))
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0] = 1.0
@@ -186,16 +175,12 @@ def model_uncertainty(
 
 def _inflated(found: ModelUncertainty, healthy: Data) -> ModelUncertainty:
     """Multiply the covariance by the largest factor that a healthy record allows."""
-    raw, gained = in_units_of(found.model, healthy), found.model
-    given = gained.initial_state(raw, "predict")
     spreads, seen = [], []
-    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
-        present = ~np.isnan(part.y)
+    for part, x0, present, white in _predicted(found.model, found.predictor, healthy):
         nuisance = found.nuisance(part, x0, present)
-        errors = np.where(present, part.y - simulation.run(_job(gained, part), x0), 0.0)
         axes = nuisance.s < np.sqrt(DIFFUSE)  # the others are those of the initial state
         spreads.append(nuisance.s[axes] ** 2)
-        seen.append((nuisance.U[:, axes].T @ found.predictor.whitened(errors, present).ravel()) ** 2)
+        seen.append((nuisance.U[:, axes].T @ white) ** 2)
     s2, z2 = np.concatenate(spreads), np.concatenate(seen)
     factor = largest_factor(s2, z2)
     return replace(found, root=np.sqrt(factor) * found.root, inflation=factor)
@@ -227,17 +212,25 @@ def _forgetting(model: "HammersteinSS", samples: int) -> Predictor:
     return predictor(replace(model, noise=replace(model.noise, R=more)))
 
 
-def _job(model: "HammersteinSS", part: Experiment) -> simulation.Run:
-    return simulation.prepared(model, "predict", part.u, part.y, None, "")
+def _predicted(
+    model: "HammersteinSS", steady: Predictor, data: Data
+) -> "Iterator[tuple[Experiment, Array, np.ndarray, Array]]":
+    """Every experiment with its initial state, whether a reading is there, and its whitened innovations (N l,)."""
+    raw = in_units_of(model, data)
+    given = model.initial_state(raw, "predict")
+    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
+        present = ~np.isnan(part.y)
+        yield part, x0, present, _whitened(model, steady, part, x0, present)
+
+
+def _whitened(model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: np.ndarray) -> Array:
+    job = simulation.prepared(model, "predict", part.u, part.y, None, "")
+    errors = np.where(present, part.y - simulation.run(job, x0), 0.0)
+    return steady.whitened(errors, present).ravel()
 
 
 def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:
-    """Return the uncertainty of a model that is exact, in records whose initial state is estimated.
-
-    Args:
-        model: with noise covariances.
-        steady: its predictor.
-    """
+    """Return the uncertainty of a model that is exact, in records whose initial state is estimated."""
     gained = replace(model, K=steady.K)
     return ModelUncertainty(gained, steady, np.zeros((len(parameters(gained)[0]), 0)), 0)
 
@@ -262,23 +255,25 @@ def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], 
     return np.concatenate(parts), np.concatenate(steps), back
 
 
+def moved_models(
+    model: "HammersteinSS", root: Array
+) -> "Iterator[tuple[HammersteinSS, HammersteinSS, float]]":
+    """Yield two models on both sides along every column of root, and what their difference is multiplied by."""
+    theta, steps, back = parameters(model)
+    largest = np.abs(root / steps[:, None]).max(axis=0, initial=0.0)
+    largest[largest == 0] = 1.0
+    for column, size in zip(root.T, largest):  # no parameter moves by more than its step
+        yield back(theta + column / size), back(theta - column / size), float(size / 2)
+
+
 def sensitivities(
     model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array
 ) -> tuple[Array, Array]:
     """Derivatives (N l, q) and (N l, n) of the whitened innovations along the columns of root and by the start."""
-    theta, steps, back = parameters(model)
-    scaled = root / steps[:, None]
-    largest = np.abs(scaled).max(axis=0, initial=0.0)
-    largest[largest == 0] = 1.0
-
-    def white(changed: "HammersteinSS") -> Array:
-        errors = np.where(present, part.y - simulation.run(_job(changed, part), x0), 0.0)
-        return steady.whitened(errors, present).ravel()
-
     columns = np.empty((present.size, root.shape[1]))
-    for j in range(root.shape[1]):
-        move = root[:, j] / largest[j]  # no parameter moves by more than its step
-        columns[:, j] = (white(back(theta + move)) - white(back(theta - move))) * (largest[j] / 2)
+    for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
+        sides = [_whitened(moved, steady, part, x0, present) for moved in (plus, minus)]
+        columns[:, j] = (sides[0] - sides[1]) * factor
     impulse = np.zeros((len(part.y), model.nx, model.nx))
     impulse[0] = np.eye(model.nx)
     start = steady.respond(impulse, np.zeros((len(part.y), model.l, model.nx)), present)

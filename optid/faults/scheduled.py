@@ -44,10 +44,7 @@ def with_schedules(found: "Dictionary", schedules: Mapping[str, Fault]) -> "Dict
         if new.label in (*found.labels, *(c.label for c in more)):
             raise StructureError(f"{new.label} is in the dictionary already.")
         more.append(new)
-    size = len(found.candidates) + len(more)
-    sines = np.full((size, size), np.nan)
-    sines[: len(found.candidates), : len(found.candidates)] = found.sines
-    return replace(found, candidates=(*found.candidates, *more), sines=sines)
+    return found.with_candidates(more)
 
 
 def change(model: "HammersteinSS", candidate: "Candidate", states: Array, u: Array) -> tuple[Array, Array]:

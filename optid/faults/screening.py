@@ -2,12 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import permutations, product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.whitening import Whitened, predictor, whiten
@@ -20,6 +19,7 @@ FLAT = 3
 """Readings identical to the bit that are no coincidence when the noise is continuous."""
 
 UNITS = (1000.0, 100.0, 60.0, 25.4, 10.0, 9.81, 9 / 5, np.pi / 180)
+FACTORS = (*UNITS, *(1 / unit for unit in UNITS))
 """Factors by which units of the same quantity differ."""
 
 BETTER = 0.1
@@ -101,39 +101,29 @@ def check_channels(model: "HammersteinSS", data: Data) -> None:
                  lambda order: _energy(model, raw.mapped(lambda u: u, lambda y: y[:, order])))
     _check_order("inputs", data.inputs, energy,
                  lambda order: _energy(model, raw.mapped(lambda u: u[:, order], lambda y: y)))
-    for c, name in enumerate(data.inputs):
-        for factor in [*UNITS, *(1 / unit for unit in UNITS)]:
-            scale = np.ones(data.m)
-            scale[c] = 1 / factor
-            trial = _energy(model, raw.mapped(lambda u, s=scale: u * s, lambda y: y))
-            if trial < BETTER * energy and trial < 2 * readings:
-                raise DataError(
-                    f"Input {name!r} seems to be in another unit: the record fits the model when it is divided by "
-                    f"{factor:g}. Convert it."
-                )
-    for number in range(raw.n_experiments):
-        for o, name in enumerate(data.outputs):
-            found = _unit_jump(model, raw, number, o)
-            if found is not None:
-                where = f"experiment {number + 1}: " * (raw.n_experiments > 1)
-                raise DataError(
-                    f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on the "
-                    f"readings fit the model when divided by {found[1]:g}. Convert them."
-                )
+    for (c, name), factor in product(enumerate(data.inputs), FACTORS):
+        scale = np.where(np.arange(data.m) == c, 1 / factor, 1.0)
+        trial = _energy(model, raw.mapped(lambda u, s=scale: u * s, lambda y: y))
+        if trial < BETTER * energy and trial < 2 * readings:
+            raise DataError(
+                f"Input {name!r} seems to be in another unit: the record fits the model when it is divided by "
+                f"{factor:g}. Convert it."
+            )
+    for (number, part), (o, name) in product(enumerate(raw.experiments), enumerate(data.outputs)):
+        found = _unit_jump(model, Data(part.u, part.y, raw.dt, raw.inputs, raw.outputs), o)
+        if found is not None:
+            where = f"experiment {number + 1}: " * (raw.n_experiments > 1)
+            raise DataError(
+                f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on the readings "
+                f"fit the model when divided by {found[1]:g}. Convert them."
+            )
 
 
 def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[[list[int]], float]) -> None:
-    """Refuse channels that the model predicts ten times better in another order.
-
-    Args:
-        what: "inputs" or "outputs".
-        names: of the channels.
-        energy: of the innovations as they are.
-        of: energy in another order.
-    """
+    """Refuse channels whose innovations have a tenth of the energy in another order, of which `of` is the energy."""
     if not 1 < len(names) <= 5:
         return
-    orders = [order for order in permutations(range(len(names))) if order != tuple(range(len(names)))]
+    orders = list(permutations(range(len(names))))[1:]  # the first is that of the record
     trials = [of(list(order)) for order in orders]
     best = int(np.argmin(trials))
     if trials[best] < BETTER * energy:
@@ -144,20 +134,16 @@ def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[
         )
 
 
-def _unit_jump(model: "HammersteinSS", raw: Data, number: int, o: int) -> tuple[int, float] | None:
-    """Return the first sample and the factor of the change of a unit, if that explains the record."""
-    part = raw.experiments[number]
-    alone = Data(part.u, part.y, raw.dt, raw.inputs, raw.outputs)
-    energy, count = _energy(model, alone), len(part.y)
-    steady, found = predictor(model), whiten(model, alone)
-    large = np.abs(found.innovations[:, o]) / np.sqrt(steady.covariance[o, o])
-    for onset in np.flatnonzero(large > 6)[:3]:
-        for factor in [*UNITS, *(1 / unit for unit in UNITS)]:
-            divided = np.array(part.y)
-            divided[onset:, o] /= factor
-            trial = _energy(model, Data(part.u, divided, raw.dt, raw.inputs, raw.outputs))
-            if trial < BETTER * energy and trial < 2 * count * raw.l:
-                return int(onset), float(factor)
+def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float] | None:
+    """The first sample and the factor of the change of a unit, if that explains a record of one experiment."""
+    energy, found = _energy(model, alone), whiten(model, alone)
+    large = np.abs(found.innovations[:, o]) / np.sqrt(predictor(model).covariance[o, o])
+    for onset, factor in product(np.flatnonzero(large > 6)[:3], FACTORS):
+        divided = np.array(alone.y)
+        divided[onset:, o] /= factor
+        trial = _energy(model, Data(alone.u, divided, alone.dt, alone.inputs, alone.outputs))
+        if trial < BETTER * energy and trial < 2 * divided.size:
+            return int(onset), float(factor)
     return None
 
 
@@ -167,11 +153,10 @@ def _energy(model: "HammersteinSS", data: Data) -> float:
         found = whiten(model, data)
     except DataError:
         return float("inf")
-    parts = [found] if isinstance(found, Whitened) else list(found)
-    return float(sum(np.sum(part.r**2) for part in parts))
+    return float(sum(np.sum(part.r**2) for part in ([found] if isinstance(found, Whitened) else found)))
 
 
-def _runs(y: Array) -> tuple[np.ndarray, np.ndarray]:
+def _runs(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First samples and lengths of the runs of equal readings; missing ones belong to none."""
     edges = np.flatnonzero(np.concatenate([[True], y[1:] != y[:-1]]))
     counts = np.diff(np.append(edges, y.size))

@@ -1,7 +1,7 @@
 """The dictionary: what every possible fault leaves in the whitened innovations, and which of them look the same."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -22,13 +22,8 @@ if TYPE_CHECKING:
 ADDITIVE = ("bias", "drift", "jump", "spike")
 """Kinds whose signature depends on nothing but the model and the time since the onset."""
 
-COURSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "bias": lambda since: since >= 0,
-    "drift": lambda since: np.maximum(since + 1, 0),
-    "jump": lambda since: since == 0,
-    "spike": lambda since: since == 0,
-}
-"""Their course over the samples since the onset."""
+SUMS = {"jump": 0, "spike": 0, "drift": 2}
+"""How often the response to an impulse is summed for the signature of a kind; once for the others."""
 
 KINDS = {
     "bias": ("actuator", "sensor", "process"),
@@ -148,6 +143,13 @@ class Dictionary:
         rows, columns = np.nonzero(np.triu(np.nan_to_num(self.sines, nan=1.0) < NEAR, 1))
         return [(self.labels[i], self.labels[j], float(self.sines[i, j])) for i, j in zip(rows, columns)]
 
+    def with_candidates(self, more: Sequence[Candidate]) -> "Dictionary":
+        """Return the dictionary with further candidates behind its own."""
+        count = len(self.candidates) + len(more)
+        sines = np.full((count, count), np.nan)
+        sines[: len(self.candidates), : len(self.candidates)] = self.sines
+        return replace(self, candidates=(*self.candidates, *more), sines=sines)
+
     def __getitem__(self, name: str) -> Candidate:
         """Return the candidate of a label, of a member of a group, or of a place with one kind.
 
@@ -169,17 +171,8 @@ class Dictionary:
         """Return what one unit of each magnitude leaves in the whitened innovations, (N, l, d).
 
         The magnitudes are the size of a bias, the slope of a drift, the jump of the state, the share lost, or the share
-        lost and the constants added (stuck).
-
-        Args:
-            candidate: the candidate or its label.
-            count: number of samples N.
-            onset: first sample that it can change.
-            u: (N, m) inputs, for a loss and a stuck actuator.
-            present: (N, l) whether a reading is there.
-
-        Raises:
-            StructureError: a frozen sensor or a noise, which have no course of their own; a loss without u.
+        lost and the constants added (stuck). Arguments and errors as of `additions`; `present` (N, l) says which
+        readings are there.
         """
         into_state, into_output = self.additions(candidate, count, onset, u)
         return self.predictor.whitened(self.predictor.respond(into_state, into_output, present), present)
@@ -200,7 +193,9 @@ class Dictionary:
         c = self[candidate] if isinstance(candidate, str) else candidate
         since = np.arange(count) - onset
         if c.additive:
-            course = COURSES[c.kind](since).astype(float)
+            course = (since == 0).astype(float)
+            for _ in range(SUMS.get(c.kind, 1)):
+                course = np.cumsum(course)
             return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
         if c.kind == "schedule":
             raise StructureError(f"{c.label}: its signature depends on the states: ask scan(...) for it.")
@@ -279,9 +274,9 @@ def dictionary(
         DataWarning: faults that were merged or left out.
     """
     wanted = [kinds] if isinstance(kinds, str) else list(kinds)
-    for kind in wanted:
-        if kind not in KINDS:
-            raise LookupFailed(f"no fault of kind {kind!r}. {nearest(kind, KINDS)}")
+    unknown_kinds = [kind for kind in wanted if kind not in KINDS]
+    if unknown_kinds:
+        raise LookupFailed(f"no fault of kind {unknown_kinds[0]!r}. {nearest(unknown_kinds[0], KINDS)}")
     declared = [disturbances] if isinstance(disturbances, str) else list(disturbances)
     steady = predictor(model)
     if declared:
@@ -296,11 +291,8 @@ def dictionary(
            if name.partition(":")[0] in KINDS[kind]]
     if state_jump or "jump" in wanted:
         raw.append(_candidate(model, "state", "jump", None, {}))
-    found, excluded = [], {}
-    for candidate in raw:
-        kept = _seen(model, steady, candidate, excluded)
-        if kept is not None:
-            found.append(kept)
+    excluded: dict[str, str] = {}
+    found = [kept for candidate in raw for kept in _seen(steady, candidate, excluded)]
     if not found:
         raise StructureError("No output sees any of the faults: there is nothing to look for.")
     merged, sines = _merged(steady, found)
@@ -321,14 +313,12 @@ def _candidate(
     model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None, zeros: Mapping[str, float]
 ) -> Candidate:
     into_state, into_output = place_of(model, name, None, process)
-    columns: tuple[int, ...] = ()
-    zero = None
+    new = Candidate(name, kind, into_state, into_output, places=(name,))
     if kind in ("loss", "stuck") and name.startswith("actuator"):
-        zero = zeros.get(name.partition(":")[2])
         c = channel_of(model.inputs, name)
         columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
-    new = Candidate(name, kind, into_state, into_output, columns, zero=zero)
-    return replace(new, members=(new.own_label,), places=(name,))
+        new = replace(new, columns=columns, zero=zeros.get(name.partition(":")[2]))
+    return replace(new, members=(new.own_label,))
 
 
 def _horizon(steady: Predictor) -> int:
@@ -342,20 +332,19 @@ def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
     direct = np.zeros((count, *candidate.into_output.shape))
     direct[0] = candidate.into_output
     found = steady.whitened(steady.respond(impulse, direct))
-    for _ in range({"jump": 0, "spike": 0, "drift": 2}.get(candidate.kind, 1)):
+    for _ in range(SUMS.get(candidate.kind, 1)):
         found = np.cumsum(found, axis=0)
     return found
 
 
-def _seen(model: "HammersteinSS", steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> Any:
-    """Keep the directions that some output sees, and flag a trace that dies out."""
+def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> list[Candidate]:
+    """Keep the directions that some output sees, and flag a trace that dies out; nothing where none is seen."""
     trace = response(steady, candidate, _horizon(steady))
-    flat = trace.reshape(-1, trace.shape[2])
     possible = np.linalg.norm(steady.root) * (
         np.linalg.norm(candidate.into_state, axis=0) * max(np.linalg.norm(steady.C), 1e-300)
         + np.linalg.norm(candidate.into_output, axis=0)
     )
-    _, sizes, axes = np.linalg.svd(flat, full_matrices=False)
+    _, sizes, axes = np.linalg.svd(trace.reshape(-1, trace.shape[2]), full_matrices=False)
     there = sizes > UNSEEN * max(float(possible.max(initial=0.0)), 1e-300)
     if not there.any():
         excluded[candidate.own_label] = "no output ever sees it"
@@ -363,59 +352,50 @@ def _seen(model: "HammersteinSS", steady: Predictor, candidate: Candidate, exclu
             f"{candidate.own_label}: no output ever sees this fault; it is left out and cannot be an answer.",
             DataWarning, stacklevel=4,
         )
-        return None
-    if not there.all() and candidate.kind in ADDITIVE:
+        return []
+    if not there.all() and candidate.additive:
         warnings.warn(
             f"{candidate.own_label}: {int(np.sum(~there))} of {there.size} directions are seen by no output; they are "
             "left out.", DataWarning, stacklevel=4,
         )
-        seen = axes[there].T
-        candidate = replace(
-            candidate, into_state=candidate.into_state @ seen, into_output=candidate.into_output @ seen
-        )
+        into_state, into_output = (part @ axes[there].T for part in (candidate.into_state, candidate.into_output))
+        candidate = replace(candidate, into_state=into_state, into_output=into_output)
     course = np.linalg.norm(trace.reshape(len(trace), -1), axis=1)
     fades = bool(candidate.additive and course[-1] < FORGOTTEN * course.max())
-    return replace(candidate, bounded_deflection=fades)
+    return [replace(candidate, bounded_deflection=fades)]
 
 
 def _merged(steady: Predictor, found: list[Candidate]) -> tuple[tuple[Candidate, ...], Array]:
-    """Put candidates whose signatures span the same space into one group."""
-    count = _horizon(steady)
-    axes = [_axes(response(steady, c, count)) if c.additive else None for c in found]
-    kept: list[int] = []
-    groups: dict[int, list[Candidate]] = {}
-    for i, candidate in enumerate(found):
-        for j in kept:
-            first, second = axes[j], axes[i]
-            if first is None or second is None or first.shape != second.shape:
+    """Put candidates whose signatures span the same space into one group; and the sines between the groups."""
+    groups: list[list[Candidate]] = []
+    axes: list[Array | None] = []
+    for candidate in found:
+        own = None
+        if candidate.additive:
+            flat = response(steady, candidate, _horizon(steady)).reshape(-1, candidate.into_state.shape[1])
+            own = np.linalg.svd(flat / np.linalg.norm(flat, axis=0), full_matrices=False)[0]
+        for group, other in zip(groups, axes):
+            if own is None or other is None or own.shape != other.shape:
                 continue
-            sine = float(np.linalg.norm(second - first @ (first.T @ second), 2))
+            sine = float(np.linalg.norm(own - other @ (other.T @ own), 2))
             if sine < SAME:
-                groups[j].append(candidate)
+                group.append(candidate)
                 warnings.warn(
-                    f"{found[j].own_label} and {candidate.own_label} leave the same trace (sine of the angle "
+                    f"{group[0].own_label} and {candidate.own_label} leave the same trace (sine of the angle "
                     f"{sine:.1e}): no record can tell them apart, and an answer names both.",
                     DataWarning, stacklevel=4,
                 )
                 break
         else:
-            kept.append(i)
-            groups[i] = [candidate]
-    sines = np.full((len(kept), len(kept)), np.nan)
-    for a, i in enumerate(kept):
-        for b, j in enumerate(kept):
-            first, second = axes[i], axes[j]
+            groups.append([candidate])
+            axes.append(own)
+    sines = np.full((len(groups), len(groups)), np.nan)
+    for i, first in enumerate(axes):
+        for j, second in enumerate(axes):
             if first is not None and second is not None:
                 wide, narrow = (first, second) if first.shape[1] >= second.shape[1] else (second, first)
-                sines[a, b] = np.linalg.svd(narrow - wide @ (wide.T @ narrow), compute_uv=False)[-1]
-    merged = []
-    for i in kept:
-        members, places = ([getattr(c, word) for c in groups[i]] for word in ("own_label", "name"))
-        merged.append(replace(found[i], members=tuple(members), places=tuple(dict.fromkeys(places))))
-    return tuple(merged), sines
-
-
-def _axes(trace: Array) -> Array:
-    """Orthonormal axes (N l, d) of a signature."""
-    flat = trace.reshape(-1, trace.shape[2])
-    return np.asarray(np.linalg.svd(flat / np.linalg.norm(flat, axis=0), full_matrices=False)[0])
+                sines[i, j] = np.linalg.svd(narrow - wide @ (wide.T @ narrow), compute_uv=False)[-1]
+    return tuple(
+        replace(group[0], members=tuple(c.own_label for c in group), places=tuple(dict.fromkeys(c.name for c in group)))
+        for group in groups
+    ), sines

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.diagnosis.posterior import MODEL_ERROR, SPREADS, Explanation
+from optid.faults.diagnosis.posterior import Explanation, share_bound, share_prior
 from optid.faults.faults import place_of
 from optid.faults.signatures import Candidate, Dictionary
 
@@ -81,15 +81,10 @@ def parted(found: Explanation, listed: Sequence[Candidate]) -> list[Explanation]
 
 def _all_lost(found: Explanation) -> Array:
     """Logarithm (K,) of the marginal likelihood with the share fixed to one."""
-    from scipy.special import ndtr
-
     share, variance = found.sizes[:, 0], np.maximum(found.covariances[:, 0, 0], EXACT)
-    std = np.sqrt(variance)
-    wide = std * np.sqrt(np.mean(SPREADS))
-    before = ndtr(1 / wide) - 0.5
-    inside = ndtr((1 - share) / std) - ndtr(-share / std)
-    free = found.logs - np.log((1 - MODEL_ERROR) * inside / before + MODEL_ERROR)
-    return free - (1 - share) ** 2 / (2 * variance) - np.log(std * np.sqrt(2 * np.pi) * before)
+    free = found.logs - np.log(share_bound(share, variance))
+    density = np.sqrt(2 * np.pi * variance) * share_prior(np.sqrt(variance))
+    return free - (1 - share) ** 2 / (2 * variance) - np.log(density)
 
 
 def _stuck(found: Explanation) -> Explanation:

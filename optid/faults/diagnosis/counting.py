@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explanation, bounded_shares, marginal
+from optid.faults.diagnosis.posterior import Explanation, bounded_shares, marginal
 from optid.faults.faults import place_of
 from optid.faults.nuisance import ModelUncertainty, Nuisance
 from optid.faults.signatures import Candidate
@@ -55,11 +55,9 @@ def recounted(found: Explanation, uncertainty: ModelUncertainty | None) -> Expla
     energy = np.einsum("kd,kd->k", nu, along_traces)
     logs = marginal(energy, candidate.dimension) - np.log(tested) + changed
     logs = logs + bounded_shares((candidate,), nu, spread)
-    kept = logs > logs.max() - NEGLIGIBLE
     return found._replace(
-        onsets=found.onsets[kept], logs=logs[kept], sizes=nu[kept], covariances=spread[kept],
-        energies=energy[kept] + 2 * changed, error=error,
-    )
+        logs=logs, sizes=nu, covariances=spread, energies=energy + 2 * changed, error=error
+    ).likely()
 
 
 def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidate, onset: int, size: Array) -> Nuisance:

@@ -141,8 +141,6 @@ def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list
         near = np.argmin(np.abs(every[:, None] - k), axis=1)
         logs = logs[near] - np.log(count)
         logs[k.astype(int)] += 1e-9  # of equals the one that was tried is reported
-        kept = logs > logs.max() - NEGLIGIBLE
-        means, spreads, highest = means[near], spreads[near], highest[near]
 
         def rest(onset: int, label: str = candidate.label, tried: np.ndarray = k, of: np.ndarray = near) -> Explained:
             place, rho = prepared[label, int(tried[of[onset]])]
@@ -151,7 +149,7 @@ def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list
             return Explained(np.zeros_like(white.r), white.r - shrunk.reshape(white.r.shape), 1)
 
         explanations.append(Explanation(
-            (candidate,), every[kept][:, None], logs[kept], means[kept][:, None], spreads[kept][:, None, None],
-            2 * highest[kept], course=rest,
-        ))
+            (candidate,), every[:, None], logs, means[near][:, None], spreads[near][:, None, None], 2 * highest[near],
+            course=rest,
+        ).likely())
     return explanations

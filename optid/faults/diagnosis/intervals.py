@@ -54,7 +54,7 @@ def onset_range(onsets: np.ndarray, weights: Array, coverage: float, best: int) 
     """
     samples, which = np.unique(onsets, return_inverse=True)
     mass = np.bincount(which.ravel(), weights)
-    chosen = np.append(samples[smallest_set(mass, coverage)], best)
+    chosen = np.append(samples[smallest_set(np.asarray(mass, dtype=float), coverage)], best)
     return int(chosen.min()), int(chosen.max())
 
 

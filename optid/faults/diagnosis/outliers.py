@@ -100,10 +100,7 @@ def with_spikes(found: Dictionary) -> Dictionary:
                   (f"sensor:{name}",), True)
         for name, column in zip(found.model.outputs, np.eye(l)) if f"sensor:{name}" not in known
     ]
-    count = len(found.candidates) + len(more)
-    sines = np.full((count, count), np.nan)
-    sines[: len(found.candidates), : len(found.candidates)] = found.sines
-    return replace(found, candidates=(*found.candidates, *more), sines=sines)
+    return found.with_candidates(more)
 
 
 def _bounded(found: Dictionary, whitened: Whitened, u: Array) -> Scan:

@@ -4,16 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from optid import __version__
+from optid.faults.diagnosis import words
 from optid.faults.diagnosis.answers import Diagnosis
-from optid.faults.diagnosis.words import (
-    certificate_words,
-    explained,
-    headline,
-    onset_words,
-    probability_words,
-    remaining_words,
-    size_words,
-)
 from optid.show.page import figure, template, versions
 from optid.show.wording import Table, number
 
@@ -52,8 +44,8 @@ def render(found: Diagnosis, *, record: str = "", command: str = "") -> str:
         "title": f"Diagnosis: {found.verdict}",
         "lead": " · ".join(part for part in (record, found.model, f"{found.window} samples") if part),
         "tone": TONES.get(found.verdict, "fair"),
-        "word": headline(found),
-        "sentences": explained(found, notes=False),
+        "word": words.headline(found),
+        "sentences": words.explained(found, notes=False),
         "cards": _cards(found),
         "notes": [*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())],
         "answers": _answers(found) if found.candidates else None,
@@ -63,20 +55,15 @@ def render(found: Diagnosis, *, record: str = "", command: str = "") -> str:
         "versions": versions(),
         "text": str(found),
         "sections": [
-            (id, name) for id, name, present in (
-                ("verdict", "Verdict", True),
-                ("answers", "Answers", bool(found.candidates)),
-                ("figures", "Figure", True),
-                ("evidence", "Evidence", True),
-                ("reproduce", "Reproduce", True),
-            ) if present
+            ("verdict", "Verdict"), *[("answers", "Answers")] * bool(found.candidates), ("figures", "Figure"),
+            ("evidence", "Evidence"), ("reproduce", "Reproduce"),
         ],
     }
     return template("diagnosis.html.j2").render(content)
 
 
 def _cards(found: Diagnosis) -> list[dict[str, str]]:
-    cards = [("p-value of health", probability_words(found.p_value))]
+    cards = [("p-value of health", words.probability_words(found.p_value))]
     if found.best is not None:
         fault = found.best.faults[0]
         cards += [
@@ -85,7 +72,7 @@ def _cards(found: Diagnosis) -> list[dict[str, str]]:
             ("deflection", number(fault.deflection, 3)),
         ]
     if found.remaining is not None:
-        cards.append(("p-value of what is left", probability_words(found.remaining.p_value)))
+        cards.append(("p-value of what is left", words.probability_words(found.remaining.p_value)))
     return [{"label": label, "value": value} for label, value in cards]
 
 
@@ -93,13 +80,13 @@ def _answers(found: Diagnosis) -> Table:
     rows = []
     for place, answer in enumerate(found.candidates, start=1):
         for i, fault in enumerate(answer.faults):
-            first, *more = size_words(fault)
+            first, *more = words.size_words(fault)
             rows.append((
                 f"{place}. {fault.label}" if i == 0 else f"and {fault.label}",
-                f"{answer.posterior:.3f}" if i == 0 else "", onset_words(fault).removeprefix("onset "),
+                f"{answer.posterior:.3f}" if i == 0 else "", words.onset_words(fault).removeprefix("onset "),
                 number(fault.deflection, 3), first,
             ))
-            rows += [("", "", "", "", words) for words in more]
+            rows += [("", "", "", "", magnitude) for magnitude in more]
     note = (
         f"The smallest set that holds {100 * found.coverage:g} % of the probability. Intervals in brackets hold "
         f"{100 * found.coverage:g} %, the search for the onset included."
@@ -111,11 +98,11 @@ def _evidence(found: Diagnosis) -> list[tuple[str, str]]:
     facts = [
         ("Method", found.method),
         ("False alarms", f"{found.false_alarm:g} of healthy records"),
-        ("p-value of health", probability_words(found.p_value)),
+        ("p-value of health", words.probability_words(found.p_value)),
     ]
     if found.certificate.kind != "none":
-        facts.append(("Proof", certificate_words(found).removeprefix("proof: ")))
+        facts.append(("Proof", words.certificate_words(found).removeprefix("proof: ")))
     if found.remaining is not None:
-        facts.append(("Left unexplained", remaining_words(found).removeprefix("left unexplained: ")))
+        facts.append(("Left unexplained", words.remaining_words(found).removeprefix("left unexplained: ")))
     return facts
 

@@ -70,6 +70,14 @@ class Explanation(NamedTuple):
     error: Nuisance | None = None
     entry: Candidate | None = None
 
+    def likely(self) -> "Explanation":
+        """Return it without onsets of negligible probability."""
+        kept = self.logs > self.logs.max() - NEGLIGIBLE
+        return self._replace(
+            onsets=self.onsets[kept], logs=self.logs[kept], sizes=self.sizes[kept],
+            covariances=self.covariances[kept], energies=self.energies[kept],
+        )
+
     def made(self) -> Explained:
         """Return what the most probable row makes of the window."""
         onsets, sizes = self.onsets[self.best], self.sizes[self.best]
@@ -115,19 +123,17 @@ def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
 
 def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
     """Return one candidate of a search at all its onsets; None where it is tested at none."""
-    row = scan.statistic[scan.index(candidate)]
-    tested = np.flatnonzero(~np.isnan(row))
-    if not tested.size:
+    c = scan.index(candidate)
+    row = scan.statistic[c]
+    onsets = np.flatnonzero(~np.isnan(row))
+    if not onsets.size:
         return None
-    logs = marginal(row[tested], candidate.dimension) - np.log(tested.size)
-    near = logs > logs.max() - NEGLIGIBLE
-    kept, logs = tested[near], logs[near]
-    found = [scan.estimate(candidate, int(k)) for k in kept]
-    sizes, covariances = np.array([m.nu for m in found]), np.array([m.covariance for m in found])
-    return Explanation(
-        (candidate,), kept[:, None], logs + bounded_shares((candidate,), sizes, covariances), sizes, covariances,
-        row[kept], scan,
-    )
+    roots, along = scan.sweep.roots_of(c)[onsets], scan.correlations[onsets, scan.sweep.columns(c)]
+    covariances = np.swapaxes(roots, 1, 2) @ roots
+    sizes = np.einsum("kij,kj->ki", covariances, along)
+    logs = marginal(row[onsets], candidate.dimension) - np.log(onsets.size)
+    found = Explanation((candidate,), onsets[:, None], logs, sizes, covariances, row[onsets], scan).likely()
+    return found._replace(logs=found.logs + bounded_shares(found.candidates, found.sizes, found.covariances))
 
 
 def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
@@ -165,11 +171,8 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
                 apart &= ranges[j][rows[j]] < ranges[i][rows[i]]
     logs = np.where(apart, logs, -np.inf) if apart.any() else logs
     logs = logs + bounded_shares(candidates, sizes, covariances)
-    kept = logs > logs.max() - NEGLIGIBLE
     where = np.stack([there[row] for there, row in zip(ranges, rows)], axis=1)
-    return Explanation(
-        tuple(candidates), where[kept], logs[kept], sizes[kept], covariances[kept], energies[kept], scan
-    )
+    return Explanation(tuple(candidates), where, logs, sizes, covariances, energies, scan).likely()
 
 
 def _solved(gram: Array, correlation: Array) -> tuple[Array, Array, Array, np.ndarray]:
@@ -185,19 +188,29 @@ def _solved(gram: Array, correlation: Array) -> tuple[Array, Array, Array, np.nd
 
 def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: Array) -> Array:
     """Return the logarithm (K,) of what it changes that a share lost lies between 0 and 1."""
-    from scipy.special import ndtr
-
     change = np.zeros(len(sizes))
     first = 0
     for candidate in candidates:
         if candidate.kind in ("loss", "stuck"):
-            mean, std = sizes[:, first], np.sqrt(np.maximum(covariances[:, first, first], 1e-300))
-            inside = ndtr((1 - mean) / std) - ndtr(-mean / std)
-            wide = std * np.sqrt(np.mean(SPREADS))
-            before = ndtr(1 / wide) - 0.5
-            change += np.log((1 - MODEL_ERROR) * inside / before + MODEL_ERROR)
+            change += np.log(share_bound(sizes[:, first], covariances[:, first, first]))
         first += candidate.dimension
     return change
+
+
+def share_bound(share: Array, variance: Array) -> Array:
+    """Return the factor (K,) of the likelihood because a share lost, estimated with a variance, is in [0, 1]."""
+    from scipy.special import ndtr
+
+    std = np.sqrt(np.maximum(variance, 1e-300))
+    inside = ndtr((1 - share) / std) - ndtr(-share / std)
+    return (1 - MODEL_ERROR) * inside / share_prior(std) + MODEL_ERROR
+
+
+def share_prior(std: Array) -> Array:
+    """Return the probability (K,) that the prior gives to shares from 0 to 1."""
+    from scipy.special import ndtr
+
+    return ndtr(1 / (std * np.sqrt(np.mean(SPREADS)))) - 0.5
 
 
 def smallest_set(posterior: Array, coverage: float) -> np.ndarray:

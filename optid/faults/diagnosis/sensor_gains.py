@@ -14,7 +14,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Experiment
 from optid.errors import StructureError
-from optid.faults.diagnosis.posterior import NEGLIGIBLE, Explained, Explanation
+from optid.faults.diagnosis.posterior import Explained, Explanation
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor, Whitened, predictor
 
@@ -35,13 +35,7 @@ LEAST = 5
 
 
 class _Grid(NamedTuple):
-    """The likelihood over a grid.
-
-    Attributes:
-        onsets: (K,).
-        shares: (G,).
-        logs: (K, G) of the likelihood beside that of health.
-    """
+    """The likelihood `logs` (K, G) beside that of health over `onsets` (K,) and `shares` (G,)."""
 
     onsets: np.ndarray
     shares: Array
@@ -49,19 +43,18 @@ class _Grid(NamedTuple):
 
 
 def sensor_gains(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
-    """Return the sensors of a dictionary that may have lost a share of their reading.
+    """Return the sensors of a dictionary (kind "loss") that may have lost a share of their reading.
 
     Args:
-        found: the dictionary; its candidates of kind "loss" at a sensor are judged.
+        found: the dictionary.
         white: the window.
         part: the record behind it.
     """
-    model = found.model
-    candidates = [c for c in found.candidates if c.kind == "loss" and not c.columns]
-    if not candidates or white.states is None or model.feedback or np.any(model.L):
+    if white.states is None or found.model.feedback or np.any(found.model.L):
         return []
-    result = [_judged(found, candidate, white, part) for candidate in candidates]
-    return [explanation for explanation in result if explanation is not None]
+    candidates = [c for c in found.candidates if c.kind == "loss" and not c.columns]
+    judged = [_judged(found, candidate, white, part) for candidate in candidates]
+    return [explanation for explanation in judged if explanation is not None]
 
 
 def _judged(found: Dictionary, candidate: Candidate, white: Whitened, part: Experiment) -> Explanation | None:
@@ -107,7 +100,6 @@ def _explanation(found: Dictionary, candidate: Candidate, white: Whitened, part:
     mean = weights @ grid.shares / total
     variance = np.maximum(weights @ grid.shares**2 / total - mean**2, 1e-12)
     logs = most + np.log(total * (grid.shares[1] - grid.shares[0])) - np.log(count)  # uniform over shares and onsets
-    kept = logs > logs.max() - NEGLIGIBLE
 
     def rest(onset: int) -> Explained:
         row = int(np.flatnonzero(grid.onsets == onset)[0])
@@ -115,9 +107,8 @@ def _explanation(found: Dictionary, candidate: Candidate, white: Whitened, part:
         return Explained(white.r - left, left, 1)
 
     return Explanation(
-        (candidate,), grid.onsets[kept][:, None], logs[kept], mean[kept][:, None], variance[kept][:, None, None],
-        2 * most[kept], course=rest,
-    )
+        (candidate,), grid.onsets[:, None], logs, mean[:, None], variance[:, None, None], 2 * most, course=rest
+    ).likely()
 
 
 def _likelihood(found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
@@ -181,8 +172,5 @@ def _filter(found: Dictionary, o: int, share: float, scale: float) -> Predictor:
 def _scales(steady: Predictor, present: np.ndarray) -> Array:
     """Logarithm (N,) of the standard deviations of the readings that are there, together."""
     patterns, of = np.unique(present, axis=0, return_inverse=True)
-    values = []
-    for pattern in patterns:
-        there = np.flatnonzero(pattern)
-        values.append(0.5 * float(np.linalg.slogdet(steady.covariance[np.ix_(there, there)])[1]) if there.size else 0.0)
-    return np.array(values)[of.ravel()]
+    blocks = [steady.covariance[np.ix_(there, there)] for there in map(np.flatnonzero, patterns)]
+    return np.array([0.5 * np.linalg.slogdet(block)[1] if block.size else 0.0 for block in blocks])[of.ravel()]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from optid.faults.diagnosis.answers import Answer, Diagnosis, Estimate
+    from optid.faults.diagnosis.answers import Diagnosis, Estimate
 
 WIDTH = 80
 
@@ -17,9 +17,21 @@ WORDS = {
 """What the magnitude of a kind is called."""
 
 
+HEADLINES = {
+    "healthy": "no alarm",
+    "untestable": "the input excites nothing that is suspected",
+    "not isolable": "something is wrong, and one output cannot tell what",
+    "unknown": "something is wrong, and it is none of the candidates",
+}
+"""The outcome of a verdict without an answer in one clause."""
+
+
 def estimate_line(fault: "Estimate") -> str:
     """Say in one or more lines what a fault is, since when and how large."""
-    lines = onset_words(fault), *size_words(fault), *effect_words(fault)
+    lines = [onset_words(fault), *size_words(fault)]
+    if fault.effect:  # of a disturbance of estimated direction on the outputs
+        moved = ", ".join(f"{name} by {change:.3g}" for name, change in fault.effect.items())
+        lines.append(f"moves {moved} in the end")
     return "\n".join([fault.label, *("  " + line for line in lines)])
 
 
@@ -50,13 +62,6 @@ def size_words(fault: "Estimate") -> list[str]:
     return lines
 
 
-def effect_words(fault: "Estimate") -> list[str]:
-    """Say what a disturbance of estimated direction does to the outputs."""
-    if not fault.effect:
-        return []
-    return ["moves " + ", ".join(f"{name} by {change:.3g}" for name, change in fault.effect.items()) + " in the end"]
-
-
 def magnitude_names(fault: "Estimate") -> list[str]:
     """Return what the entries of the size are."""
     d = len(fault.size)
@@ -72,11 +77,11 @@ def magnitude_names(fault: "Estimate") -> list[str]:
 
 def printed(found: "Diagnosis") -> str:
     """Print a diagnosis in 80 columns."""
-    lines = [f"{found.verdict}: {headline(found)}"]
-    lines.append(
+    lines = [
+        f"{found.verdict}: {headline(found)}",
         f"{found.window} samples, false alarm {found.false_alarm:g}, p-value {probability_words(found.p_value)}, "
-        f"method {found.method}"
-    )
+        f"method {found.method}",
+    ]
     for answer in found.candidates:
         mark = "  <- best" * (answer is found.best)
         lines += ["", f"probability {answer.posterior:.3f}, gain {answer.gain:.1f}{mark}"]
@@ -87,28 +92,17 @@ def printed(found: "Diagnosis") -> str:
         lines += [remaining_words(found)]
     lines += [f"untestable: {label}, {why}" for label, why in found.untestable.items()]
     lines += [found.status] * bool(found.status)
-    return "\n".join(wrapped(lines))
-
-
-def wrapped(lines: list[str]) -> list[str]:
-    """Break lines that are too wide, keeping their indent."""
     result: list[str] = []
-    for line in lines:
+    for line in lines:  # those that are too wide are broken, and keep their indent
         indent = " " * (len(line) - len(line.lstrip()) + 2)
         result += textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
-    return result
+    return "\n".join(result)
 
 
 def headline(found: "Diagnosis") -> str:
     """Say the outcome in one clause."""
-    if found.verdict == "healthy":
-        return "no alarm"
-    if found.verdict == "untestable":
-        return "the input excites nothing that is suspected"
-    if found.verdict == "not isolable":
-        return "something is wrong, and one output cannot tell what"
-    if found.verdict == "unknown":
-        return "something is wrong, and it is none of the candidates"
+    if found.verdict in HEADLINES:
+        return HEADLINES[found.verdict]
     if found.best is None:
         return f"one of {len(found.candidates)} answers, none of them proved the best"
     if found.unique:
@@ -168,46 +162,41 @@ def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
         found: the diagnosis.
         notes: add what could not be judged, and the status.
     """
+    name = found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
+    departs = f"The record departs from the healthy {name} (p-value {probability_words(found.p_value)}), but "
+    silent = _list(list(found.untestable)) if found.untestable else ""
     if found.verdict == "healthy":
         sentences = [
-            f"The record of {found.window} samples is what the healthy {_model(found)} predicts.",
+            f"The record of {found.window} samples is what the healthy {name} predicts.",
             f"Healthy records depart as far from it with probability {probability_words(found.p_value)}; below "
             f"{found.false_alarm:g} that would be an alarm.",
         ]
+    elif found.verdict == "untestable" and found.detected:
+        sentences = [f"{departs}the input does not excite what is suspected: {silent}."]
     elif found.verdict == "untestable":
-        sentences = [_nothing_said(found)]
+        sentences = [f"Nothing can be said about {silent}: the input does not excite it."]
     elif found.verdict in ("unknown", "not isolable"):
-        sentences = [
-            f"The record departs from the healthy {_model(found)} (p-value {probability_words(found.p_value)}), but "
-            + ("no fault of the dictionary fits it." if found.verdict == "unknown" else
-               "with one output a fault of any course explains it, in any place."),
-        ]
+        why = "no fault of the dictionary fits it." if found.verdict == "unknown" else \
+            "with one output a fault of any course explains it, in any place."
+        sentences = [departs + why]
         if found.remaining is not None:
             sentences.append(f"What is left of it: {course_words(found)}.")
     else:
         sentences = _faulty(found)
     if notes:
-        if found.untestable and found.verdict != "untestable":
-            sentences.append(f"This record cannot judge {_list(list(found.untestable))}.")
+        if silent and found.verdict != "untestable":
+            sentences.append(f"This record cannot judge {silent}.")
         sentences += [found.status] * bool(found.status)
     return sentences
 
 
-def _nothing_said(found: "Diagnosis") -> str:
-    names = _list(list(found.untestable))
-    if found.detected:
-        return (
-            f"The record departs from the healthy {_model(found)} (p-value {probability_words(found.p_value)}), but "
-            f"the input does not excite what is suspected: {names}."
-        )
-    return f"Nothing can be said about {names}: the input does not excite it."
-
-
 def _faulty(found: "Diagnosis") -> list[str]:
-    answers = found.candidates
-    best, others = answers[0], answers[1:]
+    best, *others = found.candidates
+    phrase = " and ".join(
+        f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in best.faults
+    )
     most = "most probably " * bool(others)
-    first = f"The record is not healthy (p-value {probability_words(found.p_value)}): {most}{_phrase(best)}."
+    first = f"The record is not healthy (p-value {probability_words(found.p_value)}): {most}{phrase}."
     if others:
         shares = _list([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
         second = (
@@ -220,19 +209,8 @@ def _faulty(found: "Diagnosis") -> list[str]:
     return [first, second, proof[0].upper() + proof[1:] + "."]
 
 
-def _phrase(answer: "Answer") -> str:
-    return " and ".join(
-        f"{fault.label} with {onset_words(fault)} and {_list(size_words(fault))}" for fault in answer.faults
-    )
-
-
-def _model(found: "Diagnosis") -> str:
-    """The title of the model inside a sentence; Hammerstein is a name."""
-    return found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
-
-
-def _list(words: list[str], joint: str = "and") -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {joint} {words[-1]}"
+def _list(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def probability_words(value: float) -> str:

@@ -1,8 +1,11 @@
 """The atoms of a window: an orthonormal set for every candidate at every onset that is tested.
 
-The exact search needs none of them; programmes that choose several faults at once do.
+The exact search needs none of them; programmes that choose several faults at once do, and so does the exchange of one
+fault at a time for the best of all candidates and onsets beside the others. Every exchange raises the gain, and the end
+is a subset that no single exchange improves.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,11 +13,17 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
+from optid.faults.search.scanning import ALIKE, Scan
 from optid.faults.search.sweeps import inverse_roots
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
-    from optid.faults.search.scanning import Scan
+
+ROUNDS = 20
+"""Rounds of exchanges at most."""
+
+Member = tuple[str, int]
+"""Label of a candidate and its onset."""
 
 MOST = 40_000_000
 """Numbers that the atoms of a window may have."""
@@ -44,7 +53,7 @@ class Atoms:
         return self.axes.shape[2]
 
 
-def atoms_of(found: "Scan", limits: "Thresholds", onsets: np.ndarray | None = None) -> tuple[Atoms, ...]:
+def atoms_of(found: Scan, limits: "Thresholds", onsets: np.ndarray | None = None) -> tuple[Atoms, ...]:
     """Return the atoms of every candidate that is tested somewhere.
 
     Args:
@@ -77,3 +86,40 @@ def atoms_of(found: "Scan", limits: "Thresholds", onsets: np.ndarray | None = No
         back = np.swapaxes(inverse_roots(products, largest), 1, 2)
         made.append(Atoms(candidate.label, where, flat @ back, back, float(threshold)))
     return tuple(made)
+
+
+def exchanged(atoms: Sequence[Atoms], r: Array, members: Iterable[Member], gain: float) -> tuple[float, list[Member]]:
+    """Return the gain and the members that no single exchange improves, from members of some gain; window r (N l,)."""
+    found, best = list(members), gain
+    for _ in range(ROUNDS):
+        before = best
+        for i in range(len(found)):
+            gain, member = _best_beside(atoms, r, found[:i] + found[i + 1 :])
+            if gain > best + 1e-9 * (1 + abs(best)):
+                best, found[i] = gain, member
+        if best == before:
+            break
+    return best, found
+
+
+def _best_beside(atoms: Sequence[Atoms], r: Array, others: Sequence[Member]) -> tuple[float, Member]:
+    """Gain of the others with the best atom beside them, and which it is."""
+    named = {own.label: own for own in atoms}
+    parts = [named[label].axes[int(np.searchsorted(named[label].onsets, onset))] for label, onset in others]
+    left, sizes, _ = np.linalg.svd(np.hstack([np.zeros((r.size, 0)), *parts]), full_matrices=False)
+    basis = left[:, sizes > np.sqrt(ALIKE)]
+    along = basis.T @ r
+    rest, before = r - basis @ along, float(along @ along) - sum(named[label].threshold for label, _ in others)
+    best, member = -np.inf, ("", -1)
+    for own in atoms:
+        score = np.einsum("tkd,k->td", own.axes, rest)
+        shared = np.einsum("tkd,kq->tdq", own.axes, basis)
+        left = np.eye(own.dimension) - np.einsum("tdq,teq->tde", shared, shared)
+        roots = inverse_roots(left, np.ones(len(left)), ALIKE)
+        energy = np.sum(np.einsum("tde,te->td", roots, score) ** 2, axis=1)
+        energy[~roots.any(axis=(1, 2))] = -np.inf
+        t = int(np.argmax(energy))
+        gain = before + float(energy[t]) - own.threshold
+        if gain > best:
+            best, member = gain, (own.label, int(own.onsets[t]))
+    return best, member

@@ -52,11 +52,7 @@ class SlidingScan:
     statistic: Array
 
     def excess(self, limits: Thresholds) -> Array:
-        """Return the largest energy over its threshold, (M,): a window alarms above one.
-
-        Raises:
-            StructureError: thresholds of other candidates or of another length.
-        """
+        """Return the largest energy over its threshold, (M,); StructureError for thresholds of other windows."""
         if limits.window != self.window:
             raise StructureError(f"These thresholds are of windows of {limits.window} samples, not {self.window}.")
         return np.nanmax(self.statistic / limits.of(self.labels), axis=1)
@@ -181,30 +177,28 @@ def empirical_thresholds(
     if len(inputs) != len(parts):
         raise DataError(f"u is of {len(inputs)} experiments, the record of {len(parts)}.")
     independent = sum(len(part.r) for part in parts) / window
-    level = false_alarm
-    if false_alarm * independent < LEAST:
-        if not extrapolate:
-            raise DataError(
-                f"{independent:.0f} windows of a healthy record cannot support a false alarm in "
-                f"{1 / false_alarm:.3g}: {int(np.ceil(LEAST / false_alarm * window))} samples are needed. Take a "
-                "longer record, a shorter window or a higher probability, or let the factor be that of a more frequent "
-                "alarm (extrapolate=True)."
-            )
-        level = min(SURE / independent, COMMON)
+    rare = false_alarm * independent < LEAST
+    if rare and not extrapolate:
+        raise DataError(
+            f"{independent:.0f} windows of a healthy record cannot support a false alarm in {1 / false_alarm:.3g}: "
+            f"{int(np.ceil(LEAST / false_alarm * window))} samples are needed. Take a longer record, a shorter window "
+            "or a higher probability, or let the factor be that of a more frequent alarm (extrapolate=True)."
+        )
     longest = None if u is None else max((np.asarray(one) for one in inputs), key=len)
     draws = max(draws, int(np.ceil(EXCEEDING / false_alarm)))
     white = thresholds(found, window, false_alarm, u=longest, draws=draws, seed=seed)
     scans = [sliding_scan(found, part, window, u=one, hop=hop) for part, one in zip(parts, inputs)]
     ratios = np.concatenate([one.excess(white) for one in scans])
     factor = float(np.quantile(ratios, 1 - false_alarm, method="higher"))
-    if level != false_alarm:
+    if rare:  # the factor of a more frequent alarm, its own where that is larger
+        level = min(SURE / independent, COMMON)
         usual = np.nanmax(simulated(found, window, u=longest, draws=draws, seed=seed) / white.q, axis=1)
         factor = max(factor, float(np.quantile(ratios, 1 - level) / np.quantile(usual, 1 - level)))
     above = [one.excess(white) > factor for one in scans]
     # an alarm that begins within a window of the one before is the same
     excursions = sum(int(np.sum(np.diff(one.stops[alarms], prepend=-window) > window))
                      for one, alarms in zip(scans, above))
-    if level == false_alarm and excursions < SURE:
+    if not rare and excursions < SURE:
         warnings.warn(
             f"The thresholds rest on {excursions} excursions of the healthy record: its rate of false alarms is kept, "
             "that of the next record may be twice as large or more. Use a longer healthy record.",
@@ -213,5 +207,5 @@ def empirical_thresholds(
     return EmpiricalThresholds(
         white.labels, factor * white.q, false_alarm, window, white.draws, seed, factor=factor,
         share=float(np.mean(np.concatenate(above))), excursions=excursions, windows=ratios.size,
-        independent=independent, extrapolated=level != false_alarm,
+        independent=independent, extrapolated=rare,
     )

@@ -103,7 +103,7 @@ def bounded(scan: Scan, candidate: Candidate | str, *, reach: ArrayLike | None =
     """
     c = scan.index(candidate)
     low, high = _bounds(scan.dictionary.model, scan.dictionary.candidates[c], reach)
-    tested, d = ~np.isnan(scan.statistic[c]), int(scan.sweep.blocks.sizes[c])
+    tested, d = ~np.isnan(scan.statistic[c]), int(scan.sweep.tables.sizes[c])
     if not tested.any():
         raise StructureError(
             f"{scan.labels[c]} is not tested in this window: "

@@ -14,9 +14,8 @@ from numba import njit
 def joint_energy(first, second, cosines, floor, work):
     """Return the energy that two subspaces explain together; -1 where nothing of the smaller one is left beside it.
 
-    `first` (a,) and `second` (b,) are coordinates of the window along the axes of the larger and of the smaller one,
-    `cosines` (a, b) the products of the axes, `floor` the share of a direction beside the other subspace below which it
-    is part of it; `work` (b, b + 1) is overwritten.
+    Coordinates (a,) and (b,) of the window are along the axes of the larger and of the smaller one, with products
+    `cosines` (a, b); below `floor` a direction beside the other subspace is part of it; `work` (b, b + 1) is scratch.
     """
     a, b = cosines.shape
     energy = 0.0
@@ -57,7 +56,7 @@ def joint_energy(first, second, cosines, floor, work):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def search(tables, products, states, along, blocks, roots, tested, z, q, same, floor, best, onsets, alike):
+def search(tables, products, states, along, roots, tested, z, q, same, floor, best, onsets, alike):
     """Find the best pair of onsets for every pair of candidates; return how many pairs cannot be told apart.
 
     Args:
@@ -65,7 +64,6 @@ def search(tables, products, states, along, blocks, roots, tested, z, q, same, f
         products: (N, D, D) of columns with the same onset.
         states: (N, n, D) of a unit state with the columns.
         along: (N, Q, D) what an uncertain model takes off the products.
-        blocks: `optid.faults.search.sweeps.Blocks`.
         roots: (N, R) inverse roots of the products.
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.
@@ -78,12 +76,12 @@ def search(tables, products, states, along, blocks, roots, tested, z, q, same, f
     """
     of, F, e = tables.of, tables.F, tables.e
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
-    count, n, columns, candidates = of.size, F.shape[1], e.shape[2], blocks.first.size
+    count, n, columns, candidates = of.size, F.shape[1], e.shape[2], tables.first.size
     most = 1
     for c in range(candidates):
-        most = max(most, blocks.sizes[c])
+        most = max(most, tables.sizes[c])
     x, later = np.zeros((n, columns)), np.zeros((n, columns))
-    cross, half, cosines = np.zeros((columns, columns)), np.zeros((most, most)), np.zeros((most, most))
+    cross, cosines = np.zeros((columns, columns)), np.zeros((most, most))
     work = np.zeros((most, most + 1))
     found = 0
     for theta in range(count):
@@ -119,33 +117,26 @@ def search(tables, products, states, along, blocks, roots, tested, z, q, same, f
                 for other in range(candidates):
                     if not tested[other, k] or (age == 0 and other <= c) or (other == c and not same):
                         continue
-                    dc, bc, pc = blocks.sizes[c], blocks.first[c], blocks.places[c]
-                    do, bo, po = blocks.sizes[other], blocks.first[other], blocks.places[other]
+                    dc, bc, pc = tables.sizes[c], tables.first[c], tables.places[c]
+                    do, bo, po = tables.sizes[other], tables.first[other], tables.places[other]
                     if dc == 1 and do == 1:
                         rho = roots[theta, pc] * cross[bc, bo] * roots[k, po]
                         left, beside = z[k, bo] - rho * z[theta, bc], 1.0 - rho * rho
                         energy = z[theta, bc] * z[theta, bc] + left * left / beside if beside > floor else -1.0
                     else:
-                        for i in range(dc):
-                            for j in range(do):
-                                half[i, j] = 0.0
-                                for a in range(dc):
-                                    half[i, j] += roots[theta, pc + i * dc + a] * cross[bc + a, bo + j]
-                        for i in range(dc):
-                            for j in range(do):
+                        swap = dc < do  # the larger one comes first
+                        first, second = (k, theta) if swap else (theta, k)
+                        d1, b1, p1, d2, b2, p2 = (do, bo, po, dc, bc, pc) if swap else (dc, bc, pc, do, bo, po)
+                        for i in range(d1):
+                            for j in range(d2):
                                 total = 0.0
-                                for a in range(do):
-                                    total += half[i, a] * roots[k, po + j * do + a]
-                                if dc >= do:
-                                    cosines[i, j] = total
-                                else:
-                                    cosines[j, i] = total
-                        if dc >= do:
-                            energy = joint_energy(z[theta, bc : bc + dc], z[k, bo : bo + do], cosines[:dc, :do], floor,
-                                                  work[:do, : do + 1])
-                        else:
-                            energy = joint_energy(z[k, bo : bo + do], z[theta, bc : bc + dc], cosines[:do, :dc], floor,
-                                                  work[:dc, : dc + 1])
+                                for a in range(d1):
+                                    for b in range(d2):
+                                        shared = cross[b2 + b, b1 + a] if swap else cross[b1 + a, b2 + b]
+                                        total += roots[first, p1 + i * d1 + a] * shared * roots[second, p2 + j * d2 + b]
+                                cosines[i, j] = total
+                        energy = joint_energy(z[first, b1 : b1 + d1], z[second, b2 : b2 + d2], cosines[:d1, :d2],
+                                              floor, work[:d2, : d2 + 1])
                     if energy < 0:
                         if found < alike.shape[0]:
                             alike[found, 0], alike[found, 1], alike[found, 2], alike[found, 3] = c, theta, other, k

@@ -42,17 +42,17 @@ def pairs(scan: Scan, thresholds: Thresholds, *, same: bool = True) -> SubsetSea
             f"{number} candidates and onsets are too many for all pairs ({MOST}): scan a shorter window or fewer "
             "onsets (scan(..., onsets=)), or use the sparse method."
         )
-    n, columns, size = prepared.tables.F.shape[1], prepared.blocks.group.size, len(tested)
+    n, columns, size = prepared.tables.F.shape[1], prepared.tables.group.size, len(tested)
     products, states = np.zeros((prepared.window, columns**2)), np.empty((prepared.window, n, columns))
-    grams(prepared.tables, prepared.blocks.group, np.arange(columns**2).reshape(columns, columns), products, states)
+    grams(prepared.tables, np.arange(columns**2).reshape(columns, columns), products, states)
     z = np.zeros_like(scan.correlations)
-    for c in np.flatnonzero(prepared.blocks.sizes).tolist():
+    for c in np.flatnonzero(prepared.tables.sizes).tolist():
         z[:, prepared.columns(c)] = prepared.coordinates(scan.correlations, c)
     best, alike = np.full((size, size), -np.inf), np.zeros((LISTED, 4), dtype=np.int64)
     onsets = np.full((size, size, 2), -1, dtype=np.int64)
     same_trace = search(
-        prepared.tables, products.reshape(-1, columns, columns), states, prepared.along, prepared.blocks,
-        prepared.roots, tested, z, np.nan_to_num(q), same, ALIKE, best, onsets, alike,
+        prepared.tables, products.reshape(-1, columns, columns), states, prepared.along, prepared.roots,
+        tested, z, np.nan_to_num(q), same, ALIKE, best, onsets, alike,
     )
 
     def pair(i: int, j: int, gain: float, first: int, second: int) -> Subset:

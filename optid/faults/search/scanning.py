@@ -107,7 +107,7 @@ class Scan:
             StructureError: a candidate without a signature.
         """
         c, count = self.index(candidate), len(self.whitened.r)
-        if not self.sweep.blocks.sizes[c]:
+        if not self.sweep.tables.sizes[c]:
             self.dictionary.additions(self.dictionary.candidates[c], count, 0, self.u)  # which says why there is none
             raise StructureError(f"{self.labels[c]} has no signature in this window.")
         if not 0 <= onset < count:

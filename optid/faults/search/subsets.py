@@ -14,8 +14,7 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.errors import StructureError
-from optid.faults.search.atoms import Atoms, atoms_of
-from optid.faults.search.exchange import exchanged
+from optid.faults.search.atoms import Atoms, atoms_of, exchanged
 from optid.faults.search.scanning import ALIKE, Magnitude, Scan
 from optid.faults.search.sparse import REACH, SparseResult
 from optid.faults.search.sweeps import inverse_roots

@@ -51,19 +51,36 @@ def correlate(tables, r, found):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def grams(tables, group, slots, products, states):
+def clear(matrix):
+    """Set a matrix to zero."""
+    for i in range(matrix.shape[0]):
+        for j in range(matrix.shape[1]):
+            matrix[i, j] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add(result, first, second):
+    """Add first' second to a matrix."""
+    for a in range(first.shape[0]):
+        for i in range(first.shape[1]):
+            for j in range(second.shape[1]):
+                result[i, j] += first[a, i] * second[a, j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def grams(tables, slots, products, states):
     """Products of the signatures of columns with the same onset, for all onsets, by one backward sweep.
 
     Args:
         tables: `optid.faults.search.sweeps.Tables`.
-        group: (D,) candidate of a column; products between groups are computed only where states are wanted.
-        slots: (D, D) where in a row of products that of two columns is written; -1 for nowhere.
+        slots: (D, D) where in a row of products that of two columns is written, -1 for nowhere; those of columns of
+            different candidates are computed only where states are wanted.
         products: (N, R) written.
         states: (N, n, D) product of a column with what a unit state at its onset leaves, written; (0, n, D) where it is
             not wanted.
     """
     whole = states.shape[0] > 0
-    of, F, C, W, h, e = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e
+    of, F, C, W, h, e, group = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e, tables.group
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
     count, n, columns, l = of.size, F.shape[1], h.shape[2], C.shape[0]  # noqa: E741
     M, moved = np.zeros((n, n)), np.zeros((n, n))
@@ -91,26 +108,16 @@ def grams(tables, group, slots, products, states):
                         kept[i, j] += H[i, helpers + j - lasting]
                     if i >= lasting and j >= lasting:
                         kept[i, j] += H[helpers + i - lasting, helpers + j - lasting]
-        for a in range(l):
-            for b in range(l):
-                S[a, b] = 0.0
-                for o in range(l):
-                    S[a, b] += W[t, o, a] * W[t, o, b]
-        for a in range(l):
-            for j in range(columns):
-                weighed[a, j] = 0.0
-                for b in range(l):
-                    weighed[a, j] += S[a, b] * h[t, b, j]
-            for i in range(n):
-                seen[a, i] = 0.0
-                for b in range(l):
-                    seen[a, i] += S[a, b] * C[b, i]
+        # S = W'W, weighed = S h, seen = S C, pushed = carried + M e; S and M are symmetric
+        for matrix in (S, weighed, seen, moved):
+            clear(matrix)
+        add(S, W[t], W[t])
+        add(weighed, S, h[t])
+        add(seen, S, C)
         for i in range(n):
             for j in range(columns):
                 pushed[i, j] = carried[i, j]
-            for a in range(n):
-                for j in range(columns):
-                    pushed[i, j] += M[i, a] * e[t, a, j]
+        add(pushed, M, e[t])
         for i in range(columns):
             for j in range(columns):
                 if whole or group[i] == group[j]:
@@ -122,36 +129,24 @@ def grams(tables, group, slots, products, states):
                     H[i, j] = total
                     if slots[i, j] >= 0:
                         products[k, slots[i, j]] = total
-        for i in range(n):
-            for j in range(columns):
-                P[i, j] = 0.0
-                for o in range(l):
-                    P[i, j] += C[o, i] * weighed[o, j]
-            for a in range(n):
-                for j in range(columns):
-                    P[i, j] += F[t, a, i] * pushed[a, j]
+        # P = C' weighed + F' pushed, M = C' seen + F' M F
+        clear(P)
+        add(P, C, weighed)
+        add(P, F[t], pushed)
         for i in range(n if whole else 0):
             for j in range(columns):
                 states[k, i, j] = P[i, j]
-        for i in range(n):
-            for j in range(n):
-                moved[i, j] = 0.0
-                for a in range(n):
-                    moved[i, j] += M[i, a] * F[t, a, j]
-        for i in range(n):
-            for j in range(n):
-                M[i, j] = 0.0
-                for o in range(l):
-                    M[i, j] += C[o, i] * seen[o, j]
-                for a in range(n):
-                    M[i, j] += F[t, a, i] * moved[a, j]
+        add(moved, M, F[t])
+        clear(M)
+        add(M, C, seen)
+        add(M, F[t], moved)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def explained(correlations, blocks, roots, statistic):
+def explained(tables, correlations, roots, statistic):
     """Write the energies (C, N) that the candidates explain at all onsets, from correlations (N, D) and their roots."""
-    for c in range(blocks.first.size):
-        d, begin, place = blocks.sizes[c], blocks.first[c], blocks.places[c]
+    for c in range(tables.first.size):
+        d, begin, place = tables.sizes[c], tables.first[c], tables.places[c]
         for k in range(correlations.shape[0] if d > 0 else 0):
             total = 0.0
             for q in range(d):
@@ -163,13 +158,13 @@ def explained(correlations, blocks, roots, statistic):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def many(tables, windows, blocks, roots, tested, largest):
+def many(tables, windows, roots, tested, largest):
     """Write the largest energy over the onsets of windows (M, N, l), (M, C); NaN where `tested` (C, N) has none."""
-    count, candidates = windows.shape[1], blocks.first.size
+    count, candidates = windows.shape[1], tables.first.size
     correlations, statistic = np.empty((count, tables.h.shape[2])), np.zeros((candidates, count))
     for m in range(windows.shape[0]):
         correlate(tables, windows[m], correlations)
-        explained(correlations, blocks, roots, statistic)
+        explained(tables, correlations, roots, statistic)
         for c in range(candidates):
             best = np.nan
             for k in range(count):

@@ -50,6 +50,10 @@ class Tables(NamedTuple):
         lasting: number of columns that last, which come first.
         drifts: number of drifts, which follow; the others are jumps.
         helpers: index of the helper of the first drift.
+        group: (D,) candidate of every column, helpers included.
+        first: (C,) first column of every candidate.
+        sizes: (C,) number of its columns; 0 for a candidate without a signature.
+        places: (C,) where its inverse roots begin in a row of `Sweep.roots`.
     """
 
     of: np.ndarray
@@ -61,22 +65,10 @@ class Tables(NamedTuple):
     lasting: int
     drifts: int
     helpers: int
-
-
-class Blocks(NamedTuple):
-    """Where the columns and the inverse roots of every candidate are.
-
-    Attributes:
-        first: (C,) first column.
-        sizes: (C,) number of columns; 0 for a candidate without a signature.
-        places: (C,) where its inverse roots begin in a row of `Sweep.roots`.
-        group: (D,) candidate of every column, helpers included.
-    """
-
+    group: np.ndarray
     first: np.ndarray
     sizes: np.ndarray
     places: np.ndarray
-    group: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +80,7 @@ class Sweep:
         window: samples N.
         present: (N, l) whether a reading is there; None where all are.
         nuisance: what uncertain parameters leave in the windows.
-        tables: of the recursions.
-        blocks: of the columns.
+        tables: of the recursions and of the columns.
         roots: (N, R) inverse roots of the products, row by row and candidate after candidate; zero rows for directions
             that nothing is seen of.
         tested: (C, N) whether the candidate is looked for at the onset.
@@ -101,27 +92,26 @@ class Sweep:
     present: Array | None
     nuisance: "Nuisance | None"
     tables: Tables
-    blocks: Blocks
     roots: Array
     tested: np.ndarray
     along: Array
 
     def roots_of(self, c: int) -> Array:
         """Return R (N, d, d) of a candidate: R' R is the inverse of the products of its columns."""
-        d, place = int(self.blocks.sizes[c]), int(self.blocks.places[c])
+        d, place = int(self.tables.sizes[c]), int(self.tables.places[c])
         return self.roots[:, place : place + d * d].reshape(-1, d, d)
 
     def columns(self, c: int) -> slice:
         """Return the columns of a candidate among the correlations."""
-        return slice(int(self.blocks.first[c]), int(self.blocks.first[c] + self.blocks.sizes[c]))
+        return slice(int(self.tables.first[c]), int(self.tables.first[c] + self.tables.sizes[c]))
 
     def signature(self, c: int, onset: int) -> Array:
         """Return the whitened signature (N, l, d) of a candidate that has one."""
         from optid.faults.search.sweep_kernels import course
 
-        result = np.zeros((self.window, self.found.model.l, int(self.blocks.sizes[c])))
+        result = np.zeros((self.window, self.found.model.l, int(self.tables.sizes[c])))
         order = ORDERS.get(self.found.candidates[c].kind, 0)
-        course(self.tables, int(self.blocks.first[c]), order, int(onset), result)
+        course(self.tables, int(self.tables.first[c]), order, int(onset), result)
         return result if self.nuisance is None else self.nuisance(result)
 
     def correlations(self, r: Array) -> Array:
@@ -129,7 +119,7 @@ class Sweep:
         from optid.faults.search.sweep_kernels import correlate
 
         seen = r if self.nuisance is None else self.nuisance(r)
-        result = np.empty((self.window, self.blocks.group.size))
+        result = np.empty((self.window, self.tables.group.size))
         correlate(self.tables, compact(seen), result)
         return result
 
@@ -142,7 +132,7 @@ class Sweep:
         from optid.faults.search.sweep_kernels import explained
 
         result = np.full(self.tested.shape, np.nan)
-        explained(correlations, self.blocks, self.roots, result)
+        explained(self.tables, correlations, self.roots, result)
         result[~self.tested] = np.nan
         return result
 
@@ -154,7 +144,7 @@ class Sweep:
         if self.nuisance is not None:
             shown = np.moveaxis(self.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
         result = np.empty((len(windows), len(self.tested)))
-        many(self.tables, compact(shown), self.blocks, self.roots, self.tested, result)
+        many(self.tables, compact(shown), self.roots, self.tested, result)
         return result
 
     def simulated(self, draws: int, rng: np.random.Generator) -> Iterator[Array]:
@@ -234,15 +224,15 @@ def _prepared(
 ) -> Sweep:
     from optid.faults.search.sweep_kernels import correlate, grams
 
-    blocks, tables = _tables(found, window, steady, present, u, able)
+    tables = _tables(found, window, steady, present, u, able)
     if any(a and c.schedule for a, c in zip(able, found.candidates)):
-        tables = _with_schedules(found, steady, blocks, tables, states, u)
-    columns, size = blocks.group.size, int(np.sum(blocks.sizes**2))
+        tables = _with_schedules(found, steady, tables, states, u)
+    columns, size = tables.group.size, int(np.sum(tables.sizes**2))
     slots = np.full((columns, columns), -1, dtype=np.int64)
-    for d, place, begin in zip(blocks.sizes, blocks.places, blocks.first):
+    for d, place, begin in zip(tables.sizes, tables.places, tables.first):
         slots[begin : begin + d, begin : begin + d] = place + np.arange(d * d).reshape(d, d)
     products = np.zeros((window, size))
-    grams(tables, blocks.group, slots, products, np.empty((0, tables.F.shape[1], columns)))
+    grams(tables, slots, products, np.empty((0, tables.F.shape[1], columns)))
     along = np.zeros((window, 0 if nuisance is None else nuisance.s.size, columns))
     if nuisance is not None:
         one = np.empty((window, columns))
@@ -250,7 +240,7 @@ def _prepared(
             correlate(tables, compact(axis.reshape(window, -1)), one)
             along[:, i] = np.sqrt(1 - 1 / (1 + s**2)) * one
     roots, tested = np.zeros((window, size)), np.zeros((len(able), window), dtype=bool)
-    for c, (d, place, begin) in enumerate(zip(blocks.sizes, blocks.places, blocks.first)):
+    for c, (d, place, begin) in enumerate(zip(tables.sizes, tables.places, tables.first)):
         if d:
             own = products[:, place : place + d * d].reshape(window, d, d)
             largest = own[:, 0, 0] if d == 1 else np.asarray(np.linalg.eigvalsh(own)[:, -1], dtype=float)
@@ -259,7 +249,7 @@ def _prepared(
             roots[:, place : place + d * d] = root.reshape(window, -1)
             tested[c] = np.any(root, axis=(1, 2))
             tested[c, window - (-(-int(d) // found.model.l)) + 1 :] = False
-    return Sweep(found, window, present, nuisance, tables, blocks, roots, tested, along)
+    return Sweep(found, window, present, nuisance, tables, roots, tested, along)
 
 
 def inverse_roots(products: Array, largest: Array, share: float = SHARE) -> Array:
@@ -276,7 +266,7 @@ def inverse_roots(products: Array, largest: Array, share: float = SHARE) -> Arra
 
 def _tables(
     found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None, able: tuple[bool, ...]
-) -> tuple[Blocks, Tables]:
+) -> Tables:
     l = found.model.l  # noqa: E741
     if present is None:
         patterns, of = np.ones((1, l), dtype=bool), np.zeros(window, dtype=np.int64)
@@ -308,26 +298,25 @@ def _tables(
     places = np.concatenate([[0], np.cumsum(dimensions**2)[:-1]])
     kinds = np.array([ORDERS.get(c.kind, 0) for c in chosen for _ in range(c.dimension)])
     count = [int(np.sum(kinds == i)) for i in range(3)]
-    tables = Tables(
+    return Tables(
         of, compact(steady.A + gains @ steady.C), compact(steady.C), compact(whitening), compact(h), compact(e),
-        count[0] + count[1], count[1], count[0],
+        count[0] + count[1], count[1], count[0], group, first, dimensions, places,
     )
-    return Blocks(first, dimensions, places, group), tables
 
 
 def _with_schedules(
-    found: Dictionary, steady: Predictor, blocks: Blocks, tables: Tables, states: Array | None, u: Array | None
+    found: Dictionary, steady: Predictor, tables: Tables, states: Array | None, u: Array | None
 ) -> Tables:
     """Append the states of one more predictor for every scheduled change: it has matrices of its own."""
     assert states is not None and u is not None
     n = steady.A.shape[0]
-    chosen = [(i, c) for i, c in enumerate(found.candidates) if c.schedule is not None and blocks.sizes[i]]
+    chosen = [(i, c) for i, c in enumerate(found.candidates) if c.schedule is not None and tables.sizes[i]]
     wide = n * (1 + len(chosen))
     count, _, columns = tables.e.shape
     F, h, e = np.zeros((count, wide, wide)), np.array(tables.h), np.zeros((count, wide, columns))
     F[:, :n, :n], e[:, :n] = tables.F, tables.e
     for place, (i, candidate) in enumerate(chosen, 1):
-        own, column = slice(n * place, n * (place + 1)), blocks.first[i]
+        own, column = slice(n * place, n * (place + 1)), tables.first[i]
         added, A = change(found.model, candidate, states, u)
         F[:, own, own] = tables.F + A - steady.A
         h[:, :, column] = added[:, :, 0] @ steady.C.T
