@@ -82,8 +82,8 @@ class Store:
         from optid import __version__
 
         new = self.path.with_name(f"{self.path.name}.{platform.node()}.{os.getpid()}.new")
-        columns = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
-        tables = {"rows": f"{columns}, PRIMARY KEY (study, key, repetition)", "superseded": columns,
+        schema = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
+        tables = {"rows": f"{schema}, PRIMARY KEY (study, key, repetition)", "superseded": schema,
                   "studies": "study TEXT PRIMARY KEY, description TEXT",
                   "runs": "study TEXT PRIMARY KEY, machine TEXT, process INTEGER, since TEXT, seen TEXT",
                   "meta": "name TEXT PRIMARY KEY, value TEXT"}
