@@ -149,38 +149,32 @@ def test_no_rows_yet(path):
     assert read_rows(path)["objective"].shape == (0,)
 
 
-def test_missing_database(path):
-    with pytest.raises(DatabaseError, match="no such database"):
-        read_rows(path)
+def made_by(statement):
+    """An SQLite file of another kind or version."""
+
+    def make(path):
+        if statement.startswith("UPDATE"):
+            append(path, rows(3))
+        with closing(sqlite3.connect(path)) as connection, connection:
+            connection.execute(statement)
+
+    return make
 
 
-def test_another_version_is_refused_for_reading_and_writing(path):
-    append(path, rows(3))
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("UPDATE meta SET value = '99' WHERE name = 'schema version'")
-    for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished(path)):
-        with pytest.raises(DatabaseError, match="schema version 99.*made by optid"):
-            attempt()
-
-
-def test_other_files_are_refused(path):
-    with closing(sqlite3.connect(path)) as connection, connection:
-        connection.execute("CREATE TABLE mine (x INTEGER)")
-    for attempt in (lambda: read_rows(path), lambda: append(path, rows(1))):
-        with pytest.raises(DatabaseError, match="not a database of studies"):
-            attempt()
-
-
-@pytest.mark.parametrize("name, content, words", [
+@pytest.mark.parametrize("name, make, words", [
+    ("study.sqlite", made_by("UPDATE meta SET value = '99' WHERE name = 'schema version'"),
+     "schema version 99.*made by optid"),
+    ("mine.sqlite", made_by("CREATE TABLE mine (x INTEGER)"), "not a database of studies"),
     ("valve.csv", b"time,u,y\n1,2,3\n" * 1000, "valve.csv is a file of another kind, .*give the one that `optid study"),
     ("study.toml", b'name = "small"\n' * 30, "study.toml is a file of another kind"),
     ("short.sqlite", b"\n", "not a database of studies .it has no tables"),
     ("old.duckdb", b"\0" * 8 + b"DUCK" + b"\0" * 99,
      "kept rows in DuckDB. Export it with that version .`optid study export old.duckdb rows.parquet`"),
 ])
-def test_files_of_another_kind_are_told_with_what_to_do(tmp_path, name, content, words):
+def test_files_of_another_kind_or_version_are_told_with_what_to_do(tmp_path, name, make, words):
     path = tmp_path / name
-    path.write_bytes(content)
+    make(path) if callable(make) else path.write_bytes(make)
+    content = path.read_bytes()
     for attempt in (lambda: read_rows(path), lambda: append(path, rows(1)), lambda: finished(path)):
         with pytest.raises(DatabaseError, match=words):
             attempt()
@@ -301,7 +295,9 @@ def test_an_export_reads_like_its_database(path, tmp_path):
         rows_of_one(tmp_path / "bad.parquet")
 
 
-def test_a_folder_is_no_database(tmp_path):
+def test_nothing_and_a_folder_are_no_database(tmp_path, path):
+    with pytest.raises(DatabaseError, match="no such database"):
+        read_rows(path)
     for attempt in (lambda: read_rows(tmp_path), lambda: append(tmp_path, rows(1))):
         with pytest.raises(DatabaseError, match="no such database|Is a directory"):
             attempt()

@@ -509,26 +509,26 @@ def test_labels_and_title_do_not_change_the_key():
 
 
 def test_versions_change_the_key(monkeypatch):
-    from optid.studies import versions
+
 
     study = Study.from_text(SMALL)
     before = {cell.key for cell in grid.cells(study)}
-    versions.determining.cache_clear()
-    monkeypatch.setattr(versions, "installed", lambda name: "99")
+    grid.determining.cache_clear()
+    monkeypatch.setattr(grid, "installed", lambda name: "99")
     assert not before & {cell.key for cell in grid.cells(study)}
     monkeypatch.undo()
-    versions.determining.cache_clear()
+    grid.determining.cache_clear()
     assert before == {cell.key for cell in grid.cells(study)}
 
 
 def test_versions_do_not_depend_on_how_optid_was_installed(monkeypatch):
     """In place it is no distribution that holds the package; as a wheel it is."""
-    from optid.studies import versions
+
 
     found = []
     for holders in ((), ("optid",)):
-        monkeypatch.setattr(versions, "packages_of", lambda package, holders=holders: holders)
-        found.append([versions.determining.__wrapped__("arx", solver) for solver in ("gauss_newton", "scs", "auto")])
+        monkeypatch.setattr(grid, "packages_of", lambda package, holders=holders: holders)
+        found.append([grid.determining.__wrapped__("arx", solver) for solver in ("gauss_newton", "scs", "auto")])
     assert found[0] == found[1]
     own, other, auto = found[0]
     assert "source of gauss_newton" in own and other["scs"] != "not installed"

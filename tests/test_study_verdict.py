@@ -263,5 +263,5 @@ def test_the_standings_equal_those_of_a_data_frame():
 def test_a_verdict_is_frozen_and_prints():
     verdict = conclude(synthetic(200, 1))
     with pytest.raises(dataclasses.FrozenInstanceError):
-        verdict.time = "fit"
+        verdict.headline = "fit"
     assert str(verdict).startswith(verdict.headline.word)

@@ -36,22 +36,13 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
                study: str | None = None, accuracy: float | None = None, time: str = "solve") -> Path:
     """Write the page of a study: verdict, tables, figures and all runs in one file that makes no request.
 
-    Args:
-        rows_or_db: path of a database, a mapping of columns, a frame (pandas, polars), dict rows, or a `Verdict`.
-        path: the file, replaced when it exists.
-        title: heading; unless given, the title of the study.
-        command: the command line behind it, for the section that says how to reproduce it.
-        study: its title, for a database that holds several.
-        accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
-        time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
+    Rows, study, accuracy and time are those of `conclude`, whose errors are raised; a `Verdict` is taken as it is. The
+    title is by default that of the study; the command is for the section that says how to reproduce the page.
 
     Returns:
-        The path.
+        The path; the file is replaced when it exists.
 
     Raises:
-        DataError: these are no rows of a study, or an unknown measure of time.
-        StudyError: the database holds several studies, and none is named.
-        DatabaseError: the database cannot be read.
         OSError: the file cannot be written.
     """
     if not isinstance(rows_or_db, Verdict):
@@ -82,9 +73,9 @@ def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
         "quality": quality_table(verdict.quality) if verdict.quality.records else None,
         "few_reasons": 0 < len(verdict.failures) <= FEW_REASONS,
         "formulations": [section.name for section in verdict.sections],
-        "requested": f"{verdict.accuracy:.0e}",
+        "requested": f"{verdict.found.accuracy:.0e}",
         "tolerance": f"{verdict.found.tolerance:.0e}",
-        "clock": f"{' + '.join(TIMES[verdict.time])}: {TIME_WORDS[verdict.time]}",
+        "clock": f"{' + '.join(TIMES[verdict.found.measure])}: {TIME_WORDS[verdict.found.measure]}",
         "states": [*OUTCOMES.items(), *MEANINGS.items()],
         "call": command or "optid study report STUDY.sqlite -o study.html",
         "versions": [*versions(), *_machines(verdict)],

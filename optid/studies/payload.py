@@ -26,7 +26,7 @@ def page_payload(verdict: Verdict) -> dict[str, Any]:
     return {
         "solvers": [s.solver for s in verdict.overall.standings] + list(verdict.overall.idle),
         "tolerance": verdict.found.tolerance,
-        "time": verdict.time,
+        "time": verdict.found.measure,
         "sections": [_section(section) for section in (verdict.overall, *verdict.sections)],
         "agreement": {
             "solvers": list(agreement.solvers),
@@ -35,7 +35,7 @@ def page_payload(verdict: Verdict) -> dict[str, Any]:
                for name in ("worst_objective", "worst_model")},
         },
         "failures": [[f.solver, f.state, f.reason[:400], f.count] for f in verdict.failures],
-        "columns": [column for column in _columns(verdict.table, states, verdict.time) if column is not None],
+        "columns": [column for column in _columns(verdict.table, states, verdict.found.measure) if column is not None],
         "count": len(states),
     }
 

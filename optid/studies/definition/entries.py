@@ -22,9 +22,7 @@ from optid.studies.sources.systems import SYSTEMS, simulate
 AUTO, ALL = "auto", "all"
 MOST_SEEDS, MOST_FORMULATIONS = 1_000_000, 10_000  # a study has no more cells than that
 
-READING = ("inputs", "outputs", "dt", "time", "experiment", "columns", "delimiter", "decimal")
-"""Keys of a data entry that say how its files are read."""
-
+READING = ("inputs", "outputs", "dt", "time", "experiment", "columns", "delimiter", "decimal")  # how files are read
 _TOP = ("name", "accuracy", "time_limit", "memory_limit", "repetitions", "warm", "seeds", "holdout", "data",
         "formulation", "solver", "solvers")
 _DATA = ("name", "file", "system", "samples", "noise", *READING)

@@ -21,10 +21,9 @@ from optid.program.solution import Solution
 from optid.solving.solve import NOT_FINITE, solve
 from optid.studies.execution.machine import Peak, machine
 from optid.studies.execution.worker import keep
-from optid.studies.grid import Cell, content_hash
+from optid.studies.grid import Cell, content_hash, determining
 from optid.studies.sources.records import Record, load
 from optid.studies.storage.rows import DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, as_json, complete
-from optid.studies.versions import determining
 
 KEPT = 3  # records that a worker keeps, so that cells of one data set load it once
 SHORTEST = 0.01  # seconds of a time limit that a solver always has: some take none at all for no limit

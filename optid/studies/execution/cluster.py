@@ -20,9 +20,8 @@ from optid.data.clusters import PACKAGES, connected, difference
 from optid.errors import ClusterError, StudyError
 from optid.studies.execution import cluster_worker
 from optid.studies.execution.cell import lost_row, run_cell
-from optid.studies.grid import Cell, content_hash
+from optid.studies.grid import Cell, content_hash, determining
 from optid.studies.storage.rows import CRASHED, ERROR
-from optid.studies.versions import determining
 
 TICK = 1.0  # seconds between looks at the cluster while no cell ends
 AHEAD = 2  # cells that are under way per thread of the cluster: one runs, one is there when it ends

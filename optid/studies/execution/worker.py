@@ -22,8 +22,7 @@ from typing import Any
 from optid.studies.execution.machine import MB, resident_mb
 from optid.studies.storage.rows import ERROR, MEMORY_LIMIT
 
-RETIRED = 77
-"""Exit code of a worker that holds so much memory of earlier cells that another one takes the cell it was given."""
+RETIRED = 77  # exit code of a worker that holds so much memory of earlier cells that another one takes its cell
 KEPT, KEPT_MB = 0.5, 150.0  # share of the limit, and MB, that a worker may hold of earlier cells
 TOLD, LONGEST = 100_000, 300  # bytes of the words of a worker that are looked at, and characters of them in a reason
 

@@ -19,12 +19,7 @@ def check_target(target: str | Path) -> Path:
 
 
 def export(path: str | Path, target: str | Path, study: str | None = None) -> int:
-    """Write the rows of a database to a Parquet or CSV file and return how many there are.
-
-    Args:
-        path: the database.
-        target: file that ends in .parquet or .csv; replaced when it is there.
-        study: only rows of this study.
+    """Write the rows of a database, or of one study, to a .parquet or .csv file and return how many there are.
 
     Raises:
         DatabaseError: another ending, no rows, the target cannot be written, or the database cannot be read.

@@ -30,11 +30,8 @@ OUTCOMES = {
 }
 """Every value of the column ``outcome`` and what it means."""
 
-STATUSES = tuple(str(status) for status in Status)
-"""Every value of the column ``status_verified``."""
-
-SUCCESS = (str(Status.OPTIMAL), str(Status.LOCAL))
-"""Verified statuses with which the requested accuracy was reached."""
+STATUSES = tuple(str(status) for status in Status)  # every value of the column ``status_verified``
+SUCCESS = (str(Status.OPTIMAL), str(Status.LOCAL))  # those with which the requested accuracy was reached
 
 
 @dataclass(frozen=True)

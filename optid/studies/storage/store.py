@@ -82,8 +82,8 @@ class Store:
         from optid import __version__
 
         new = self.path.with_name(f"{self.path.name}.{platform.node()}.{os.getpid()}.new")
-        columns = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
-        tables = {"rows": f"{columns}, PRIMARY KEY (study, key, repetition)", "superseded": columns,
+        schema = ", ".join(f'"{c.name}" {c.sql}{" NOT NULL" if c.always else ""}' for c in COLUMNS)
+        tables = {"rows": f"{schema}, PRIMARY KEY (study, key, repetition)", "superseded": schema,
                   "studies": "study TEXT PRIMARY KEY, description TEXT",
                   "runs": "study TEXT PRIMARY KEY, machine TEXT, process INTEGER, since TEXT, seen TEXT",
                   "meta": "name TEXT PRIMARY KEY, value TEXT"}
@@ -340,11 +340,7 @@ def append(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarray]:
     """Return the rows of a database as `rows.columns` does, sorted by the moments their cells started.
 
-    These are datetime64[us], and repetitions int64.
-
-    Args:
-        path: the database; a run may be writing to it.
-        study: only rows of this study.
+    These are datetime64[us], and repetitions int64. A run may be writing to the database.
 
     Raises:
         DatabaseError: as for `Store`.
@@ -368,11 +364,7 @@ def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]
 
 
 def rows_of_one(path: str | Path, study: str | None = None) -> Any:
-    """Return the rows of a study as `read_rows` does, or those of an exported Parquet file.
-
-    Args:
-        path: the database, or a .parquet file that `optid study export` wrote.
-        study: title of the study; it need not be given where there is only one.
+    """Return the rows of a study as `read_rows` does, or those of a .parquet file that `optid study export` wrote.
 
     Raises:
         StudyError: the database holds several studies, and none is given.

@@ -87,10 +87,7 @@ class Comparison:
 
 
 def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
-    """Set the rows of one record and one formulation side by side.
-
-    Args:
-        rows: of a study with one record, one formulation and one accuracy.
+    """Set the rows of a study with one record, one formulation and one accuracy side by side.
 
     Raises:
         DataError: there are no rows, or these are none of a study.
@@ -117,14 +114,7 @@ def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
 
 
 def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
-    """Return the verdict of a study of one record and one formulation, headed by what the comparison says.
-
-    Args:
-        rows: of a study with one record, one formulation and one accuracy.
-
-    Raises:
-        DataError: there are no rows, or these are none of a study.
-    """
+    """Return the verdict on the rows that `compare` takes, headed by what the comparison says; it raises the same."""
     head, verdict = compare(rows).headline, conclude(rows)
     caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. Which solver to prefer on others is "
                        "told by a study of at least 6 problems (optid study run).", "data sets")

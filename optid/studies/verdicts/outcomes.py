@@ -15,15 +15,9 @@ FALSE_CLAIM, CONTRADICTED, INFEASIBLE = "false claim", "contradicted", str(Statu
 LESS_ACCURATE, WORSE_MINIMUM, OTHER_ACCURACY = "less accurate", "worse minimum", "other accuracy"
 WARM_FAILED, UNTIMED = "warm solve failed", "no time"
 VALUE = 1e-6  # relative difference of objectives up to which two runs found the same minimum
-TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}
-"""Measures of time and the columns they are the sum of."""
-
-VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)
-"""States whose verified accuracy was reached, whatever is known of the time."""
-
-UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))
-"""States of runs that ended before the solver had an answer."""
-
+TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}  # measures: sums of columns
+VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, whatever is known of the time
+UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))  # ended before the solver had an answer
 MEANINGS = {
     SOLVED: "the verified accuracy was reached, at the best objective that any solver verified",
     FALSE_CLAIM: "success or infeasibility was claimed, and our residuals took it back",

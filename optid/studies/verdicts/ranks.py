@@ -51,12 +51,8 @@ def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.
          ) -> Ranking:
     """Rank those that were tried on every data set; a failure on a problem ranks last there, failures tied.
 
-    Args:
-        costs: (P, k) lower is better, ``nan`` where not solved.
-        tried: (P, k) where somebody was run.
-        names: the k names.
-        data: (P,) labels of the data sets.
-        noun: what is ranked.
+    Costs (lower is better, ``nan`` where not solved) and where somebody was tried are (P, k), the labels of the data
+    sets (P,).
     """
     everywhere = [bool(len(data)) and all(column[data == label].any() for label in dict.fromkeys(data))
                   for column in tried.T]

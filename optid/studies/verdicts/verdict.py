@@ -23,7 +23,6 @@ from optid.studies.verdicts.outcomes import (
     Table,
     states_of_rows,
     tabulate,
-    usual_accuracy,
 )
 from optid.studies.verdicts.quality import Quality, compare_formulations
 from optid.studies.verdicts.standings import Section, compare_solvers
@@ -56,9 +55,7 @@ class Verdict:
     """What a study says."""
 
     table: Table  # the rows, one array per column
-    found: Results  # problems and solvers
-    accuracy: float  # relative accuracy that was compared at
-    time: str  # measure of time: "solve", "fit" or "warm"
+    found: Results  # problems and solvers, the accuracy and the measure of time
     overall: Section  # comparison on all problems
     sections: tuple[Section, ...]  # comparison on the problems of each formulation, in alphabetical order
     quality: Quality  # the formulations by their models
@@ -102,13 +99,12 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
 
         rows = rows_of_one(rows, study)
     table = columns(rows)
-    at = usual_accuracy(table) if accuracy is None else accuracy
-    found = tabulate(table, at, time)
+    found = tabulate(table, accuracy, time)
     overall = compare_solvers(found)
     sections = tuple(compare_solvers(found.where(found.formulation == f), f) for f in sorted(set(found.formulation)))
     quality = compare_formulations(found, table)
     head = headline(overall, sections, quality)
-    return Verdict(table, found, at, time, overall, sections, quality, agreement_matrix(found, table),
+    return Verdict(table, found, overall, sections, quality, agreement_matrix(found, table),
                    _false_claims(table, found), _failures(found), head,
                    tuple(_statements(overall, sections, quality, found, table, head)))
 
