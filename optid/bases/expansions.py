@@ -42,11 +42,10 @@ class Polynomial(Basis):
         from numpy.polynomial import legendre
 
         lo, hi = span(self)
-        values = legendre.legvander((2 * x - lo - hi) / (hi - lo), self.p)
-        if order == 0:
-            return np.array(values[:, 1:], order="C")
-        slopes = legendre.legder(np.eye(self.p + 1)[:, 1:], order, scl=2 / (hi - lo))
-        return values[:, : len(slopes)] @ slopes
+        coefficients = np.eye(self.p + 1)[:, 1:]
+        if order:
+            coefficients = legendre.legder(coefficients, order, scl=2 / (hi - lo))
+        return np.array(legendre.legval((2 * x - lo - hi) / (hi - lo), coefficients).T, dtype=float, order="C")
 
 
 @dataclass(frozen=True)
