@@ -34,6 +34,9 @@ from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 if TYPE_CHECKING:
     from optid.data.record import Data
 
+SMALL = 20_000
+"""Entries of a table that a triangular solution filters sooner than numba is imported."""
+
 CHUNK = 4096
 """Samples whose sensitivities are formed at a time: they stay in the processor's cache."""
 
@@ -227,9 +230,6 @@ def _through(d: Array, table: Array) -> Array:
     for i, value in enumerate(d, start=1):
         total = total + value * table[len(d) - i : len(table) - i]
     return total
-
-
-SMALL = 20_000  # entries of a table up to which a triangular solution takes less time than the import of numba
 
 
 def _all_pole(a: Array, table: Array, first: int) -> None:
