@@ -58,7 +58,7 @@ def translate(form: Smooth) -> dict[str, Any]:
             done[id(expr)] = (expr, _column(expr, known, column))
         return done[id(expr)][1]
 
-    rows = [ca.densify(column(row.expression)) for row in form.rows]
+    rows = [ca.densify(column(one)) for one in form.rows]
     return {"x": x, "p": p, "f": ca.densify(column(form.problem.objective.expr)),
             "g": ca.vertcat(*rows) if rows else ca.MX(0, 1)}
 

@@ -31,18 +31,6 @@ CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
 
 @dataclass(frozen=True)
-class Row:
-    """A block of rows of the smooth programme: ``expression == 0`` or ``expression <= 0``.
-
-    The multiplier of either, in the convention ``L = f + dual * expression``, is CVXPY's own dual value.
-    """
-
-    expression: cp.Expression
-    equality: bool
-    id: int
-
-
-@dataclass(frozen=True)
 class Smooth:
     """A programme after CVXPY's smooth chain, with the way back.
 
@@ -64,13 +52,12 @@ class Smooth:
         return self.problem.variables()
 
     @cached_property
-    def rows(self) -> tuple[Row, ...]:
-        """The constraints as rows.
+    def rows(self) -> list[cp.Expression]:
+        """What the constraints hold at zero or not above it; refuses a cone (`StructureError`).
 
-        Raises:
-            StructureError: a cone that is not a smooth equality or inequality.
+        Their multipliers, in the convention ``L = f + dual * row``, are CVXPY's own dual values.
         """
-        return tuple(_row(constraint) for constraint in self.problem.constraints)
+        return [_rows(constraint) for constraint in self.problem.constraints]
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -81,8 +68,9 @@ class Smooth:
     @cached_property
     def row_bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper bounds of the stacked rows."""
-        lower = [np.full(row.expression.size, 0.0 if row.equality else -np.inf) for row in self.rows]
-        return _flat(lower), _flat([np.zeros(row.expression.size) for row in self.rows])
+        lower = [np.full(rows.size, 0.0 if isinstance(constraint, EQUALITIES) else -np.inf)
+                 for rows, constraint in zip(self.rows, self.problem.constraints)]
+        return _flat(lower), _flat([np.zeros(rows.size) for rows in self.rows])
 
     def start(self) -> np.ndarray:
         """Return the flat start: the values the original variables hold now, auxiliary ones consistent with them."""
@@ -108,8 +96,9 @@ class Smooth:
         x, multipliers = np.ravel(x), np.ravel(multipliers)
         parts = np.split(x, np.cumsum([v.size for v in self.variables])[:-1])
         primal = {v.id: np.reshape(part, v.shape, order="F") for v, part in zip(self.variables, parts)}
-        parts = np.split(multipliers, np.cumsum([row.expression.size for row in self.rows])[:-1])
-        dual = {row.id: part for row, part in zip(self.rows, parts)} if multipliers.size else {}
+        parts = np.split(multipliers, np.cumsum([rows.size for rows in self.rows])[:-1])
+        ids = [constraint.id for constraint in self.problem.constraints]
+        dual = dict(zip(ids, parts)) if multipliers.size else {}
         solution = ReducedSolution(cp.OPTIMAL, 0.0, primal, dual, {})
         solution = self.attributes.invert(self.kinks.invert(solution, self.inverse[1]), self.inverse[0])
         values, duals = solution.primal_vars, solution.dual_vars
@@ -150,10 +139,10 @@ class Derivatives:
     def __init__(self, form: Smooth) -> None:
         from cvxpy.reductions.solvers.nlp_solvers.nlp_solver import Oracles
 
-        self._problem = cp.Problem(form.problem.objective, [Zero(row.expression) for row in form.rows])
+        self._problem = cp.Problem(form.problem.objective, [Zero(rows) for rows in form.rows])
         self._oracles = Oracles(self._problem, verbose=False)
         self._x: np.ndarray | None = None
-        self.rows = np.zeros(sum(row.expression.size for row in form.rows))
+        self.rows = np.zeros(sum(rows.size for rows in form.rows))
         self.jacobian_pattern = self._oracles.jacobianstructure()
         self.hessian_pattern = self._oracles.hessianstructure()
 
@@ -229,9 +218,9 @@ class _SmoothChain(Dnlp2Smooth):
                                      cp.log_sum_exp: level, cp.rel_entr: entropy, cp.kl_div: entropy}
 
 
-def _row(constraint: Constraint) -> Row:
+def _rows(constraint: Constraint) -> cp.Expression:
     if (expression := rows_of(constraint)) is not None:
-        return Row(expression, isinstance(constraint, EQUALITIES), constraint.id)
+        return expression
     raise StructureError(
         f"{constraint} is a {type(constraint).__name__} constraint, which no NLP solver here accepts; "
         "write it with equalities and inequalities (a second-order cone as norm(x) <= t)")

@@ -131,7 +131,8 @@ class Basis:
         """Evaluate eta, (N, P), at u (N,); rows of missing samples (NaN) are NaN; errors as `local`."""
         u = samples(u)
         complete = spread(*self.local(u), self.full_size)
-        complete[np.isnan(u)] = np.nan
+        if (missing := np.isnan(u)).any():
+            complete[missing] = np.nan
         return self._reduced(complete)
 
     def slopes(self, u: ArrayLike) -> Array:

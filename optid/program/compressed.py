@@ -90,11 +90,7 @@ def white_spread(compressed: Compressed, z: Array, moves: Array) -> Spread:
 
 
 def degrees_of_freedom(rows: float, parameters: float) -> float:
-    """Return what so many rows leave beside the parameters.
-
-    Raises:
-        RankError: nothing.
-    """
+    """Return what so many rows leave beside the parameters (`RankError`: nothing)."""
     if not rows > parameters:
         raise RankError(f"{rows:.0f} rows for {parameters:.0f} parameters: none are left to estimate the noise")
     return rows - parameters

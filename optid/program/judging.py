@@ -33,8 +33,7 @@ def judge(program: Program, values: Values, duals: Values) -> tuple[Values, floa
     if program.is_stated or structure is None:
         values, (violation, worst) = program.values(), measure_violation(program)
     else:
-        values = structure.complete(program, values)
-        violation, worst = structure.measure_violation(values)
+        values, violation, worst = structure.complete(program, values)
     known = None if structure is None else structure.measure(program, values)
     if known is not None:
         objective, stationarity = known

@@ -102,7 +102,7 @@ class Program:
             name: of the formulation.
             statement: returns objective, constraints, variables, view and derived.
             start: values of all variables that are not derived.
-            structure: which measures a point by itself (`Structure.complete`, `Structure.measure_violation`).
+            structure: which measures a point by itself (`Structure.complete`).
             known: the other attributes.
         """
         made = cls(name, *[None] * 3, start=start, structure=structure, view=None, **known)  # type: ignore[arg-type]

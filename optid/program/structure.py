@@ -36,16 +36,12 @@ class Structure:
         """
         return None
 
-    def complete(self, program: Any, values: Mapping[str, Array]) -> dict[str, Array]:
-        """Return values in the shapes of the variables, derived ones computed from the others.
+    def complete(self, program: Any, values: Mapping[str, Array]) -> tuple[dict[str, Array], float, str]:
+        """Return values in the shapes of the variables, derived ones computed from the others, and what they violate.
 
-        Raises:
-            ValueError: a value of another shape.
+        That is the largest relative violation of a structural constraint, and its name. Only a programme that is
+        `deferred` asks for it.
         """
-        raise NotImplementedError
-
-    def measure_violation(self, values: Mapping[str, Array]) -> tuple[float, str]:
-        """Return the largest relative violation of a structural constraint at a point, and its name."""
         raise NotImplementedError
 
 

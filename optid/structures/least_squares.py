@@ -79,27 +79,17 @@ class RankOneStructure(LeastSquaresStructure):
             found |= zip((mu, b), pair)
         return {name: np.reshape(part, shapes[name], order="F") for name, part in found.items()}
 
-    def complete(self, program: Any, values: Mapping[str, Array]) -> dict[str, Array]:
-        """Return values in the shapes of the variables, and the residual ``R z - s``."""
-        shapes = program.shapes
+    def complete(self, program: Any, values: Mapping[str, Array]) -> tuple[dict[str, Array], float, str]:
+        """Return values in the shapes of the variables, the residual ``R z - s``, and the violation of the gauge."""
+        shapes, worst = program.shapes, 0.0
         found = {name: np.array(values[name], dtype=float).reshape(shapes[name], order="F") for name in self.names}
-        return {**found, "residual": self.problem.root @ self.point(found).lift() - self.problem.target}
-
-    def measure_violation(self, values: Mapping[str, Array]) -> tuple[float, str]:
-        """Return the largest violation of the gauge, relative to its terms."""
-        a, worst = np.asarray(values.get("a", np.zeros(0))), 0.0
-        for _, name in self.blocks:
-            b = np.asarray(values[name])
-            if self.gauge == "norm":
-                left, right, terms = float(np.sum(b**2)), 1.0, 2.0
-            elif self.gauge == "b0":
-                left, right, terms = float(b.flat[0]), 1.0, 2.0
-            else:
-                left, right = float(np.sum(b)), 1.0 + float(np.sum(a))
-                terms = 1.0 + float(np.sum(np.abs(b)) + np.sum(np.abs(a)))
-            amount = abs(left - right) / terms
+        a = found.get("a", np.zeros(0))
+        for b in (found[name] for _, name in self.blocks):
+            level = {"norm": np.sum(b**2), "b0": b.flat[0], "gain": np.sum(b) - np.sum(a)}[self.gauge]  # must be one
+            amount = abs(float(level) - 1.0) / (1.0 + float(np.sum(np.abs(b)) + np.sum(np.abs(a))))
             worst = worst if amount <= worst else amount  # also nan
-        return (worst, "gauge") if worst else (0.0, "")
+        found["residual"] = self.problem.root @ self.point(found).lift() - self.problem.target
+        return found, worst, "gauge" if worst else ""
 
 
 def rank_one_of(program: Any) -> RankOneStructure | None:
