@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, compact
 from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.stretches import interpolated
@@ -377,10 +377,14 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
 
 def _states(steady: Predictor, drive: Array, innovations: Array, x0: Array) -> Array:
     """States (N, n) of a predictor from its innovations."""
-    from optid.faults.kernels import propagate
+    from optid.faults.kernels import predict
 
-    states = np.empty(drive.shape)
-    propagate(np.ascontiguousarray(steady.A), drive + innovations @ steady.K.T, x0, states)
+    count, outputs = innovations.shape
+    states, nothing = np.empty(drive.shape), np.zeros((count - 1, outputs))
+    states[0] = x0
+    entered = drive + innovations @ steady.K.T  # nothing else corrects the states
+    predict(compact(steady.A), compact(steady.C), np.zeros(steady.K.shape), compact(steady.root), entered[:-1],
+            nothing, nothing, states, np.empty(nothing.shape))
     return states
 
 
