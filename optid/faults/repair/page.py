@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from optid import __version__
-from optid.faults.repair.reformulation import Reformulation
+from optid.faults.repair.reformulation import HEADS, Reformulation
 from optid.faults.repair.schedule import fit_words
-from optid.faults.repair.words import HEADS, member_lines
 from optid.show.page import figure, template, versions
 from optid.show.wording import Table, number
 
@@ -49,9 +48,7 @@ def render(found: Reformulation, *, record: str = "", command: str = "") -> str:
         "notes": list(dict.fromkeys(note for note in found.notes)),
         "tables": _tables(found),
         "figures": [figure("reformulation", found.plot, caption)],
-        "members": [
-            {"title": member.label, "text": "\n".join(member_lines(member)[1:])} for member in found.members
-        ],
+        "members": [{"title": member.label, "text": str(member)} for member in found.members],
         "call": command or "optid.faults.reformulate(model, diagnosis, data)",
         "versions": versions(),
         "text": str(found),
