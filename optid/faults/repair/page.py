@@ -26,9 +26,8 @@ def write(found: Reformulation, path: str | Path, *, record: str = "", command: 
     Raises:
         OSError: the file cannot be written.
     """
-    path = Path(path)
-    path.write_text(render(found, record=record, command=command), encoding="utf-8")
-    return path
+    Path(path).write_text(render(found, record=record, command=command), encoding="utf-8")
+    return Path(path)
 
 
 def render(found: Reformulation, *, record: str = "", command: str = "") -> str:
@@ -102,15 +101,11 @@ def _tables(found: Reformulation) -> list[Table]:
             f"record says of the values it visits {one.excitation:.3g}. Standard errors do not count the rules."
         )
         tables.append(Table(f"Effect of {one.name}", ("input", "before", "now", "standard error", ""), rows, note))
-    noise = found.healthy.noise
-    if not found.observer.lost:  # nothing has changed of what the sensors say
+    seen = found.observer
+    if not seen.lost:  # nothing has changed of what the sensors say
         return tables
-    assert noise is not None
-    rows = [
-        (name, "not used" if name in found.observer.lost else "used", number(value, 3),
-         number(float(np.sqrt(noise.R[o, o])), 3), number(found.observer.open_loop[name], 3))
-        for o, (name, value) in enumerate(found.observer.rmse.items())
-    ]
+    rows = [(name, "not used" if name in seen.lost else "used", number(value, 3), number(seen.noise[name], 3),
+             number(seen.open_loop[name], 3)) for name, value in seen.rmse.items()]
     tables.append(Table(
         "Outputs", ("output", "sensor", "predicted RMSE", "noise of the sensor", "RMSE of a simulation"), rows,
         "Of the outputs without their noise, from the Riccati equation of the filter on the sensors that are used.",
