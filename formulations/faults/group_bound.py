@@ -5,13 +5,10 @@ of the Lagrangian, every v with ``‖M_g' v - c_g‖ <= lambda w_g`` gives the b
 returns is scaled into that set, v and multipliers together, so that the bound holds whatever it was.
 """
 
-from collections.abc import Iterable, Mapping
-
-import cvxpy as cp
 import numpy as np
 
-from optid.program.expressions import flat_value, jacobians
-from optid.program.judging import multiplier_terms
+from optid.program.expressions import flat_value
+from optid.program.judging import Lagrangian, multiplier_terms
 from optid.program.limits import spans
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, relative_gap
@@ -55,40 +52,19 @@ def _bound(problem, v: np.ndarray, penalty: float, slope: np.ndarray, constant: 
 
 
 def _lagrangian(program: Program, form: GroupSparseStructure, duals: Values) -> tuple[np.ndarray, float]:
-    """Return c (p,) and k of the user's affine constraints; one that is no help counts with multiplier zero."""
-    slope, constant = np.zeros(problem_size(form)), 0.0
+    """Return c (p,) and k of the user's constraints that are affine in a; others count with multiplier zero."""
+    found, value = Lagrangian(program), 0.0
+    blocks = [program.variables[name] for name in form.blocks]
     for name, group in program.user_constraints.items():
         for member, span in zip(group, spans(group)):
             given = np.ravel(duals[name])[span] if name in duals else np.zeros(0)
             usable = given.size == span.stop - span.start and np.isfinite(given).all()
             terms = multiplier_terms(member, given) if usable else None
-            part = None if terms is None else _affine(terms, program.variables, form)
-            if part is not None:
-                slope, constant = slope + part[0], constant + part[1]
-    return slope, constant
-
-
-def problem_size(form: GroupSparseStructure) -> int:
-    """Return the number of coefficients."""
-    return int(form.problem.edges[-1])
-
-
-def _affine(terms: Iterable[tuple[cp.Expression, np.ndarray]], variables: Mapping[str, cp.Variable],
-            form: GroupSparseStructure) -> tuple[np.ndarray, float] | None:
-    """Return slope and constant of a sum of weighted affine expressions of the coefficients; None for others."""
-    known = {variables[name].id: name for name in form.blocks}
-    slopes = {name: np.zeros(shape) for name, shape in form.blocks.items()}
-    constant = 0.0
-    for expression, weights in terms:
-        if not expression.is_affine():
-            return None
-        constant += float(flat_value(expression) @ weights)
-        found = jacobians(expression)
-        if found is None or any(variable.id not in known for variable in found):
-            return None
-        for variable, jacobian in found.items():
-            part = jacobian.T @ weights
-            name = known[variable.id]
-            slopes[name] = slopes[name] + part.reshape(form.blocks[name], order="F")
-            constant -= float(flat_value(variable) @ part)
-    return np.concatenate([part.ravel() for part in slopes.values()]), constant
+            if terms is None or not all(one.is_affine() and set(one.variables()) <= set(blocks) for one, _ in terms):
+                continue
+            for expression, weights in terms:
+                found.add(expression, weights)
+                value += float(flat_value(expression) @ weights)
+    slope = np.concatenate([np.ravel(found.gradient(block)) for block in blocks])
+    point = np.concatenate([np.ravel(np.asarray(block.value, dtype=float)) for block in blocks])
+    return slope, value - float(slope @ point)

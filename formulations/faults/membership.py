@@ -14,7 +14,7 @@ Named variables: ``t``; named expressions: ``x`` (N, n) and, with a candidate, `
 
 from collections.abc import Generator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -42,16 +42,8 @@ PROVED = 1e-6
 """Relative gap below which a factor counts as least."""
 
 
-class Signature(NamedTuple):
-    """Additions of unknown sizes.
-
-    Attributes:
-        state: (N, n, c) to x(k).
-        output: (N, l, c) to y(k).
-    """
-
-    state: Array
-    output: Array
+Signature = tuple[Array, Array]
+"""What a fault of unknown sizes adds: (N, n, c) to x(k), (N, l, c) to y(k)."""
 
 
 def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictionary | None = None,
@@ -78,93 +70,84 @@ def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictiona
     """
     window = bounded_window(model, data, bounds)
     tried = _onsets(onsets, window.count)
-    solution = yield membership_programme(window).subject_to(*constraints)
-    proof = _proof_of(solution)
-    factor = solution.objective if solution.has_point else float("nan")
+    solution = yield _programme(window).subject_to(*constraints)
+    factor, proof = _factor(solution), _proof_of(solution)
     factors: dict[str, float] = {}
     where: dict[str, int | None] = {}
     proofs: dict[str, dict[tuple[int, int], ParityProof]] = {}
     untested: dict[str, str] = {}
-    impossible = proof is not None and proof.proved
-    for candidate in () if faults is None or not (candidates or impossible) else faults.candidates:
+    for candidate in faults.candidates if faults is not None and (candidates or proof is not None) else ():
         if not (candidate.additive or candidate.columns):
             untested[candidate.label] = "it has no signature: test it as an arbitrary waveform"
             continue
-        per_sample = _per_sample(faults, candidate, window)
-        found = yield from _possible(window, candidate, per_sample, tried)
+        if candidate.additive:
+            parts = (candidate.into_state, candidate.into_output)
+            unit: Any = tuple(np.broadcast_to(part, (window.count, *part.shape)) for part in parts)
+        else:
+            assert faults is not None
+            unit = faults.additions(candidate, window.count, 0, window.u)
+        found = yield from _possible(window, candidate, unit, tried)
         factors[candidate.label], where[candidate.label], proofs[candidate.label] = found
     status = "" if solution.status in (Status.OPTIMAL, Status.LOCAL) else f"{solution.status}: {solution.reason}"
-    result = Membership(factor, proof, factors, where, proofs, untested, window, status)
-    bound = solution.bound or Bound(-np.inf, False, "none", solution.reason)
-    return Evidence(result, factor, bound, solution.status, solution.reason,
+    shown = solution.bound.multipliers if solution.has_point and solution.bound is not None else None
+    result = Membership(factor, shown, factors, where, proofs, untested, window, status)
+    return Evidence(result, factor, solution.bound or Bound.none(solution.reason), solution.status, solution.reason,
                     {"least factor of the bounds": factor, "candidates possible": len(result.consistent)})
 
 
-def _possible(window: BoundedWindow, candidate: Candidate, per_sample: Signature, tried: list[int] | None
+def _possible(window: BoundedWindow, candidate: Candidate, unit: Signature, tried: list[int] | None
               ) -> Generator[Program, Solution, tuple[float, int | None, dict[tuple[int, int], ParityProof]]]:
     """Return a factor and onset at which a candidate is possible; or the least factor proved, with all proofs.
 
-    The factor is NaN where the solver gave neither.
+    The factor is NaN where the solver gave neither; `unit` is what a unit of the course in each sample adds.
     """
     if tried is None:
-        solution = yield membership_programme(window, _between(candidate, per_sample, 0, window.count))
+        solution = yield _programme(window, _between(candidate, unit, 0, window.count))
         proof = _proof_of(solution)
-        if proof is not None and proof.proved:
-            return proof.factor, None, {(0, window.count - 1): proof}
-        return (solution.objective if solution.has_point else float("nan")), None, {}
+        return (_factor(solution), None, {}) if proof is None else (proof.factor, None, {(0, window.count - 1): proof})
     proofs: dict[tuple[int, int], ParityProof] = {}
     waiting: list[tuple[float, int, int]] = [(0.0, 0, len(tried) - 1)]
     while waiting:
         waiting.sort()  # the smallest factor first: there the candidate may be possible
         _, first, last = waiting.pop(0)
-        a, b = tried[first], tried[last]
-        solution = yield membership_programme(window, _between(candidate, per_sample, a, b))
-        proof = _proof_of(solution)
-        if proof is not None and proof.proved:
-            proofs[a, b] = proof
+        solution = yield _programme(window, _between(candidate, unit, tried[first], tried[last]))
+        proof, middle = _proof_of(solution), (first + last) // 2
+        if proof is not None:
+            proofs[tried[first], tried[last]] = proof
         elif first == last:
-            return (solution.objective if solution.has_point else float("nan")), a, {}
+            return _factor(solution), tried[first], {}
         else:
             value = solution.objective if solution.has_point else 0.0
-            middle = (first + last) // 2
             waiting += [(value, first, middle), (value, middle + 1, last)]
     return min(proof.factor for proof in proofs.values()), None, proofs
 
 
-def _per_sample(faults: Dictionary | None, candidate: Candidate, window: BoundedWindow) -> Signature:
-    """What a unit of the course in each sample adds, (N, n, d) and (N, l, d)."""
-    assert faults is not None
-    if not candidate.additive:
-        return Signature(*faults.additions(candidate, window.count, 0, window.u))
-    parts = (np.broadcast_to(part, (window.count, *part.shape)) for part in
-             (candidate.into_state, candidate.into_output))
-    return Signature(*parts)
+def _factor(solution: Solution) -> float:
+    return solution.objective if solution.has_point else float("nan")
 
 
-def _between(candidate: Candidate, per_sample: Signature, first: int, last: int) -> Signature:
+def _proof_of(solution: Solution) -> ParityProof | None:
+    """Return the proof that the window is impossible, where there is one."""
+    proof = solution.bound.multipliers if solution.has_point and solution.bound is not None else None
+    return proof if proof is not None and proof.proved else None
+
+
+def _between(candidate: Candidate, unit: Signature, first: int, last: int) -> Signature:
     """Columns of which some combination is the fault with any onset from first to last; last = N: any course."""
-    count = len(per_sample.state)
-    k = np.arange(count)
-    courses = [k == at for at in range(first, min(last + (candidate.kind == "jump"), count))]
-    if last < count and candidate.kind != "jump":
-        if candidate.kind == "drift":
-            courses += [np.maximum(k - last + 1, 0)] + [k >= last] * (first < last)
-        else:
-            courses += [k >= last]
+    k, jump = np.arange(len(unit[0])), candidate.kind == "jump"
+    courses = [k == at for at in range(first, min(last + jump, k.size))]
+    if last < k.size and not jump:
+        ramp = candidate.kind == "drift"
+        courses += [np.maximum(k - last + 1, 0)] * ramp + [k >= last] * (not ramp or first < last)
     shapes = np.array(courses, dtype=float)
-    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(count, part.shape[1], -1) for part in per_sample)
+    state, output = (np.einsum("ck,kid->kicd", shapes, part).reshape(k.size, part.shape[1], -1) for part in unit)
     sizes = np.maximum(np.abs(state[1:]).max(axis=(0, 1), initial=0.0), np.abs(output).max(axis=(0, 1), initial=0.0))
     seen = sizes > 0
-    return Signature(state[:, :, seen] / sizes[seen], output[:, :, seen] / sizes[seen])
+    return state[:, :, seen] / sizes[seen], output[:, :, seen] / sizes[seen]
 
 
-def membership_programme(window: BoundedWindow, signature: Signature | None = None) -> Program:
-    """Pose the linear programme of the healthy plant, or with additions of unknown sizes.
-
-    Args:
-        window: the window.
-        signature: the additions.
-    """
+def _programme(window: BoundedWindow, signature: Signature | None = None) -> Program:
+    """Pose the linear programme of the healthy plant, or with additions of unknown sizes."""
     n, count = window.A.shape[0], window.count
     later, earlier = (sp.diags_array(np.ones(count - 1), offsets=k, shape=(count - 1, count)) for k in (1, 0))
     steps = sp.kron(later, np.eye(n)) - sp.kron(earlier, window.A)
@@ -176,10 +159,10 @@ def membership_programme(window: BoundedWindow, signature: Signature | None = No
     variables: dict[str, cp.Variable] = {"t": t, "states": x}
     expressions: dict[str, cp.Expression] = {"t": t, "x": cp.reshape(x, (count, n), order="C")}
     added = np.zeros((level.size, 0))
-    if signature is not None and signature.state.shape[2]:
-        d = signature.state.shape[2]
+    if signature is not None and signature[0].shape[2]:
+        d = signature[0].shape[2]
         variables["size"] = expressions["size"] = cp.Variable(d, name="size")
-        added = np.vstack([signature.state[1:].reshape(-1, d), signature.output.reshape(-1, d)])
+        added = np.vstack([signature[0][1:].reshape(-1, d), signature[1].reshape(-1, d)])
     bounded, exact = np.flatnonzero(known & (bounds > 0)), np.flatnonzero(known & (bounds == 0))
 
     def noise(rows: Array, units: Array) -> Any:
@@ -204,21 +187,18 @@ def _certified(window: BoundedWindow, signature: Signature | None, bounded: Arra
     program.assign(values)
     objective = float(np.asarray(program.objective.expr.value))
     if np.size(duals.get("noise", ())) != 2 * bounded.size:
-        return Bound(-np.inf, False, "parity", "the solver gave no multipliers"), None
+        return Bound.none("the solver gave no multipliers"), None
     weights = np.zeros(bounds.size)
     upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
     if exact.size and np.size(duals.get("no noise", ())) == exact.size:
         weights[exact] = np.asarray(duals["no noise"], dtype=float)
     p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
-    unseen = window.unseen(None, None) if signature is None else window.unseen(signature.state, signature.output)
-    proof = parity_proof(window, p, unseen)
+    proof = parity_proof(window, p, window.unseen(*(signature or (None, None))))
     gap = relative_gap(objective, proof.factor, program.scale)
-    if program.user_constraints:
-        return Bound(proof.factor, False, "parity", "the bound is that without the further constraints",
-                     multipliers=proof), None
-    words = f"parity vector, relative gap {gap:.1e}"
-    return Bound(proof.factor, gap < PROVED, "parity", words, multipliers=proof), None
+    free, words = not program.user_constraints, f"parity vector, relative gap {gap:.1e}"
+    return Bound(proof.factor, free and gap < PROVED, "parity",
+                 words if free else "the bound is that without the further constraints", multipliers=proof), None
 
 
 def _onsets(onsets: Sequence[int] | str, count: int) -> list[int] | None:
@@ -230,9 +210,3 @@ def _onsets(onsets: Sequence[int] | str, count: int) -> list[int] | None:
     if not chosen or chosen[0] < 0 or chosen[-1] >= count:
         raise StructureError(f"onsets: whole numbers from 0 to {count - 1} are needed, one at least.")
     return chosen
-
-
-def _proof_of(solution: Solution) -> ParityProof | None:
-    if not solution.has_point or solution.bound is None:
-        return None
-    return solution.bound.multipliers

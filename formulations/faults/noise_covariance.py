@@ -18,13 +18,13 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.faults.residual import least_squares
 from optid.errors import StructureError, nearest
 from optid.faults.consistency.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
-from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
 
 FORMS = ("places", "full")
@@ -57,62 +57,48 @@ def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", l
     problem = covariance_problem(found, whitened, lags=lags, onset=onset)
     pose = places_programme if form == "places" else full_programme
     solution = yield pose(problem).subject_to(*constraints)
-    ok = solution.status in (Status.OPTIMAL, Status.LOCAL) and solution.proof
-    result = matched(problem, solution, ok)
-    bound = solution.bound or Bound(-np.inf, False, "none", solution.reason)
-    return Evidence(result, solution.objective, bound, solution.status, solution.reason, {"lags": problem.lags})
+    bound = solution.bound or Bound.none(solution.reason)
+    return Evidence(_matched(problem, solution), solution.objective, bound, solution.status, solution.reason,
+                    {"lags": problem.lags})
 
 
 def places_programme(problem: CovarianceProblem) -> Program:
     """Pose the non-negative least-squares problem of the candidates."""
     sizes = np.linalg.norm(problem.signatures, axis=0)
-    scaled, residual = cp.Variable(sizes.size, name="scaled"), cp.Variable(problem.target.size, name="residual")
-    misfit = problem.target - (problem.signatures / sizes) @ scaled
-    view = View({"rho": cp.multiply(1 / sizes, scaled)})
-    return Program(
-        "fault.noise_covariance", cp.Minimize(0.5 * cp.sum_squares(residual)),
-        {"residual": (residual == misfit,), "variances": (scaled >= 0,)}, {"scaled": scaled, "residual": residual},
-        {"scaled": np.maximum((problem.signatures / sizes).T @ problem.target, 1.0)}, dict, view,
-        structural=frozenset({"residual", "variances"}),
-        derived={"residual": misfit}, scale=0.5 * float(problem.target @ problem.target))
+    scaled, units = cp.Variable(sizes.size, name="scaled"), problem.signatures / sizes
+    return least_squares(
+        "fault.noise_covariance", problem.target, units @ scaled, {"scaled": scaled},
+        {"scaled": np.maximum(units.T @ problem.target, 1.0)}, {"rho": cp.multiply(1 / sizes, scaled)},
+        constraints={"variances": (scaled >= 0,)})
 
 
 def full_programme(problem: CovarianceProblem) -> Program:
     """Pose the semidefinite programme of full covariances of the added process and sensor noise."""
     n, l = problem.nx, problem.l  # noqa: E741
     Q, R = cp.Variable((n, n), symmetric=True, name="Q"), cp.Variable((l, l), symmetric=True, name="R")
-    residual = cp.Variable(problem.target.size, name="residual")
-    units = np.sqrt(np.outer(problem.state_units, problem.state_units)), np.sqrt(
-        np.outer(problem.output_units, problem.output_units))
-    process, sensor = cp.multiply(units[0], Q), cp.multiply(units[1], R)
-    misfit = problem.target - problem.by_process @ cp.vec(process, order="F") - problem.by_sensor @ cp.vec(
-        sensor, order="F")
-    return Program(
-        "fault.noise_covariance full", cp.Minimize(0.5 * cp.sum_squares(residual)),
-        {"residual": (residual == misfit,), "process covariance": (Q >> 0,), "sensor covariance": (R >> 0,)},
-        {"Q": Q, "R": R, "residual": residual}, {"Q": np.eye(n), "R": np.eye(l)}, dict,
-        View({"Q": process, "R": sensor}),
-        structural=frozenset({"residual", "process covariance", "sensor covariance"}), derived={"residual": misfit},
-        scale=0.5 * float(problem.target @ problem.target))
+    process, sensor = (cp.multiply(units, one) for units, one in zip(_units(problem), (Q, R)))
+    fit = problem.by_process @ cp.vec(process, order="F") + problem.by_sensor @ cp.vec(sensor, order="F")
+    return least_squares(
+        "fault.noise_covariance full", problem.target, fit, {"Q": Q, "R": R}, {"Q": np.eye(n), "R": np.eye(l)},
+        {"Q": process, "R": sensor}, constraints={"process covariance": (Q >> 0,), "sensor covariance": (R >> 0,)})
 
 
-def matched(problem: CovarianceProblem, solution: Solution, certified: bool) -> CovarianceMatch:
-    """Read the solution.
+def _units(problem: CovarianceProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Units of the entries of Q and of R."""
+    return (np.sqrt(np.outer(problem.state_units, problem.state_units)),
+            np.sqrt(np.outer(problem.output_units, problem.output_units)))
 
-    Args:
-        problem: the numbers.
-        solution: of either programme.
-        certified: whether it is proved.
-    """
+
+def _matched(problem: CovarianceProblem, solution: Solution) -> CovarianceMatch:
+    """Read the solution of either programme."""
     rho, gains, Q, R = np.full(len(problem.labels), np.nan), np.full(len(problem.labels), np.nan), None, None
     if solution.has_point and "scaled" in solution.values:
-        sizes = np.linalg.norm(problem.signatures, axis=0)
         scaled = np.asarray(solution.values["scaled"])
-        scaled = np.where(scaled > NOTHING, scaled, 0.0)
-        rho, gains = scaled / sizes, scaled
+        gains = np.where(scaled > NOTHING, scaled, 0.0)
+        rho = gains / np.linalg.norm(problem.signatures, axis=0)
     elif solution.has_point:
-        Q = np.asarray(solution.values["Q"]) * np.sqrt(np.outer(problem.state_units, problem.state_units))
-        R = np.asarray(solution.values["R"]) * np.sqrt(np.outer(problem.output_units, problem.output_units))
+        Q, R = (np.asarray(solution.values[name]) * units for name, units in zip("QR", _units(problem)))
+    certified = solution.status in (Status.OPTIMAL, Status.LOCAL) and solution.proof
     status = "" if certified else f"{solution.status}: {solution.reason}".rstrip(": ")
     return CovarianceMatch(problem.labels, rho, gains, Q, R, solution.objective, solution.gap, certified, problem.lags,
                            status)

@@ -11,13 +11,13 @@ Named variables: ``a[label]`` (onsets, d); named expressions: ``size[label]`` (o
 """
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
 from formulations.faults.group_bound import certify
+from formulations.faults.residual import least_squares
 from optid.errors import StructureError
 from optid.faults.search.atoms import Atoms, atoms_of
 from optid.faults.search.calibration import Thresholds
@@ -25,7 +25,6 @@ from optid.faults.search.scanning import Scan
 from optid.faults.search.sparse import ActiveGroup, SparseResult
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
-from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 
@@ -46,26 +45,17 @@ def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constrai
         StructureError: a penalty that is not positive, thresholds that do not fit, a window that is too long.
     """
     atoms = atoms_of(found, limits)
-    program = signature_programme(atoms, found.whitened.r.ravel(), penalty).subject_to(*constraints)
+    program = _programme(atoms, found.whitened.r.ravel(), penalty).subject_to(*constraints)
     solution = yield program
-    result = sparse_result(program, solution, atoms, len(found.whitened.r))
-    none = Bound(-np.inf, False, "none", solution.reason)
-    return Evidence(result, solution.objective, solution.bound or none, solution.status, solution.reason,
+    result = _sparse_result(program, solution, atoms, len(found.whitened.r))
+    return Evidence(result, solution.objective, solution.bound or Bound.none(solution.reason), solution.status,
+                    solution.reason,
                     {"groups active": len(result.active), "clusters": len(result.clusters),
                      "relative gap": result.gap, "smallest penalty without a fault": result.largest})
 
 
-def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 1.0) -> Program:
-    """Pose the programme.
-
-    Args:
-        atoms: of every candidate.
-        r: (N l,) the window.
-        penalty: lambda.
-
-    Raises:
-        StructureError: a penalty that is not positive, or nothing to look for.
-    """
+def _programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float) -> Program:
+    """Pose the programme of a window r (N l,)."""
     if not (np.isfinite(penalty) and penalty > 0):
         raise StructureError(f"penalty={penalty!r}; a positive number is needed.")
     if not atoms:
@@ -76,19 +66,14 @@ def signature_programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float = 
     designs = [np.moveaxis(atom.axes, 1, 0).reshape(r.size, -1) for atom in atoms]
     fit: Any = sum(design @ cp.vec(a, order="C") for design, a in zip(designs, variables.values()))
     norms: Any = sum(np.sqrt(atom.threshold) * _lengths(a) for atom, a in zip(atoms, variables.values()))
-    edges = np.concatenate([[0], np.cumsum(np.concatenate([[a.dimension] * a.onsets.size for a in atoms]))])
+    edges = np.cumsum([0, *(atom.dimension for atom in atoms for _ in atom.onsets)])
     weights = np.concatenate([np.full(atom.onsets.size, np.sqrt(atom.threshold)) for atom in atoms])
     form = GroupSparseStructure(GroupProblem(np.hstack(designs), r, edges, weights),
-                     {name: a.shape for name, a in variables.items()})
-    residual, misfit = cp.Variable(r.size, name="residual"), r - fit
+                                {name: a.shape for name, a in variables.items()})
     sizes = {f"size[{atom.label}]": _sizes(atom, a) for atom, a in zip(atoms, variables.values())}
-    return Program(
-        "fault.signature", cp.Minimize(0.5 * cp.sum_squares(residual) + level * norms),
-        {"residual": (residual == misfit,)}, {**variables, "residual": residual},
-        {name: _alone(atom, r) for name, atom in zip(variables, atoms)}, dict,
-        View({**variables, **sizes}),
-        structural=frozenset({"residual"}), parameters={"lambda": level}, derived={"residual": misfit}, structure=form,
-        certify=partial(certify), scale=0.5 * float(r @ r))
+    return least_squares(
+        "fault.signature", r, fit, variables, {name: _alone(atom, r) for name, atom in zip(variables, atoms)},
+        {**variables, **sizes}, penalty=level * norms, parameters={"lambda": level}, structure=form, certify=certify)
 
 
 def _alone(atom: Atoms, r: np.ndarray) -> np.ndarray:
@@ -110,24 +95,16 @@ def _sizes(atom: Atoms, a: cp.Variable) -> Any:
     return sum(cp.multiply(atom.back[:, :, j], a[:, [j]] @ ones) for j in range(atom.dimension))
 
 
-def sparse_result(program: Program, solution: Solution, atoms: Sequence[Atoms], count: int) -> SparseResult:
-    """Read the solution; groups that rounding has left of zeros are zeros.
-
-    Args:
-        program: that of `signature_programme`, constrained or not.
-        solution: its solution.
-        atoms: as there.
-        count: samples of the window.
-    """
+def _sparse_result(program: Program, solution: Solution, atoms: Sequence[Atoms], count: int) -> SparseResult:
+    """Read the solution for a window of some samples; groups that rounding has left of zeros are zeros."""
     form = program.structure
     assert isinstance(form, GroupSparseStructure)
     problem, penalty = form.problem, float(np.asarray(program.parameters["lambda"].value))
-    free = not program.user_constraints
+    bound = solution.bound
     certified = bool(solution.has_point and solution.proof and solution.status in (Status.OPTIMAL, Status.LOCAL))
     zero = np.zeros(problem.weights.size, dtype=bool)
-    point = solution.bound.multipliers if solution.bound is not None else None
-    if certified and free and point is not None and solution.bound is not None:
-        zero = problem.certainly_zero(point, solution.objective - solution.bound.value, penalty)
+    if certified and not program.user_constraints and bound is not None and bound.multipliers is not None:
+        zero = problem.certainly_zero(bound.multipliers, solution.objective - bound.value, penalty)
     active: list[ActiveGroup] = []
     masks = {atom.label: np.zeros(count, dtype=bool) for atom in atoms}
     norms = problem.norms(form.flat(solution.values)) if solution.has_point else np.zeros(problem.weights.size)
@@ -142,6 +119,6 @@ def sparse_result(program: Program, solution: Solution, atoms: Sequence[Atoms], 
         first += atom.onsets.size
     active.sort(key=lambda group: -group.deflection)
     return SparseResult(tuple(active), count, solution.objective,
-                        -np.inf if solution.bound is None else solution.bound.value, solution.gap, certified,
+                        -np.inf if bound is None else bound.value, solution.gap, certified,
                         problem.largest(), penalty, masks, f"{solution.status}: {solution.reason}".rstrip(": "),
                         solution.solver, tuple(program.user_constraints))

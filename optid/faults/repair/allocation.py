@@ -234,13 +234,11 @@ class Allocation:
         gain, centre = self.problem.members[0].gain(), self.problem.members[0].rest_output(self.problem.middle)
         edges = (gain * ((self.problem.high - self.problem.low) / 2)).T
         edges = edges[np.linalg.norm(edges, axis=1) > 0]
-        if not len(edges):
-            return centre[None, :]
-        edges = np.where((edges[:, [1]] < 0) | ((edges[:, [1]] == 0) & (edges[:, [0]] < 0)), -edges, edges)
-        edges = edges[np.argsort(np.arctan2(edges[:, 1], edges[:, 0]))]
-        start = centre - edges.sum(axis=0)
-        half = start + np.vstack([np.zeros(2), 2 * np.cumsum(edges, axis=0)])
-        return np.asarray(np.vstack([half, 2 * centre - half[1:-1]]) if len(edges) > 1 else half)
+        angles = np.arctan2(edges[:, 1], edges[:, 0])
+        flipped = (angles < 0) | (angles == np.pi)  # every edge points into the upper half plane
+        edges = np.where(flipped[:, None], -edges, edges)[np.argsort(angles % np.pi)]
+        half = centre - edges.sum(axis=0) + np.vstack([np.zeros(2), 2 * np.cumsum(edges, axis=0)])
+        return np.vstack([half, 2 * centre - half[1:-1]]) if len(edges) > 1 else half
 
     @cached_property
     def moving(self) -> tuple[str, ...]:

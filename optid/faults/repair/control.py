@@ -192,14 +192,11 @@ class Controller:
             assert self._z is not None
             for k, v in enumerate(self._z.reshape(self.horizon, -1)):
                 near = u[k] = a.inputs(v, near)
-        states, columns, outputs = [x], [], []
-        member = a.problem.members[0]
+        one, states, columns, outputs = a.problem.members[0], [x], [], []
         for now in u:
-            x, v = states[-1], a.columns(now, np.zeros(a.model.l))
-            y = member.C @ x + member.D @ v + member.c
-            v = a.columns(now, y)
-            states.append(member.A @ x + member.B @ v + member.d)
-            columns.append(v)
+            y = one.C @ states[-1] + one.D @ a.columns(now, np.zeros(a.model.l)) + one.c  # g(y) adds to no output
+            columns.append(a.columns(now, y))
+            states.append(one.A @ states[-1] + one.B @ columns[-1] + one.d)
             outputs.append(y)
         return {"u": u, "v": np.array(columns), "x": np.array(states), "y": np.array(outputs)}
 

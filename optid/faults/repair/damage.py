@@ -120,76 +120,60 @@ def merged(broken: list[Damage]) -> list[Damage]:
 
 
 def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posterior: float) -> Damage:
+    """Add up what the faults at some places break."""
     r, n = len(model.nonlinearities), model.nx
-    columns: list[int] = []
-    dead: list[int] = []
-    sensors: list[str] = []
-    offsets: list[Candidate] = []
+    found: dict[str, list[Any]] = {"columns": [], "dead": [], "sensors": [], "offsets": [], "notes": []}
     louder: dict[str, float] = {}
     states, gains, constants, added = np.zeros((n, n)), np.ones(r), np.zeros(r), np.zeros(n)
-    notes: list[str] = []
+    notes = found["notes"]
     for place, fault in parts:
         part, _, channel = place.partition(":")
         size = np.asarray(fault.size, dtype=float)
         known = bool(np.all(np.isfinite(size)))
+        into_state = fault.candidate.into_state
         if fault.kind == "spike":
             notes.append(f"{channel}: single readings were wrong; nothing is broken")
         elif part == "actuator":
-            c = channel_of(model.inputs, place)
-            mine = [i for i, of in enumerate(model.input_of) if of == c]
-            columns += mine
-            _actuator(fault, mine, size, known, gains, constants, dead, notes, channel)
+            mine = [i for i, of in enumerate(model.input_of) if of == channel_of(model.inputs, place)]
+            found["columns"] += mine
+            if fault.kind == "drift":
+                notes.append(f"{channel}: a drift goes on growing; the model holds the mean since its onset")
+            if known and fault.kind in ("bias", "drift"):
+                constants[mine] += size
+            elif known:
+                gains[mine] = float(np.clip(1 - size[0], 0.0, 1.0))
+                if len(size) == 1 + len(mine):
+                    constants[mine] += size[1:]
+                low, high = np.asarray(fault.size_interval, dtype=float)[0]
+                if size[0] >= DEAD_SHARE and low <= 1 <= high or fault.kind == "frozen":
+                    found["dead"] += mine
+                    gains[mine] = 0.0
+                    notes.append(f"{channel}: nothing of its effect is left within the interval of the share lost: "
+                                 "hard-over")
         elif part == "sensor":
-            o = channel_of(model.outputs, place)
+            name = model.outputs[channel_of(model.outputs, place)]
             if fault.kind == "noise" and known:
-                louder[model.outputs[o]] = float(np.max(np.abs(size)))
+                louder[name] = float(np.max(np.abs(size)))
             else:
-                sensors.append(model.outputs[o])
+                found["sensors"].append(name)
                 if fault.kind == "bias" and known:
                     notes.append(f"{channel}: its readings were off by {size[0]:.4g}; they are not used")
         elif fault.kind == "noise":
-            where = fault.candidate.into_state
-            if known:
-                states = states + where * size**2 @ where.T
+            states = states + into_state * size**2 @ into_state.T if known else states
         elif fault.kind == "jump":
             notes.append("the state jumped once: the plant is as it was, the observer starts anew")
         else:
-            own = replace(
-                fault.candidate, kind=fault.kind, members=(fault.candidate.members or (place,)), name=place
-            )
-            offsets.append(own)
+            found["offsets"].append(replace(fault.candidate, kind=fault.kind, name=place,
+                                            members=fault.candidate.members or (place,)))
             if fault.kind == "drift":
                 notes.append(f"{place}: a drift goes on growing; the model holds its last value")
             elif known:
-                added = added + fault.candidate.into_state @ size
+                added = added + into_state @ size
     onsets = [fault.onset for _, fault in parts]
     label = " + ".join(place if fault.kind in ("bias", "jump") else f"{place} {fault.kind}" for place, fault in parts)
-    return Damage(
-        label, posterior, max(onsets), min(onsets) == max(onsets), tuple(dict.fromkeys(columns)),
-        tuple(dict.fromkeys(dead)), tuple(dict.fromkeys(sensors)), tuple(offsets), louder, states, gains, constants,
-        added, tuple(notes),
-    )
-
-
-def _actuator(fault: Any, mine: list[int], size: Array, known: bool, gains: Array, constants: Array, dead: list[int],
-              notes: list[str], channel: str) -> None:
-    """Write down what a fault of an actuator does to its functions."""
-    if fault.kind in ("bias", "drift"):
-        if known:
-            constants[mine] += size
-        if fault.kind == "drift":
-            notes.append(f"{channel}: a drift goes on growing; the model holds the mean since its onset")
-        return
-    if not known:
-        return
-    gains[mine] = float(np.clip(1 - size[0], 0.0, 1.0))
-    if len(size) == 1 + len(mine):
-        constants[mine] += size[1:]
-    low, high = np.asarray(fault.size_interval, dtype=float)[0]
-    if size[0] >= DEAD_SHARE and low <= 1 <= high or fault.kind in ("frozen",):
-        dead.extend(mine)
-        gains[mine] = 0.0
-        notes.append(f"{channel}: nothing of its effect is left within the interval of the share lost: hard-over")
+    once: dict[str, Any] = {name: tuple(dict.fromkeys(values)) for name, values in found.items() if name != "offsets"}
+    return Damage(label, posterior, max(onsets), min(onsets) == max(onsets), offsets=tuple(found["offsets"]),
+                  louder_sensors=louder, louder_states=states, gains=gains, constants=constants, added=added, **once)
 
 
 def check_answers(diagnosis: Any) -> None:

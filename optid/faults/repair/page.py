@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from optid import __version__
-from optid.faults.repair.reformulation import Reformulation
+from optid.faults.repair.reformulation import HEADS, Reformulation
 from optid.faults.repair.schedule import fit_words
-from optid.faults.repair.words import HEADS, member_lines
 from optid.show.page import figure, template, versions
 from optid.show.wording import Table, number
 
@@ -27,9 +26,8 @@ def write(found: Reformulation, path: str | Path, *, record: str = "", command: 
     Raises:
         OSError: the file cannot be written.
     """
-    path = Path(path)
-    path.write_text(render(found, record=record, command=command), encoding="utf-8")
-    return path
+    Path(path).write_text(render(found, record=record, command=command), encoding="utf-8")
+    return Path(path)
 
 
 def render(found: Reformulation, *, record: str = "", command: str = "") -> str:
@@ -49,9 +47,7 @@ def render(found: Reformulation, *, record: str = "", command: str = "") -> str:
         "notes": list(dict.fromkeys(note for note in found.notes)),
         "tables": _tables(found),
         "figures": [figure("reformulation", found.plot, caption)],
-        "members": [
-            {"title": member.label, "text": "\n".join(member_lines(member)[1:])} for member in found.members
-        ],
+        "members": [{"title": member.label, "text": str(member)} for member in found.members],
         "call": command or "optid.faults.reformulate(model, diagnosis, data)",
         "versions": versions(),
         "text": str(found),
@@ -105,15 +101,11 @@ def _tables(found: Reformulation) -> list[Table]:
             f"record says of the values it visits {one.excitation:.3g}. Standard errors do not count the rules."
         )
         tables.append(Table(f"Effect of {one.name}", ("input", "before", "now", "standard error", ""), rows, note))
-    noise = found.healthy.noise
-    if not found.observer.lost:  # nothing has changed of what the sensors say
+    seen = found.observer
+    if not seen.lost:  # nothing has changed of what the sensors say
         return tables
-    assert noise is not None
-    rows = [
-        (name, "not used" if name in found.observer.lost else "used", number(value, 3),
-         number(float(np.sqrt(noise.R[o, o])), 3), number(found.observer.open_loop[name], 3))
-        for o, (name, value) in enumerate(found.observer.rmse.items())
-    ]
+    rows = [(name, "not used" if name in seen.lost else "used", number(value, 3), number(seen.noise[name], 3),
+             number(seen.open_loop[name], 3)) for name, value in seen.rmse.items()]
     tables.append(Table(
         "Outputs", ("output", "sensor", "predicted RMSE", "noise of the sensor", "RMSE of a simulation"), rows,
         "Of the outputs without their noise, from the Riccati equation of the filter on the sensors that are used.",

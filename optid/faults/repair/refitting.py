@@ -218,7 +218,8 @@ class Refitting:
     def held_out(self, samples: int) -> "Refitting":
         """Return the same without the last samples of the last window."""
         last = self.windows[-1]
-        shorter = Window(*(part[: len(last.u) - samples] for part in last[:4]), *last[4:])
+        u, y, present, fed = (part[: len(last.u) - samples] for part in last[:4])
+        shorter = last._replace(u=u, y=y, present=present, fed=fed)
         return replace(self, windows=(*self.windows[:-1], shorter))
 
     def covariance(self, sensitivities: Array) -> Array:
@@ -228,7 +229,7 @@ class Refitting:
         """
         rows, _ = self.believed()
         rows = np.vstack([rows, np.pad(sensitivities, ((0, 0), (0, len(self.curves))))])
-        free = np.flatnonzero(np.append(~self.held, np.ones(len(self.curves), dtype=bool)))
+        free = np.flatnonzero(np.append(np.logical_not(self.held), np.ones(len(self.curves), dtype=bool)))
         found = np.zeros((rows.shape[1],) * 2)
         found[np.ix_(free, free)] = np.linalg.pinv(rows[:, free].T @ rows[:, free], hermitian=True)
         return found[: self.start.size, : self.start.size]
@@ -275,8 +276,9 @@ class Refitting:
         if "x0" in self.slices:
             first = self.slices["x0"].start + number * model.nx
             into_state[0, :, first : first + model.nx] = np.eye(model.nx)
-        response = steady.whitened(steady.respond(into_state, into_output, shown), shown)
-        return steady.whitened(innovations, shown)[shown], -response[shown]
+        response: Any = steady.whitened(steady.respond(into_state, into_output, shown), shown)
+        white: Any = steady.whitened(innovations, shown)
+        return white[shown], -response[shown]
 
     def _additions(self, model: "HammersteinSS", w: Window, f: Array, states: Array) -> tuple[Array, Array]:
         """What a unit of every unknown adds to the states (N, n, q) and to the outputs (N, l, q)."""

@@ -3,6 +3,7 @@
 Everything here is a pure function of a healthy model and a diagnosis; the healthy model is never changed.
 """
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, check_integer
+from optid.arrays import check_integer
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.records import record_of
@@ -19,13 +20,21 @@ from optid.faults.repair.ambiguity import Ambiguity, advise
 from optid.faults.repair.damage import Damage, check_answers, damages, merged
 from optid.faults.repair.refitting import NODES, Prior
 from optid.faults.repair.schedule import Schedule, refit
-from optid.faults.repair.virtual_sensor import Observer, observer
+from optid.faults.repair.virtual_sensor import Observer, observer, without_sensors
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from optid.faults.diagnosis.answers import Diagnosis
     from optid.models import HammersteinSS
+
+HEADS = {
+    "healthy": "healthy: the plant is as it was",
+    "refitted": "one explanation; the model is refitted",
+    "as diagnosed": "one explanation; the model is what the diagnosis says",
+    "ambiguous": "several explanations; the model stays the healthy one until one is left",
+}
+"""What the statuses mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +61,11 @@ class MemberModel:
     def label(self) -> str:
         """What it is called."""
         return self.damage.label
+
+    def __str__(self) -> str:
+        """Say what is left of the plant if this explanation is right."""
+        parts = [one for one in (self.schedule, self.observer, self.allocation) if one is not None]
+        return "\n".join([*map(str, parts), *(f"note: {note}" for note in self.notes)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +125,14 @@ class Reformulation:
 
     def __str__(self) -> str:
         """Say what is left of the plant, in 80 columns."""
-        from optid.faults.repair.words import printed
-
-        return printed(self)
+        told = (self.schedule, self.if_ambiguous, *((self.observer, self.allocation) if self.members else ()))
+        heads = [f"{one.label} (probability {one.damage.posterior:.3g})" for one in self.members]
+        text = "\n".join([HEADS[self.status], *heads, *(str(one) for one in told if one is not None)])
+        known = {line.strip() for line in text.splitlines()}
+        lines = text.splitlines() + [f"note: {note}" for note in self.notes if note.strip() not in known]
+        return "\n".join(
+            textwrap.fill(line, 80, subsequent_indent=" " * (len(line) - len(line.lstrip()) + 4),
+                          break_long_words=False, break_on_hyphens=False) for line in lines)
 
 
 def reformulate(
@@ -155,46 +174,58 @@ def reformulate(
     Warns:
         DataWarning: too few samples for a refit; values that no sample supports; a nonlinearity without an inverse.
     """
-    _check(model, diagnosis)
+    _check(model, diagnosis, stage, nodes, if_ambiguous)
     if data is not None and not isinstance(data, Data):
         data = record_of(model, data)
-    _check_words(stage, nodes, if_ambiguous)
-    bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "route": route, "solver": solver}
+    bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "solver": solver}
+
+    def allocated(plant: "HammersteinSS") -> tuple[Allocation | None, list[str]]:
+        """Return the allocation, or why there is none: inputs without an interval, when no bounds are given."""
+        for f, c in zip(plant.nonlinearities, plant.input_of):
+            if f.basis.interval is None and (low is None or high is None):
+                return None, [f"no allocation: input {plant.inputs[c]} has no range; give low= and high="]
+        found = allocate(plant, route=route, **bounds)
+        return found, list(found.messages)
+
     if diagnosis.verdict == "healthy":
-        allocation, notes = _allocated(model, bounds)
+        allocation, notes = allocated(model)
         return Reformulation("healthy", model, model, observer(model), allocation, None, (), None, tuple(notes))
     check_answers(diagnosis)
-    broken = merged([one for answer in diagnosis.candidates for one in damages(model, answer)])
-    how: dict[str, Any] = {
-        "constraints": constraints, "prior": prior, "nodes": nodes, "stage": stage, "solver": solver, "seed": seed,
-    }
-    members = tuple(_member(model, one, data, how, bounds) for one in broken)
+    broken, members = merged([one for answer in diagnosis.candidates for one in damages(model, answer)]), []
+    for damage in broken:
+        watched, schedule = damage.with_noise(model), None
+        plant = damage.believed(watched)
+        if damage.needs_refit and data is not None:
+            plant, schedule = refit(
+                watched, without_sensors(data, damage.sensors), damage, constraints=constraints, prior=prior,
+                nodes=nodes, stage=stage, solver=solver, seed=seed)
+        allocation, notes = allocated(plant)
+        if damage.needs_refit and data is None:
+            notes.append("no record: the plant is what the diagnosis says")
+        members.append(MemberModel(damage, plant, observer(plant, damage.sensors), allocation, schedule,
+                                   (*damage.notes, *notes)))
     if len(members) == 1:
         only = members[0]
         refitted = only.schedule is not None and only.schedule.stage != "prior"
-        return Reformulation(
-            "refitted" if refitted else "as diagnosed", model, only.model, only.observer, only.allocation,
-            only.schedule, members, None, only.notes,
-        )
+        return Reformulation("refitted" if refitted else "as diagnosed", model, only.model, only.observer,
+                             only.allocation, only.schedule, (only,), None, only.notes)
     distrusted = sorted({name for one in broken for name in one.sensors})
-    kept = distrusted if len(distrusted) < model.l else []
-    notes = []
-    if distrusted and not kept:
-        notes.append("every sensor is suspected by some member: all are used until one is left")
-    allocation, more = _allocated(model, bounds)
+    allocation, notes = allocated(model)
+    if len(distrusted) == model.l:
+        distrusted = []
+        notes = ["every sensor is suspected by some member: all are used until one is left", *notes]
     robust, why_not = None, ""
     try:
-        robust = robust_allocation(model, broken, low=low, high=high, weights=weights, solver=solver)
+        robust = robust_allocation(model, broken, **bounds)
     except StructureError as error:
         why_not = str(error)
     u = None if data is None else np.asarray(data.raw().experiments[0].u)
     advice = advise(model, broken, u, robust, why_not, action=if_ambiguous, seed=seed)
-    return Reformulation(
-        "ambiguous", model, model, observer(model, kept), allocation, None, members, advice, (*notes, *more)
-    )
+    return Reformulation("ambiguous", model, model, observer(model, distrusted), allocation, None, tuple(members),
+                         advice, tuple(notes))
 
 
-def _check(model: Any, diagnosis: Any) -> None:
+def _check(model: Any, diagnosis: Any, stage: str, nodes: int, if_ambiguous: str) -> None:
     if getattr(model, "kind", "") != "HammersteinSS":
         raise StructureError(
             f"A {getattr(model, 'title', type(model).__name__)} cannot be reformulated: a state-space model with noise "
@@ -208,50 +239,8 @@ def _check(model: Any, diagnosis: Any) -> None:
         raise DataError(
             f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}."
         )
-
-
-def _check_words(stage: str, nodes: int, if_ambiguous: str) -> None:
     for word, given, known in (("stage", stage, ("auto", "affected only", "all with prior")),
                                ("if_ambiguous", if_ambiguous, ("auto", "wait", "probe", "robust"))):
         if given not in known:
             raise StructureError(f"{word}={given!r}: use one of {', '.join(map(repr, known))}.")
     check_integer(nodes, "nodes", 3)
-
-
-def _member(model: "HammersteinSS", damage: Damage, data: Data | None, how: dict[str, Any], bounds: dict[str, Any]
-            ) -> MemberModel:
-    watched = damage.with_noise(model)
-    schedule = None
-    plant = damage.believed(watched)
-    if damage.needs_refit and data is not None:
-        plant, schedule = refit(watched, _trusted(data, damage.sensors), damage, **how)
-    seen = observer(plant, damage.sensors)
-    allocation, notes = _allocated(plant, bounds)
-    if damage.needs_refit and data is None:
-        notes.append("no record: the plant is what the diagnosis says")
-    return MemberModel(damage, plant, seen, allocation, schedule, (*damage.notes, *notes))
-
-
-def _trusted(data: Data, sensors: Sequence[str]) -> Data:
-    """Return the record without the readings of broken sensors."""
-    gone = [o for o, name in enumerate(data.outputs) if name in sensors]
-    if not gone:
-        return data
-
-    def without(y: Array) -> Array:
-        left = np.array(y, dtype=float)
-        left[:, gone] = np.nan
-        return left
-
-    return data.mapped(lambda u: u, without)
-
-
-def _allocated(model: "HammersteinSS", bounds: dict[str, Any]) -> tuple[Allocation | None, list[str]]:
-    """Return the allocation, or why there is none: inputs without an interval, when no bounds are given."""
-    unbounded = [
-        model.inputs[c] for f, c in zip(model.nonlinearities, model.input_of) if f.basis.interval is None
-    ]
-    if unbounded and (bounds["low"] is None or bounds["high"] is None):
-        return None, [f"no allocation: input {unbounded[0]} has no range; give low= and high="]
-    found = allocate(model, **bounds)
-    return found, list(found.messages)

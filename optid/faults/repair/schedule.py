@@ -110,12 +110,9 @@ def refit(
     Warns:
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.
     """
-    how: dict[str, Any] = {
-        "damaged": damage.columns, "offsets": damage.offsets, "prior": prior, "nodes": nodes,
-        "known_start": damage.same_onset, "dead": damage.dead,
-    }
     try:
-        narrow = refitting(model, data, damage.onset, **how)
+        narrow = refitting(model, data, damage.onset, damaged=damage.columns, offsets=damage.offsets, prior=prior,
+                           nodes=nodes, known_start=damage.same_onset, dead=damage.dead)
     except RankError as error:
         warnings.warn(f"{damage.label}: no refit. {error}", DataWarning, stacklevel=3)
         counted = sum(1 if i in damage.dead else nodes for i in damage.columns) + sum(
@@ -126,7 +123,6 @@ def refit(
         return damage.believed(model), none
     if prior is None and narrow.curves:
         narrow = replace(narrow, prior=likeliest(narrow))
-        how["prior"] = narrow.prior
     scores: dict[str, float] = {}
     reason = "as asked for"
     if stage == "auto":

@@ -42,33 +42,30 @@ class Observer:
         lost: names of the outputs that are not used.
         correction: (n, l) gain of the correction by the readings of the same sample.
         error: (n, n) covariance of the error of the corrected state.
-        predicted_error: (n, n) covariance before the correction.
     """
 
     model: "HammersteinSS"
     lost: tuple[str, ...]
     correction: Array
     error: Array
-    predicted_error: Array
 
     @property
     def rmse(self) -> dict[str, float]:
         """Predicted root mean square error of every output without its noise, in its units."""
-        return self._sizes(self.error)
+        return _output_errors(self.model, self.error)
 
     @property
     def open_loop(self) -> dict[str, float]:
         """The same of a simulation that no sensor corrects; inf for a plant that is not stable."""
-        from scipy.linalg import solve_discrete_lyapunov
-
-        assert self.model.noise is not None
         if not self.model.is_stable:
             return dict.fromkeys(self.model.outputs, float("inf"))
-        return self._sizes(np.asarray(solve_discrete_lyapunov(self.model.A, self.model.noise.Q)))
+        return _output_errors(self.model, _uncorrected(self.model))
 
-    def _sizes(self, covariance: Array) -> dict[str, float]:
-        squares = np.einsum("oi,ij,oj->o", self.model.C, covariance, self.model.C)
-        return dict(zip(self.model.outputs, np.sqrt(np.maximum(squares, 0.0)).tolist()))
+    @property
+    def noise(self) -> dict[str, float]:
+        """Standard deviation of the noise of every sensor."""
+        assert self.model.noise is not None
+        return dict(zip(self.model.outputs, np.sqrt(np.diag(self.model.noise.R)).tolist()))
 
     def estimate(self, data: Data, x0: Any = "fit") -> Any:
         """Return the outputs without their noise (N, l), from the surviving sensors up to the same sample.
@@ -80,15 +77,7 @@ class Observer:
         Returns:
             (N, l); a tuple of such arrays for several experiments.
         """
-        raw = in_units_of(self.model, data)
-        gone = [o for o, name in enumerate(self.model.outputs) if name in self.lost]
-
-        def without(y: Array) -> Array:
-            left = np.array(y, dtype=float)
-            left[:, gone] = np.nan
-            return left
-
-        seen = raw.mapped(lambda u: u, without)
+        seen = without_sensors(in_units_of(self.model, data), self.lost)
         predicted = self.model.predict(seen, x0=x0)
         found = []
         for part, p in zip(seen.experiments, predicted if isinstance(predicted, tuple) else (predicted,)):
@@ -99,17 +88,28 @@ class Observer:
     def __str__(self) -> str:
         """Say what is lost and how far each output will be off."""
         head = f"filter without {', '.join(self.lost)}" if self.lost else "filter on all sensors"
-        rows = [
-            f"  {name}: predicted RMSE {value:.4g}" + (
-                f" (its own noise {self._noise(name):.4g}, simulation {self.open_loop[name]:.4g})"
-            ) for name, value in self.rmse.items() if name in self.lost
-        ]
+        rows = [f"  {name}: predicted RMSE {self.rmse[name]:.4g} (its own noise {self.noise[name]:.4g}, simulation "
+                f"{self.open_loop[name]:.4g})" for name in self.lost]
         return "\n".join([head, *rows])
 
-    def _noise(self, name: str) -> float:
-        assert self.model.noise is not None
-        o = self.model.outputs.index(name)
-        return float(np.sqrt(self.model.noise.R[o, o]))
+
+def without_sensors(data: Data, names: Sequence[str]) -> Data:
+    """Return the record without the readings of some sensors."""
+    gone = np.isin(data.outputs, names)
+    return data.mapped(lambda u: u, lambda y: np.where(gone, np.nan, y)) if gone.any() else data
+
+
+def _output_errors(model: "HammersteinSS", covariance: Array) -> dict[str, float]:
+    squares = np.einsum("oi,ij,oj->o", model.C, covariance, model.C)
+    return dict(zip(model.outputs, np.sqrt(np.maximum(squares, 0.0)).tolist()))
+
+
+def _uncorrected(model: "HammersteinSS") -> Array:
+    """Covariance (n, n) of the state of a stable plant."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    assert model.noise is not None
+    return np.asarray(solve_discrete_lyapunov(model.A, model.noise.Q))
 
 
 def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
@@ -129,38 +129,26 @@ def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
             "The model has no noise covariances, and the best filter depends on them: estimate them with "
             "optid.noise.with_noise(model, data)."
         )
-    gone = sorted({channel_of(model.outputs, name if ":" in name else f":{name}") for name in lost})
-    left = [o for o in range(model.l) if o not in gone]
-    names = tuple(model.outputs[o] for o in gone)
-    check_detectable(model, left)
-    noise, n = model.noise, model.nx
-    K, correction = np.zeros((n, model.l)), np.zeros((n, model.l))
-    if left:
-        C, R, S = model.C[left], noise.R[np.ix_(left, left)], noise.S[:, left]
-        steady = kalman_gain(model.A, C, noise.Q, R, S)
-        K[:, left] = steady.K
-        gain = np.linalg.solve(steady.innovation, C @ steady.error).T
-        correction[:, left] = gain
-        before, after = steady.error, steady.error - gain @ steady.innovation @ gain.T
-    else:
-        from scipy.linalg import solve_discrete_lyapunov
-
-        before = after = np.asarray(solve_discrete_lyapunov(model.A, noise.Q))
-    return Observer(replace(model, K=K), names, correction, (after + after.T) / 2, before)
-
-
-def check_detectable(model: "HammersteinSS", left: Sequence[int]) -> None:
-    """Refuse when a mode that does not decay is seen by no sensor that is left.
-
-    Raises:
-        StructureError: with the mode.
-    """
-    mode = hidden_mode(model.A, model.C[list(left)])
-    if mode is not None:
+    names = _names(model, lost)
+    left = [o for o, name in enumerate(model.outputs) if name not in names]
+    mode = _hidden_mode(model.A, model.C[left])
+    if mode:
+        words = ", ".join(f"sensor {name}" for name in names) or "more sensors"
         raise StructureError(
-            f"Without {_others(model.outputs, left)} the {_named(*mode)} is seen by no sensor and does not decay: the "
-            "damaged plant is not detectable, and no observer can follow it. Repair the sensor, or measure this mode."
+            f"Without {words} the {mode} is seen by no sensor and does not decay: the damaged plant is not detectable, "
+            "and no observer can follow it. Repair the sensor, or measure this mode."
         )
+    noise, shape = model.noise, (model.nx, model.l)
+    K, correction = np.zeros(shape), np.zeros(shape)
+    if left:
+        C = model.C[left]
+        steady = kalman_gain(model.A, C, noise.Q, noise.R[np.ix_(left, left)], noise.S[:, left])
+        K[:, left], gain = steady.K, np.linalg.solve(steady.innovation, C @ steady.error).T
+        correction[:, left] = gain
+        error = steady.error - gain @ steady.innovation @ gain.T
+    else:
+        error = _uncorrected(model)
+    return Observer(replace(model, K=K), names, correction, (error + error.T) / 2)
 
 
 def check_stabilisable(model: "HammersteinSS", left: Sequence[int]) -> None:
@@ -173,37 +161,32 @@ def check_stabilisable(model: "HammersteinSS", left: Sequence[int]) -> None:
     Raises:
         StructureError: with the mode.
     """
-    mode = hidden_mode(model.A.T, model.B[:, list(left)].T)
-    if mode is not None:
-        lost = sorted({model.input_of[i] for i in range(len(model.input_of)) if i not in left})
+    mode = _hidden_mode(model.A.T, model.B[:, list(left)].T)
+    if mode:
+        lost = sorted({c for i, c in enumerate(model.input_of) if i not in left})
         words = ", ".join(f"actuator {model.inputs[c]}" for c in lost) or "any actuator"
         raise StructureError(
-            f"Without {words} the {_named(*mode)} is moved by no actuator and does not decay: the damaged plant is "
-            "not stabilisable, and no controller can hold it."
+            f"Without {words} the {mode} is moved by no actuator and does not decay: the damaged plant is not "
+            "stabilisable, and no controller can hold it."
         )
 
 
-def hidden_mode(A: Array, C: Array) -> tuple[complex, int] | None:
-    """Return the first mode on or outside the unit circle that C does not see, and the state it is largest in."""
-    values, vectors = np.linalg.eig(A)
-    for value, vector in zip(values, vectors.T):
-        if abs(value) < 1 - MARGINAL:
-            continue
-        rows = np.vstack([value * np.eye(len(A)) - A, C.reshape(-1, len(A))])
-        sizes = np.linalg.svd(rows, compute_uv=False)
-        if sizes[-1] < UNSEEN * sizes[0]:
-            return complex(value), int(np.argmax(np.abs(vector)))
-    return None
+def _hidden_mode(A: Array, C: Array) -> str:
+    """Name the first mode on or outside the unit circle that C does not see, and the state it is largest in."""
+    for value, vector in zip(*(part.T for part in np.linalg.eig(A))):
+        sizes = np.linalg.svd(np.vstack([value * np.eye(len(A)) - A, C]), compute_uv=False)
+        if abs(value) >= 1 - MARGINAL and sizes[-1] < UNSEEN * sizes[0]:
+            value = complex(value)
+            shown = f"{value.real:.4g}" if abs(value.imag) < 1e-12 else f"{value.real:.4g} ± {abs(value.imag):.4g}i"
+            state = int(np.argmax(np.abs(vector))) + 1
+            return f"mode at {shown} (modulus {abs(value):.4g}, largest in state x{state})"
+    return ""
 
 
-def _named(value: complex, state: int) -> str:
-    shown = f"{value.real:.4g}" if abs(value.imag) < 1e-12 else f"{value.real:.4g} ± {abs(value.imag):.4g}i"
-    return f"mode at {shown} (modulus {abs(value):.4g}, largest in state x{state + 1})"
-
-
-def _others(names: Sequence[str], left: Sequence[int]) -> str:
-    lost = [f"sensor {name}" for o, name in enumerate(names) if o not in left]
-    return ", ".join(lost) or "more sensors"
+def _names(model: "HammersteinSS", lost: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of outputs, given with their part or without, in their order."""
+    places = sorted({channel_of(model.outputs, name if ":" in name else f":{name}") for name in lost})
+    return tuple(model.outputs[o] for o in places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,13 +221,10 @@ class LearntSensor:
 
     def estimate(self, data: Data) -> Any:
         """Return the lost outputs (N, lost); NaN in the first samples and where a sample of the past is missing."""
-        raw = in_units_of(self.model, data)
         found = []
-        for part in raw.experiments:
-            result = np.full((len(part.y), len(self.lost)), np.nan)
-            rows = _stacked(self.model, part.u, part.y, self.lost, self.lags)
-            result[self.lags - 1 :] = rows @ self.weights + self.constant
-            found.append(result)
+        for part in in_units_of(self.model, data).experiments:
+            rows = _stacked(self.model, part.u, part.y, self.lost, self.lags)[0] @ self.weights + self.constant
+            found.append(np.vstack([np.full((self.lags - 1, len(self.lost)), np.nan), rows])[: len(part.y)])
         return one_or_all(found)
 
 
@@ -260,9 +240,10 @@ def conditional_mean(model: "HammersteinSS", data: Data, lost: Sequence[str], *,
     Raises:
         DataError: fewer complete windows than twice the weights, with the length that is needed.
         LookupFailed: an unknown output.
+        StructureError: no output is named.
     """
-    names = _names(model, lost)
-    rows, readings = _learning(model, data, names, lags, 2)
+    names, rows, readings = _learning(model, data, lost, lags, 2)
+    readings = readings[:, : len(names)]
     mean, level = rows.mean(axis=0), readings.mean(axis=0)
     weights = np.linalg.lstsq(rows - mean, readings - level, rcond=1e-10)[0]
     rest = readings - level - (rows - mean) @ weights
@@ -276,68 +257,42 @@ def subspace_projection(
 ) -> LearntSensor:
     """Learn a lost sensor from healthy data: the point of the signal subspace that agrees with what is left.
 
-    Args:
-        model: gives the nonlinearities of the inputs and the order of the plant.
-        data: a healthy record.
-        lost: names of outputs.
-        lags: rows of the stack.
-        rank: dimension of the subspace; lags times the inputs, and the states, by default.
-
-    Raises:
-        DataError: as `conditional_mean`.
-        LookupFailed: an unknown output.
+    Arguments as in `conditional_mean`, as are the errors raised; `rank` is the dimension of the subspace, lags times
+    the inputs and the states by default.
     """
-    names = _names(model, lost)
-    seen, readings = _learning(model, data, names, lags, 1)
-    past = _learning(model, data, names, lags, 1, whole=True)[1]
-    everything = np.hstack([seen, past])
+    names, rows, readings = _learning(model, data, lost, lags, 1)
+    everything, width, count = np.hstack([rows, readings]), rows.shape[1], len(names)
     mean = everything.mean(axis=0)
     axes = np.linalg.svd(everything - mean, full_matrices=False)[2]
-    rank = min(rank or lags * len(model.nonlinearities) + model.nx, len(axes))
-    basis = axes[:rank].T
-    width = seen.shape[1]
-    weights = np.linalg.pinv(basis[:width]).T @ basis[width : width + len(names)].T
-    constant = mean[width : width + len(names)] - mean[:width] @ weights
-    residual = np.std(readings - seen @ weights - constant, axis=0)
+    basis = axes[: rank or lags * len(model.nonlinearities) + model.nx].T
+    weights = np.linalg.pinv(basis[:width]).T @ basis[width : width + count].T
+    constant = mean[width : width + count] - mean[:width] @ weights
+    residual = np.std(readings[:, :count] - rows @ weights - constant, axis=0)
     return LearntSensor(model, names, "subspace", lags, weights, constant, residual)
 
 
-def _names(model: "HammersteinSS", lost: Sequence[str]) -> tuple[str, ...]:
-    places = sorted({channel_of(model.outputs, name if ":" in name else f":{name}") for name in lost})
-    if not places:
+def _learning(model: "HammersteinSS", data: Data, lost: Sequence[str], lags: int, per_weight: int
+              ) -> tuple[tuple[str, ...], Array, Array]:
+    """Names of the lost, and complete windows of a healthy record: as `_stacked`."""
+    names = _names(model, lost)
+    if not names:
         raise StructureError("No lost sensor is named.")
-    return tuple(model.outputs[o] for o in places)
-
-
-def _learning(model: "HammersteinSS", data: Data, lost: tuple[str, ...], lags: int, per_weight: int,
-              whole: bool = False) -> tuple[Array, Array]:
-    """Complete windows of a healthy record: features (T, p), and readings of the lost sensors (T, lost [lags])."""
-    raw = in_units_of(model, data)
-    gone = [model.outputs.index(name) for name in lost]
-    features, readings = [], []
-    for part in raw.experiments:
-        if len(part.y) < lags:
-            continue
-        features.append(_stacked(model, part.u, part.y, lost, lags))
-        past = [part.y[lags - 1 - lag : len(part.y) - lag, gone] for lag in range(lags)]
-        readings.append(np.hstack(past if whole else past[:1]))
-    width = lags * (model.l - len(lost) + len(model.nonlinearities))
-    if features:
-        rows, targets = np.vstack(features), np.vstack(readings)
-        complete = ~(np.isnan(rows).any(axis=1) | np.isnan(targets).any(axis=1))
-        rows, targets = rows[complete], targets[complete]
-    else:
-        rows, targets = np.zeros((0, width)), np.zeros((0, len(lost)))
-    if len(rows) < per_weight * (width + 1):
+    found = [_stacked(model, part.u, part.y, names, lags) for part in in_units_of(model, data).experiments]
+    rows, readings = (np.vstack(parts) for parts in zip(*found))
+    complete = ~(np.isnan(rows).any(axis=1) | np.isnan(readings).any(axis=1))
+    least = per_weight * (rows.shape[1] + 1)
+    if complete.sum() < least:
         raise DataError(
-            f"{len(rows)} complete windows of {lags} samples do not determine {width + 1} weights: at least "
-            f"{per_weight * (width + 1) + lags} healthy samples are needed, or fewer lags."
+            f"{complete.sum()} complete windows of {lags} samples do not determine {rows.shape[1] + 1} weights: at "
+            f"least {least + lags} healthy samples are needed, or fewer lags."
         )
-    return rows, targets
+    return names, rows[complete], readings[complete]
 
 
-def _stacked(model: "HammersteinSS", u: Array, y: Array, lost: tuple[str, ...], lags: int) -> Array:
-    """[other readings; f(u)] of every lag, the newest first, (N - lags + 1, p)."""
-    left = [o for o, name in enumerate(model.outputs) if name not in lost]
-    signal = np.hstack([y[:, left], model.expanded(u)])
-    return np.hstack([signal[lags - 1 - lag : len(signal) - lag] for lag in range(lags)])
+def _stacked(model: "HammersteinSS", u: Array, y: Array, lost: tuple[str, ...], lags: int) -> tuple[Array, Array]:
+    """[other readings; f(u)] and the lost readings of every lag, the newest first, (N - lags + 1, p)."""
+    gone = np.isin(model.outputs, lost)
+    count = max(len(y) - lags + 1, 0)
+    starts = [max(lags - 1 - lag, 0) for lag in range(lags)]
+    signal = np.hstack([y[:, ~gone], model.expanded(u)])
+    return tuple(np.hstack([part[k : k + count] for k in starts]) for part in (signal, y[:, gone]))  # type: ignore
