@@ -42,9 +42,6 @@ def feedback_model() -> HammersteinSS:
     return HammersteinSS([[0.6, 0.2], [-0.1, 0.5]], [[1.0], [0.3]], [[1.0, 0.0]], E=[[-0.3], [0.1]], feedback=(g,))
 
 
-# -- horizons ----------------------------------------------------------------------------------------------------------
-
-
 def test_the_curve_is_the_fit_of_predictions_over_common_samples():
     model = siso()
     data = record(model)
@@ -78,9 +75,6 @@ def test_every_experiment_is_measured():
     assert not validate(model, parts[0]).experiments
 
 
-# -- tests between outputs ---------------------------------------------------------------------------------------------
-
-
 def test_the_residual_of_one_output_that_follows_another_is_found():
     rng = np.random.default_rng(0)
     p_values = []
@@ -95,9 +89,6 @@ def test_the_residual_of_one_output_that_follows_another_is_found():
     assert late.values[2] == pytest.approx(np.mean(z[3:] * v[:-3]))
 
 
-# -- models with feedback ----------------------------------------------------------------------------------------------
-
-
 def test_the_three_simulators_of_a_model_with_feedback():
     model = feedback_model()
     rng = np.random.default_rng(1)
@@ -109,9 +100,6 @@ def test_the_three_simulators_of_a_model_with_feedback():
     assert found.predictors["measured feedback"]["y"].fit == pytest.approx(expected)
     assert found.structure.passed and "measured feedback" in str(found)
     assert max(map(len, str(found).splitlines())) <= 80
-
-
-# -- several models ----------------------------------------------------------------------------------------------------
 
 
 def test_models_are_compared_over_the_samples_that_all_predict():

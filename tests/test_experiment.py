@@ -38,9 +38,6 @@ def condition_of(data, basis, feedback, rows):
 PENDULUM = plants.pendulum(plants.pendulum_input("chirp", 4000))
 
 
-# -- the measured frequency response ----------------------------------------------------------------------------------
-
-
 def test_response_of_a_linear_plant_is_found_with_its_coherence_and_disturbance():
     data = linear_record(40_000)
     found = frequency_response(data, segment=256)
@@ -82,9 +79,6 @@ def test_response_knows_where_it_knows_nothing():
 def test_records_that_show_no_response(make, error, words):
     with pytest.raises(error, match=words):
         make()
-
-
-# -- the excitation ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["multisine", "chirp", "noise", "levels"])
@@ -247,9 +241,6 @@ def test_a_record_with_gaps_and_two_experiments_serves_as_well():
 def test_what_cannot_be_designed(call, error, words):
     with pytest.raises(error, match=words):
         call()
-
-
-# -- the command -----------------------------------------------------------------------------------------------------
 
 
 def run(*words):

@@ -50,9 +50,6 @@ def short(monkeypatch):
     monkeypatch.setitem(RUNGS, INPUTS, functions)
 
 
-# -- blocks ----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("lengths", [(103,), (60, 43, 80), (50, 50, 50, 50), (20,) * 9])
 def test_every_sample_is_left_out_once(lengths):
     rng = np.random.default_rng(1)
@@ -114,9 +111,6 @@ def test_a_run_that_leaves_the_range_counts_as_infinite():
     assert np.isinf(energy).all()
 
 
-# -- exact sums ------------------------------------------------------------------------------------------------------
-
-
 def test_the_sums_without_a_block_are_those_of_the_record_without_it():
     data = plant(300, noise=0.1)
     blocks = Blocks.of(data, 3)
@@ -162,9 +156,6 @@ def test_a_slow_input_shows_no_sharp_delay():
     assert sharp_delays(LagSums(Blocks.of(data), linear(data))) == (0,)
 
 
-# -- trials ----------------------------------------------------------------------------------------------------------
-
-
 def test_a_trial_is_given_up_early_and_says_why():
     data = plant(400, cubic=0.5)
     blocks = Blocks.of(data)
@@ -185,9 +176,6 @@ def test_a_trial_is_given_up_early_and_says_why():
 ])
 def test_free_parameters_are_counted_without_those_that_repeat_others(formulation, arguments, count):
     assert free_parameters(optid.fit(plant(300), formulation, **arguments).model) == count
-
-
-# -- the choice ------------------------------------------------------------------------------------------------------
 
 
 def trial(kind, energies, parameters=3):
@@ -220,9 +208,6 @@ def test_of_structures_that_are_as_good_the_smaller_is_best():
 def test_a_model_whose_run_diverges_in_a_block_is_never_chosen():
     simple, wild = trial(LINEAR, [0.5] * 4), trial(INPUTS, [0.001, 0.001, 0.001, np.inf])
     assert ladder_of(simple, wild).choice() is simple and ladder_of(wild).choice() is None
-
-
-# -- the whole -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -326,9 +311,6 @@ def test_two_outputs():
     one, two = plant(300, seed=4), plant(300, seed=4, cubic=0.2)
     found = identify(optid.Data(one.u, np.column_stack([one.y, two.y])), classes=[LINEAR], workers=1)
     assert found.model.l == 2 and found.chosen.score > 50
-
-
-# -- the pool --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [1, 3])

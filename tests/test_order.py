@@ -48,9 +48,6 @@ def linear(data):
     return expand(data, Linear())
 
 
-# -- the distribution ------------------------------------------------------------------------------------------------
-
-
 def test_moments_of_t_from_formed_windows():
     data, alpha, n0 = record(500, colour=0.7), 4, 2
     found = order_test(data.records, linear(data), alpha)
@@ -154,9 +151,6 @@ def test_simulated_outputs_follow_the_inputs_alone():
     assert np.std(extended[15:, 2] - clean[15:]) < 0.1 * clean.std()
 
 
-# -- the rule behind nx="auto" -----------------------------------------------------------------------------------------
-
-
 def test_the_choice_has_a_reason():
     data = record()
     statistics = hankel_statistics(data.records, 15)
@@ -184,9 +178,6 @@ def test_refusals_of_the_test():
         rank_test(short, z, phi, y, rows=10)
 
 
-# -- criteria --------------------------------------------------------------------------------------------------------
-
-
 def test_prediction_errors_of_full_order_are_those_of_least_squares():
     data, alpha = record(700), 3
     signals = linear(data)
@@ -212,9 +203,6 @@ def test_criteria_and_hold_out_find_a_white_noise_innovation_model():
     y = lfilter([0, 1.0, 0.4], [1, -1.2, 0.6], u) + lfilter([1, -0.5, 0.2], [1, -1.2, 0.6], e)
     found = optid.order(Data(u, y))
     assert found.nx == 2 and found.states.best()["bic"] == 2 and abs(found.states.best()["hold-out"] - 2) <= 1
-
-
-# -- lags ------------------------------------------------------------------------------------------------------------
 
 
 def arx(n=900, seed=0, nonlinear=False):
@@ -286,9 +274,6 @@ def test_hold_out_of_lags_by_hand():
     error = target - other @ np.linalg.lstsq(phi, y)[0]
     expected = 100 * (1 - np.sqrt(np.mean(error**2) / np.var(target)))
     assert one.fit == pytest.approx(expected, abs=1e-6)
-
-
-# -- the study -------------------------------------------------------------------------------------------------------
 
 
 def test_the_study_reads_like_a_page():

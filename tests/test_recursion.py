@@ -75,9 +75,6 @@ def started(case, **more):
     return RecursiveARX(**settings), record(m=len(settings.get("inputs", "u")), l=len(settings.get("outputs", "y")))
 
 
-# -- the recursion is Algorithm 3.2
-
-
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("forgetting", [1.0, 0.98])
@@ -149,9 +146,6 @@ def test_a_second_record_continues_the_first():
     assert carried_on.rows == recursion.rows + recursion.layout.first_row
 
 
-# -- blocks, missing samples, determination
-
-
 @given(st.lists(st.integers(0, 200), max_size=5), st.integers(0, 1000), st.sampled_from([1.0, 0.97]))
 def test_blocks_do_not_matter(cuts, seed, forgetting):
     u, y = record(200, seed=seed)
@@ -199,9 +193,6 @@ def test_says_what_is_not_determined_yet():
     half.update(np.abs(u), y)  # no sample reaches the left nodes
     with pytest.raises(RankError, match="triangular1"):
         _ = half.theta
-
-
-# -- the model and its trace
 
 
 @pytest.mark.parametrize("split", ["whitened", "plain"])
@@ -291,9 +282,6 @@ def test_trace_holds_the_estimates_of_the_shorter_records():
         assert np.linalg.norm(b[k]) == pytest.approx(1 / 0.75) and ratio[k] == pytest.approx(values[1] / values[0])
 
 
-# -- long runs
-
-
 def test_a_million_samples_do_not_drift():
     rng = np.random.default_rng(0)
     n = 1_000_000
@@ -336,9 +324,6 @@ def test_a_direction_without_excitation_keeps_its_estimate():
     assert recursion.theta[1, 0] == pytest.approx(1.0, abs=1e-6)
     recursion.update(u[-500:], y[-500:])
     assert recursion.theta[1, 0] == pytest.approx(1.0, abs=1e-9)
-
-
-# -- files
 
 
 @given(seed=st.integers(0, 1000), at=st.integers(0, 150))
@@ -388,9 +373,6 @@ def test_files_that_are_not_states(tmp_path):
             RecursiveARX.load(path)
     with pytest.raises(FileNotFoundError):
         RecursiveARX.load(tmp_path / "none.npz")
-
-
-# -- refusals
 
 
 def test_bad_settings():

@@ -38,9 +38,6 @@ def hammerstein(count=1500, seed=0, wiener=False, delay=0, noise=0.2):
     return Data(u, y + noise * y.std() * lfilter([1], [1, -0.8], rng.normal(size=count)))
 
 
-# -- parts -----------------------------------------------------------------------------------------------------------
-
-
 def test_families_by_hand():
     data = Data(np.linspace(-1, 3, 401), np.zeros(401) + np.arange(401))
     family = Family.of(data, 0, 2, 3)
@@ -138,9 +135,6 @@ def test_columns_do_not_depend_on_how_the_record_is_cut(monkeypatch):
     several = structure_test(data)
     monkeypatch.undo()
     assert several.p_value == pytest.approx(structure_test(data).p_value, rel=1e-6)
-
-
-# -- level and power -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -243,9 +237,6 @@ def test_refusals():
     sine = np.sin(0.7 * np.arange(2000))
     with pytest.raises(RankError):
         structure_test(Data(sine, lfilter([1], [1, -0.5], sine) + 1e-3 * np.random.default_rng(0).normal(size=2000)))
-
-
-# -- real records ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif("OPTID_DATA" not in os.environ, reason="OPTID_DATA names no folder with the real records")

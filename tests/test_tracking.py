@@ -55,9 +55,6 @@ def textbook(x, r, beta, start, p0=1.0, orthonormal=False):
     return w
 
 
-# -- trackers --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("method", ["past", "opast"])
 def test_recursion_is_that_of_the_textbook(method):
@@ -216,9 +213,6 @@ def test_a_sample_costs_microseconds():
     assert (time.process_time() - begin) / len(x) < 50e-6
 
 
-# -- theorems --------------------------------------------------------------------------------------------------------
-
-
 def test_stationary_points_of_the_reference_example():
     points = stationary_points(covariance(3), 2, among=range(4))
     assert [p.loss for p in points] == pytest.approx([1.9, 3.9, 4.4, 5.9, 6.4, 8.4])
@@ -277,9 +271,6 @@ def test_turning_one_direction_changes_the_loss_by_the_formula():
         assert projection_loss(c, turned) == pytest.approx(3.9 + np.sin(angle) ** 2 * (1 - 3))
 
 
-# -- angles ----------------------------------------------------------------------------------------------------------
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(3, 8), st.integers(0, 10_000))
 def test_the_largest_angle_is_that_of_the_projector_norm(n, seed):
@@ -296,9 +287,6 @@ def test_small_angles_keep_their_digits():
     for angle in (1e-12, 1e-7, 0.5, 1.2, np.pi / 2):
         turned = np.column_stack([u[:, 0], np.cos(angle) * u[:, 1] + np.sin(angle) * u[:, 2]])
         assert principal_angles(u[:, :2], turned)[-1] == pytest.approx(angle, rel=1e-3)
-
-
-# -- certificate -----------------------------------------------------------------------------------------------------
 
 
 def test_bound_holds_for_any_t_and_is_tight_at_the_best():
@@ -348,9 +336,6 @@ def refusals():
 def test_what_cannot_be_proved_or_projected_is_refused(call, error, words):
     with pytest.raises(error, match=words):
         call()
-
-
-# -- reconstruction --------------------------------------------------------------------------------------------------
 
 
 def test_losses_are_mean_squares_of_what_is_left():

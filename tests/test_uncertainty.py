@@ -71,9 +71,6 @@ def plain():
     return optid.fit(simulated(), **STRUCTURE)
 
 
-# -- covariance against independent routes ---------------------------------------------------------------------------
-
-
 def test_errors_equal_the_fisher_matrix_of_another_parametrisation(plain):
     phi, y = dense(plain.data, 2, 2, BASIS)
     m = plain.model
@@ -254,9 +251,6 @@ def test_errors_describe_the_scatter():
     assert 0.8 < np.mean(squares) < 1.25
 
 
-# -- inequalities ----------------------------------------------------------------------------------------------------
-
-
 @given(st.integers(0, 10_000), st.integers(1, 5), st.integers(1, 8), st.sampled_from([1e-9, 1.0, 1e9]))
 def test_projection_is_the_nearest_feasible_point(seed, n, r, unit):
     rng = np.random.default_rng(seed)
@@ -318,9 +312,6 @@ def test_static_gain_fixed_in_the_exact_programme():
     assert found.error < 1e-4 * fit.uncertainty.of(lambda m: m.static_gain(-0.8)).error
 
 
-# -- bootstrap -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_bootstrap_agrees_with_the_linearisation(plain):
     refits = optid.bootstrap(plain, 100)
@@ -354,9 +345,6 @@ def test_bootstrap_serves_robust_losses():
     with pytest.raises(StructureError, match="huber.*bootstrap"):
         _ = fit.uncertainty
     assert np.all(optid.bootstrap(fit, 40).percentile.a.error > 0)
-
-
-# -- refusals --------------------------------------------------------------------------------------------------------
 
 
 def test_refusals_name_the_reason_and_the_remedy(plain):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import toeplitz
+from scipy.signal import lfilter
 from scipy.stats import chi2, kstest
 from systems import by_hand, inputs, mimo, nonlinearity, siso
 
@@ -30,9 +31,6 @@ def ar(rng, count, pole):
     return x
 
 
-# -- measures ------------------------------------------------------------------------------------------------------
-
-
 def test_measures_by_hand():
     y, yhat = np.array([1.0, 2.0, 3.0, np.nan, 6.0]), np.array([1.0, 2.5, 3.0, 4.0, 5.0])
     q = Measures.of(y, yhat)
@@ -46,9 +44,6 @@ def test_measures_by_hand():
     assert np.isnan(fit_percent(np.ones((4, 1)), np.ones((4, 1)))[0])
     perfect = Measures.of(y, y)
     assert perfect.fit == 100 and perfect.snr == np.inf
-
-
-# -- residual tests --------------------------------------------------------------------------------------------------
 
 
 def test_correlations_of_complete_records_by_hand():
@@ -107,23 +102,13 @@ def test_a_constant_input_gives_no_verdict():
     assert np.isnan(test.p_value) and test.passed and test.outside == 0
 
 
-# -- structure -------------------------------------------------------------------------------------------------------
-
-
-def two_paths(seed=0, count=1500, noise=0.1, share=1.0):
+def two_paths(count=1500):
     """u -> f1 at lag 0 and u -> f2 at lag 1: Theta of rank two."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     u = rng.uniform(-0.7, 1.3, count)
     f1, f2 = nonlinearity(Triangular(5), 0), nonlinearity(Triangular(5), 1)
-    w = f1(u)
-    w[1:] += share * f2(u)[:-1] + (1 - share) * 0.5 * f1(u)[:-1]
-    y = np.zeros(count)
-    for k in range(1, count):
-        y[k] = 0.5 * y[k - 1] + w[k] + noise * rng.normal()
-    return Data(u, y)
-
-
-# -- the whole -------------------------------------------------------------------------------------------------------
+    w = f1(u) + np.r_[0, f2(u)[:-1]]
+    return Data(u, lfilter([1.0], [1.0, -0.5], w + 0.1 * rng.normal(size=count)))
 
 
 def test_a_true_model_passes():

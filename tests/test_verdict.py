@@ -61,31 +61,17 @@ def test_a_wrong_delay_is_useless_whatever_is_proved():
     assert "--nk 7" in [step for _, step in told(fit)] and "raises the simulation fit from" in fit.advice[0].sentence
 
 
-def test_too_large_a_delay_is_named():
-    fit = optid.fit(optid.Data(*simulated(delay=1)), "oe.exact", na=2, nb=2, nk=4)
-    assert any(step in ("--nk 0", "--nk 1") for _, step in told(fit))
-
-
-def test_too_low_an_order_is_named():
-    u, y = simulated()
-    fit = optid.fit(optid.Data(u, y), "oe.exact", na=1, nb=1, nk=1)
-    assert any(step.startswith("--na 2") for _, step in told(fit))
-
-
-def test_an_equation_error_under_output_noise_is_named():
-    fit = optid.fit(optid.Data(*simulated(noise=0.4, samples=2000)), "arx", na=2, nb=1, nk=1)
-    assert any(part.name == "one step ahead, above that" or part.name == "simulation fit" for part in fit.verdict.parts)
-    assert any("oe.exact" in step for _, step in told(fit))
-
-
-def test_a_missing_constant_is_named():
-    fit = optid.fit(optid.Data(*simulated(offset=30.0)), "oe.exact", na=2, nb=1, nk=1, offset=False)
-    assert any("offset" in step for _, step in told(fit))
-
-
-def test_a_missing_function_is_named():
-    fit = optid.fit(optid.Data(*simulated(f=lambda u: np.maximum(u, 0.0) ** 2)), "oe.exact", na=2, nb=1, nk=1)
-    assert any("hammerstein_oe.exact" in step for _, step in told(fit))
+@pytest.mark.parametrize("plant, formulation, arguments, steps", [
+    ({"delay": 1}, "oe.exact", {"nb": 2, "nk": 4}, ("--nk 0", "--nk 1")),
+    ({}, "oe.exact", {"na": 1}, ("--na 2",)),
+    ({"offset": 30.0}, "oe.exact", {"offset": False}, ("--set offset=true",)),
+    ({"f": lambda u: np.maximum(u, 0.0) ** 2}, "oe.exact", {}, ("--formulation hammerstein_oe.exact",)),
+    ({"noise": 0.4, "samples": 2000}, "arx", {}, ("--formulation oe.exact",)),
+], ids=["too large a delay", "too low an order", "a missing constant", "a missing function", "output noise"])
+def test_what_is_wrong_with_a_structure_is_named(plant, formulation, arguments, steps):
+    fit = optid.fit(optid.Data(*simulated(**plant)), formulation, **{"na": 2, "nb": 1, "nk": 1, **arguments})
+    assert any(step.startswith(steps) for _, step in told(fit))
+    assert any(part.name in ("one step ahead, above that", "simulation fit") for part in fit.verdict.parts)
 
 
 def test_a_needless_function_is_named():

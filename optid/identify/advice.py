@@ -28,7 +28,6 @@ APART = 15.0
 DRIVEN = 0.5  # log ratio of one-step errors that the past of the output saves of the input, where columns look swapped
 TOO_FEW = 10  # samples per parameter at least
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
-
 STATIC = {"arx": "hammerstein_arx.exact", "oe.exact": "hammerstein_oe.exact", "ss.exact": "hammerstein_ss.exact"}
 """Formulations with a static function of the input, by those without."""
 

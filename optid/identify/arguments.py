@@ -29,12 +29,7 @@ def in_memory(data: Any, errors: str) -> Data:
 
 
 def one_output(data: Any, errors: str) -> Data:
-    """Refuse streams, several outputs (`StructureError`), and an output without a single sample (`DataError`).
-
-    Args:
-        data: the record.
-        errors: what the fit minimises, for the message.
-    """
+    """Refuse streams, several outputs (`StructureError`), and an output without a single sample (`DataError`)."""
     data = in_memory(data, errors)
     if data.l > 1:
         raise StructureError(
@@ -46,13 +41,9 @@ def one_output(data: Any, errors: str) -> Data:
 
 
 def enough_rows(rows: int, what: str, unknowns: int, remedy: str) -> None:
-    """Refuse a record with fewer than 1.1 rows per unknown (`RankError`).
+    """Refuse a record with fewer than 1.1 rows, called `what`, per unknown, initial states included (`RankError`).
 
-    Args:
-        rows: number of them.
-        what: their name.
-        unknowns: their number, initial states included.
-        remedy: the lags or states that a user could have fewer of, besides basis functions.
+    The remedy are the lags or states that a user could have fewer of, besides basis functions.
     """
     needed = ROWS_PER_UNKNOWN * unknowns
     if rows < needed:

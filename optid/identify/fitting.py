@@ -214,9 +214,6 @@ class Fit(Rendered):
         arguments = {**self.arguments, **({"constraints": constraints} if constraints else {})}
         return {**{name: value for name, value in vars(self).items() if name != "outcome"}, "arguments": arguments}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-
     def __getattr__(self, name: str) -> Any:
         if name != "outcome" or "arguments" not in vars(self):  # a fit from a pickle has no outcome yet
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")

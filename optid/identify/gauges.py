@@ -14,14 +14,8 @@ FIXED = GAUGES[:-1]  # the gauges that fix the scale
 def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np.ndarray | None = None) -> Any:
     """Return the constraint on the coefficients of B: norm one, unit static gain, or a first coefficient of one.
 
-    Args:
-        gauge: one of `FIXED`.
-        b: coefficients of B of one input, (nb,) or (nb, l).
-        a: coefficients of A, None without poles.
-        reference: (nb,) iterate in whose tangent the norm is fixed; None for the norm itself.
-
-    Raises:
-        StructureError: "gain" with several outputs.
+    The gauge is one of `FIXED`, b (nb,) or (nb, l) of one input, a that of A, None without poles. The norm is fixed in
+    the tangent of a reference (nb,), an iterate, if there is one. "gain" with several outputs is a `StructureError`.
     """
     if gauge == "norm":
         return cp.sum_squares(b) == 1 if reference is None else reference @ b == float(reference @ reference)
@@ -34,17 +28,10 @@ def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np
 
 def in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray | None, channel: str
              ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mu and b of one input, scaled to satisfy a gauge.
+    """Return mu (P,) and b (nb,) or (nb, l) of one input, the channel, scaled to satisfy a gauge of `FIXED`.
 
-    Args:
-        gauge: one of `FIXED`.
-        mu: (P,) coefficients of the nonlinearity.
-        b: (nb,) or (nb, l) coefficients of B.
-        a: coefficients of A, None without poles.
-        channel: name of the input, for the message.
-
-    Raises:
-        StructureError: the quantity that the gauge sets to one is zero.
+    The coefficients a of A are None without poles. A quantity that is zero, and that the gauge sets to one, is a
+    `StructureError`.
     """
     if gauge == "norm" and not np.any(b):  # an input without effect: any direction will do
         return np.zeros_like(mu), np.full(b.shape, 1 / np.sqrt(b.size))

@@ -37,13 +37,11 @@ LONGEST = 40  # lags of the autoregression of prediction errors at most
 EXACT = 1e-8  # prediction errors relative to the outputs below which a record shows no noise model
 NEARLY_MARGINAL = 1 - 1e-4
 """Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
-
 RATIOS = (1e-2, 1.0, 1e2)  # process over measurement noise of the observers behind the starts, in units of C
 TRIED = 2  # observers whose errors are whitened, and then starts that are refined, the best of all
 BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
 """Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
 in."""
-
 NEARLY, ELSEWHERE = 0.1, 1.0
 """Gain of the log-likelihood to be expected that is of no account in a part of a record, and the difference beyond
 which two gains are not the same optimum of it."""
@@ -192,10 +190,8 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
     """Return the gain (n, l), A - K C stable, with the spectrum of a long autoregression of an observer's errors.
 
     With F = A - L C the errors of the gain L obey r = e + C (qI - F)^-1 (K - L) e. The autoregression shows this
-    response, which is linear in K. The errors are (N, l), one array per experiment, NaN = missing.
-
-    Raises:
-        StructureError: errors that determine no gain: too few, zero, or on the stability limit.
+    response, which is linear in K. The errors are (N, l), one array per experiment, NaN = missing; those that determine
+    no gain (too few, zero, or on the stability limit) are a `StructureError`.
     """
     n, l = gain.shape  # noqa: E741
     lags = regression_lags([len(run) for r in errors for run in complete_runs(r, 1)], n, l)
@@ -215,8 +211,7 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
 def regression_lags(lengths: Sequence[int], n: int, l: int) -> int:  # noqa: E741
     """Return the lags of the autoregression of the errors of l outputs, in complete runs of some lengths, order n.
 
-    Raises:
-        StructureError: too few for a noise model.
+    Too few for a noise model are a `StructureError`.
     """
     total = sum(lengths)
     lags = int(min(LONGEST, max(4, 2 * n), max(1, total // (20 * l))))

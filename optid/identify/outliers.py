@@ -21,19 +21,16 @@ LEAST_SAMPLES = 50  # samples of a channel below which nothing can be said
 FAR = 6.0  # robust standard deviations of the departures from the course that a wild reading is off at least
 GAP = 1.2
 """Ratio at least of the smallest wild departure to the largest sound one, so that levels of a quantiser are no gap."""
-
 STEP = 1.5
 """A wild departure is larger than a step between sound readings by this factor: a channel may switch to and fro."""
 
 SWITCHING = 0.25
 """Larger steps, relative to the number of wild runs, from which on the channel switches and nothing is wild."""
-
 GAP_RISK, TAIL_RISK = 2e-3, 1e-4
 """Probability of as wide a gap, and of as heavy a tail, where the tail goes on as it began."""
 
 FLATTEST = 0.1
 """Least steepness of a tail: that of a Gaussian one at 3 standard deviations, for signals that are bounded."""
-
 TRIED = 20  # splits into wild and sound readings that are tried, those at the widest gaps
 TAIL = 0.05  # share of the departures that is the tail of any distribution
 NORMAL_MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
@@ -67,10 +64,8 @@ def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Arra
     a disturbance at any of these samples does, and chance does not (Fox 1972; Chang, Tiao and Chen 1988). Of
     neighbours within the lags only the likeliest is returned, so the search is to be repeated without it.
 
-    Args:
-        residuals: (N, l) of every experiment, NaN where a row is not used.
-        past: (na, l, l) coefficients of A: ``past[i - 1, o, p]`` is that of output o, lag i, in equation p.
-        spread: (l,) robust standard deviations of the residuals.
+    Residuals are NaN where a row is not used; ``past[i - 1, o, p]`` of (na, l, l) is the coefficient of A of output o,
+    lag i, in equation p; the spread (l,) are robust standard deviations of the residuals.
     """
     signature = np.concatenate([np.eye(spread.size)[None], past]) / spread  # (na + 1, l outputs, l equations)
     critical = -ndtri(CHANCE / (2 * max(sum(r.size for r in residuals), 1)))

@@ -27,7 +27,6 @@ from optid.structures.whitening import symmetric_root
 
 NO_EFFECT = 1e-10
 """Size of an effect on the predictions, relative to the largest, below which a direction counts as undetermined."""
-
 STEP = 1e-5  # step of the central differences, relative to the size of the parameter
 MEANINGS = {
     "gaussian": "confidence intervals of least squares, Student's quantile",

@@ -24,10 +24,8 @@ from optid.identify.validation.predictions import fit_percent, one_step, simulat
 from optid.models.functions import has_feedback
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
-
 GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 """Fits in % from which on, and below which, a model is called so; the second is that of its worst block."""
-
 OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
 GAP = 15.0  # points that the one-step prediction may be better than the free run
 CORRELATED = 0.25  # largest correlation of residuals and past inputs; their p-values say nothing on long records

@@ -162,16 +162,9 @@ def many_lines(x: Array, most: int, tolerance: float) -> bool:
 def remaining_shares(signals: Array, most: int, enough: float) -> Array:
     """Return the share of variance that 0, 1, 2, ... common sinusoids leave, greedily chosen and fitted jointly.
 
-    Each step adds the frequency that explains most of what is left of all signals together (orthogonal matching
-    pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993) and refines the first few between the bins.
-
-    Args:
-        signals: (N, s) without missing samples; every one counts alike.
-        most: largest number of sinusoids.
-        enough: share at which to stop.
-
-    Returns:
-        (L + 1,) decreasing; L <= most.
+    Each step adds the frequency that explains most of what is left of all signals (N, s) together, every one of which
+    counts alike (orthogonal matching pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993), and refines the first few
+    between the bins. The shares (L + 1,) fall, up to L = most sinusoids or a share that is enough.
     """
     x = signals - signals.mean(axis=0)
     size = np.linalg.norm(x, axis=0)

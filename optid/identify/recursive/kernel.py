@@ -15,7 +15,6 @@ from optid.arrays import Array
 FADED = 1e-120
 """Diagonal entry of R below which a row is not forgotten any further: a direction that is never excited again keeps
 its last estimate instead of ending as zero over zero."""
-
 NOTHING = 1e-250  # entries of R below this are set to zero, before they slow the processor down as subnormal numbers
 UNDETERMINED = 1e-12
 """Share of a column, or of a row, outside the span of what came before below which it counts as rounding."""

@@ -22,7 +22,6 @@ Rung = Generator[list[Candidate], list[Trial], None]
 
 LINEAR, INPUTS, FEEDBACK, LATENT = KINDS = ("linear", "input functions", "feedback", "latent signals")
 """Classes of models, each richer than those before."""
-
 PATIENCE = 2  # orders in a row that may fail to improve before a ladder ends
 LARGEST = 10  # largest number of states
 FEW_LEVELS = 5  # levels of an input up to which nothing shows between them how a function would go on
@@ -32,7 +31,6 @@ PATIENT = 12.0  # the same where the class leaves much less of the record itself
 PROMISING = 0.7  # what much less is: the share of the error on the record that it leaves
 EQUAL = 0.02
 """Share of the error by which structures of a class may differ and still be as good: the smaller one is taken."""
-
 FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
 
 

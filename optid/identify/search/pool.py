@@ -76,8 +76,9 @@ class Pool:
         """End the processes."""
         for child in self._children:
             child.kill()
-        for child, connection in zip(self._children, self._connections):
+        for child in self._children:
             child.join()
+        for connection in self._connections:  # fewer where a process died
             connection.close()
         self._connections, self._children = [], []
 

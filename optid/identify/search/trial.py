@@ -16,7 +16,6 @@ from optid.models.functions import free_parameters
 
 WORSE = 1.3
 """A structure is given up when its errors on the first half of the blocks have so many times the energy of the best."""
-
 STARTS = 2  # starts of output-error models on trial
 STEPS = 30  # steps of the descents of state-space models on trial
 
@@ -92,16 +91,10 @@ class Trial:
 
 def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
           constraints: Sequence[Any], horizon: int | None, deadline: float) -> Trial:
-    """Fit a candidate, leave out block after block, and stop early where it cannot win.
+    """Fit a candidate, leave out block after block, and stop early where it cannot beat its rival.
 
-    Args:
-        candidate: the structure.
-        blocks: of the record.
-        rival: what it has to beat, None for nothing.
-        settings: solver and accuracy.
-        constraints: of the user.
-        horizon: samples ahead of the predictions that are compared; None for the free run.
-        deadline: by `time.monotonic`; where there is no rival, it takes the time it needs.
+    The settings are solver and accuracy, the horizon is as in `Blocks.errors`, the deadline by `time.monotonic`; where
+    there is no rival, it takes the time it needs.
     """
     clock, found = time.process_time(), Trial(candidate)
     arguments = {**candidate.arguments, **_spared(candidate),

@@ -18,7 +18,6 @@ from optid.models.functions import has_feedback
 from optid.registry import Rendered
 
 ONE_STEP, MEASURED, SIMULATION = "one step", "measured feedback", "simulation"
-
 HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
 """Samples ahead at which the fit is evaluated, as far as the record reaches."""
 

@@ -42,11 +42,9 @@ SIGNIFICANT = 5e-3
 UNNOTICED = 0.003
 """Share of the residual variance that another structure may save in truth while a record counts as Hammerstein: the
 functions and filters of the test follow a system up to that."""
-
 PRODUCTS = "inputs at different lags act together, as in a Wiener system"
 RANK = "different lags see different nonlinearities"
 FUNCTIONS = "functions of the inputs explain a part of the residuals"
-
 NOISE_ORDER, KEPT = 12, 0.4
 """Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
 DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own

@@ -14,7 +14,6 @@ from optid.models.recursions import lfilter
 COURSES = 4  # degree of the polynomials in time that a gain may follow
 LAGS, SLOW, FEW_RECORDS = 16, (0.8, 0.9, 0.95, 0.98, 0.99), 3
 """Lags and poles by which the filters are completed; experiments up to which each has decays of its own."""
-
 MOST = 6  # most groups of poles, over all inputs, that may come before a second nonlinearity
 
 

@@ -36,7 +36,6 @@ DEGREE, HATS, SAMPLES = 3, 5, 250
 """Powers and, at most, hats of an input that every filter sees; samples for each of these hats and each input."""
 FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40
 """The same for the leading filter: there f is known to a few tenths of a percent."""
-
 EXTRA = 3  # pulses beyond the order of the filters
 LONGEST = 600  # samples after which the filters are cut, at most
 CHUNK = 16384
