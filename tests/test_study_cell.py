@@ -268,7 +268,7 @@ def test_errors_outside_the_solver(monkeypatch, error, outcome):
 def test_a_solver_that_lies_or_returns_what_is_not_finite_is_caught(solver, change, outcome):
     row = run_cell(one(solver(lambda program, settings: Answer(Status.OPTIMAL, "solved!", {
         name: change(np.array(value, dtype=float)) for name, value in program.start.items()}))))
-    assert row["outcome"] == outcome and row["status_claimed"] == "solved!"
+    assert row["outcome"] == outcome and row["status_claimed"] == "solved!", row["reason"]
     assert row["false_claim"] and not row["reached"] and not row["proved"]
     assert all(value is None or not isinstance(value, float) or np.isfinite(value) for value in row.values())
     if np.isnan(change(np.ones(1))[0]):

@@ -144,14 +144,19 @@ def _finish(
     work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any], what: str = "fit"
 ) -> None:
     """Validate on what was held out, and write the model, with the place of a record that it is from as a whole."""
+    from optid.cli.arguments import listed
+
     if held_out is not None:
         from optid.identify.validation.checks import validate as check
 
         work.step("validating")
         work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{check(found.model, held_out)}"
     if saved is not None:
-        whole = data and held_out is None
-        found.model.save(saved, {**how, "files": [str(Path(name).resolve()) for name in data]} if whole else None)
+        record = None
+        if data and held_out is None:
+            named = {key: listed(how[key]) for key in ("inputs", "outputs", "columns")}
+            record = {**how, **named, "files": [str(Path(name).resolve()) for name in data]}
+        found.model.save(saved, record)
 
 
 def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:

@@ -1,6 +1,7 @@
 """A programme: the identification problem written once, in CVXPY, with everything in it named."""
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -118,7 +119,8 @@ class Program:
         del vars(self)["_statement"]
         vars(self).update(stated)
         if held := vars(self).pop("_held"):
-            self.assign(held)
+            with suppress(ValueError):  # CVXPY takes no derived value that overflowed; the judgement has said so
+                self.assign(held)
         return vars(self)[name]
 
     @property

@@ -136,7 +136,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution
         return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
     judged = time.perf_counter()
     assert point.residuals is not None
-    if abs(point.objective) > LARGEST:  # models refuse such numbers, since their squares overflow
+    if not abs(point.objective) <= LARGEST:  # models refuse such numbers, since their squares overflow
         return replace(point, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}", values={}, duals={})
     status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
     if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
