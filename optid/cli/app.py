@@ -17,7 +17,6 @@ from optid.cli.terminal import Command, Group, Waiting, output, say
 app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode="rich",
