@@ -43,7 +43,7 @@ def main(folder: Path) -> dict[str, float]:
             at = (moments := hankel_statistics([record], 2 * ROWS, expansion, centre="mean")).at
             z, y = np.r_[0, at(expansion.eta), at(expansion.zeta, past), at(expansion.y, past)], at(expansion.y, future)
             phi = np.r_[0, at(expansion.eta, future), at(expansion.zeta, future[:-1])]
-            fast, middle = rq(moments, z, phi, y).singular_values, time.process_time()
+            fast, middle = rq(moments, z, phi, y).decomposition[1], time.process_time()
             windows = windows_of(expansion(record) - moments.centre, 2 * ROWS).reshape(n - 2 * ROWS + 1, -1)
             slow = explicit(np.insert(windows, 0, 1.0, axis=1).T, z, phi, y)
             means[-1] += np.array([time.process_time() - middle, middle - start]) * (1e3 / runs if seed else 0)

@@ -107,7 +107,8 @@ def kalman_gain(A: Array, C: Array, Q: Array, R: Array, S: Array | None = None) 
     if n == 0:
         return Kalman(np.zeros((0, outputs)), R, np.zeros((0, 0)))
     try:
-        error = solve_discrete_are(A.T, C.T, (Q + Q.T) / 2, (R + R.T) / 2, s=S)
+        with np.errstate(invalid="ignore"):  # its balancing meets numbers beyond the range of integers
+            error = solve_discrete_are(A.T, C.T, (Q + Q.T) / 2, (R + R.T) / 2, s=S)
     except np.linalg.LinAlgError as cause:
         raise StructureError(
             f"The Riccati equation has no stabilising solution ({cause}): a mode of A on or outside the unit circle is "

@@ -306,6 +306,12 @@ class Runs:
         for first in range(0, len(u), CHUNK):
             part = both[first : first + CHUNK]
             used = run if len(part) == CHUNK else step.mapaccum(len(part))
-            states, found = (np.array(one).T for one in used(start, part.T, p))
+            try:
+                states, found = (np.array(one).T for one in used(start, part.T, p))
+            except RuntimeError:  # a step without a solution, far from any record: no number from here on
+                rest = len(u) - first
+                yield (np.vstack([start[None], np.full((rest - 1, start.size), np.nan)]),
+                       np.full((rest, step.size1_out(1)), np.nan))
+                return
             yield np.vstack([start[None], states[:-1]]), found
             start = states[-1]

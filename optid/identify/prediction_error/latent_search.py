@@ -84,7 +84,9 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         pace = PACE["search" if size < total else "long" if size > STAGES[0] else "short"]
         end = descend(part, _finite(part, x), iterations=iterations, progress=pace, start=best.start)
         x, steps = end.x, steps + end.steps
-    return part, replace(end, steps=steps), {**figures, **_idle(errors, best.x, part, end)}
+    if iterations:  # without a descent nothing can be said of what the functions are worth
+        figures |= _idle(errors, best.x, part, end)
+    return part, replace(end, steps=steps), figures
 
 
 def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator, iterations: int
