@@ -158,22 +158,6 @@ def explained(tables, correlations, roots, statistic):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def many(tables, windows, roots, tested, largest):
-    """Write the largest energy over the onsets of windows (M, N, l), (M, C); NaN where `tested` (C, N) has none."""
-    count, candidates = windows.shape[1], tables.first.size
-    correlations, statistic = np.empty((count, tables.h.shape[2])), np.zeros((candidates, count))
-    for m in range(windows.shape[0]):
-        correlate(tables, windows[m], correlations)
-        explained(tables, correlations, roots, statistic)
-        for c in range(candidates):
-            best = np.nan
-            for k in range(count):
-                if tested[c, k] and not statistic[c, k] <= best:
-                    best = statistic[c, k]
-            largest[m, c] = best
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
 def course(tables, first, order, onset, signature):
     """Write the whitened signature (N, l, d) of the columns from `first`; order 0: they last, 1: drifts, 2: jumps."""
     count, l, d = signature.shape  # noqa: E741

@@ -23,6 +23,7 @@ from optid.faults.scheduled import change
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Predictor, Whitened
 from optid.models.experiments import samples_of
+from optid.models.recursions import SHORT, propagated
 
 if TYPE_CHECKING:
     from optid.faults.nuisance import Nuisance
@@ -32,6 +33,9 @@ SHARE = 1e-9
 
 BATCH = 2_000_000
 """Numbers of a batch of simulated windows."""
+
+SMALL = 10_000
+"""Products of columns up to which a single run takes less time than to compile it."""
 
 ORDERS = {"drift": 1, "jump": 2, "spike": 2}
 """Where the columns of a kind stand: those that last, drifts, jumps."""
@@ -107,11 +111,18 @@ class Sweep:
 
     def signature(self, c: int, onset: int) -> Array:
         """Return the whitened signature (N, l, d) of a candidate that has one."""
-        from optid.faults.search.sweep_kernels import course
+        tables, order, since = self.tables, ORDERS.get(self.found.candidates[c].kind, 0), self.window - int(onset)
+        result = np.zeros((self.window, self.found.model.l, int(tables.sizes[c])))
+        if len(tables.F) == 1 and since <= SHORT:
+            share = (np.ones(since), np.arange(1.0, since + 1), np.eye(1, since)[0])[order][:, None, None]
+            drive = np.zeros((since, *tables.e.shape[1:]))[..., self.columns(c)]
+            drive[1:] = share[:-1] * tables.e[0][:, self.columns(c)]
+            seen = share * tables.h[0][:, self.columns(c)] + tables.C @ propagated(tables.F[0], drive)
+            result[int(onset) :] = tables.W[0] @ seen
+        else:
+            from optid.faults.search.sweep_kernels import course
 
-        result = np.zeros((self.window, self.found.model.l, int(self.tables.sizes[c])))
-        order = ORDERS.get(self.found.candidates[c].kind, 0)
-        course(self.tables, int(self.tables.first[c]), order, int(onset), result)
+            course(tables, int(tables.first[c]), order, int(onset), result)
         return result if self.nuisance is None else self.nuisance(result)
 
     def correlations(self, r: Array) -> Array:
@@ -138,13 +149,21 @@ class Sweep:
 
     def largest(self, windows: Array) -> Array:
         """Return the largest energy over the onsets for windows (M, N, l), (M, C); NaN for what is not tested."""
-        from optid.faults.search.sweep_kernels import many
-
         shown = windows if self.present is None else np.where(self.present, windows, 0.0)
         if self.nuisance is not None:
             shown = np.moveaxis(self.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
-        result = np.empty((len(windows), len(self.tested)))
-        many(self.tables, compact(shown), self.roots, self.tested, result)
+        return self._largest(compact(shown))
+
+    def _largest(self, windows: Array) -> Array:
+        from optid.faults.search.sweep_kernels import correlate, explained
+
+        correlations = np.empty((self.window, self.tables.group.size))
+        statistic, result = np.full(self.tested.shape, np.nan), np.empty((len(windows), len(self.tested)))
+        for window, row in zip(windows, result):
+            correlate(self.tables, window, correlations)
+            explained(self.tables, correlations, self.roots, statistic)
+            np.fmax.reduce(statistic, axis=1, where=self.tested, initial=-np.inf, out=row)
+        result[:, ~self.tested.any(axis=1)] = np.nan
         return result
 
     def simulated(self, draws: int, rng: np.random.Generator) -> Iterator[Array]:
@@ -201,7 +220,7 @@ def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
     if key not in kept:
         if len(kept) >= _MOST:
             kept.pop(next(iter(kept)))
-        kept[key] = _prepared(found, count, steady, None, None, None, None, able)
+        kept[key] = _prepared(found, count, steady, None, None, None, None, able, once=True)
     return kept[key]
 
 
@@ -220,7 +239,7 @@ def _inputs(found: Dictionary, u: Any, window: int) -> Array:
 
 def _prepared(
     found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None,
-    nuisance: "Nuisance | None", states: Array | None, able: tuple[bool, ...],
+    nuisance: "Nuisance | None", states: Array | None, able: tuple[bool, ...], once: bool = False,
 ) -> Sweep:
     from optid.faults.search.sweep_kernels import correlate, grams
 
@@ -232,7 +251,8 @@ def _prepared(
     for d, place, begin in zip(tables.sizes, tables.places, tables.first):
         slots[begin : begin + d, begin : begin + d] = place + np.arange(d * d).reshape(d, d)
     products = np.zeros((window, size))
-    grams(tables, slots, products, np.empty((0, tables.F.shape[1], columns)))
+    multiply: Any = grams.py_func if once and window * columns**2 <= SMALL else grams
+    multiply(tables, slots, products, np.empty((0, tables.F.shape[1], columns)))
     along = np.zeros((window, 0 if nuisance is None else nuisance.s.size, columns))
     if nuisance is not None:
         one = np.empty((window, columns))
