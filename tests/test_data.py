@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from refusals import refused
+from refusals import refuses
 from scipy.signal import decimate
 
 from optid.data.channels import MOST_LEVELS, count_levels
@@ -162,7 +162,7 @@ def test_split_window_and_join_are_inverse(record):
 
 @pytest.mark.parametrize("at", [0, 200, -1, 1.0, 0.0, 0.001, True, "half", np.nan])
 def test_split_refuses_empty_parts(record, at):
-    refused("split at", record.split, at)
+    refuses(DataError, "split at", record.split, at)
 
 
 def test_select_keeps_order_and_names(record):
@@ -170,19 +170,19 @@ def test_select_keeps_order_and_names(record):
     np.testing.assert_array_equal(part.u, record.u[:, ::-1])
     assert part.input_units == ("V", "%")
     assert Data.join(*record.split(50)).select(experiments=1).n_samples == 150
-    refused(r"no input 'vlave'. Did you mean 'valve'\?", record.select, inputs="vlave")
-    refused("experiment 1 does not exist", record.select, experiments=[1])
-    refused("at least one", record.select, inputs=[])
-    refused("window 150:201", record.window, 150, 201)
+    refuses(DataError, r"no input 'vlave'. Did you mean 'valve'\?", record.select, inputs="vlave")
+    refuses(DataError, "experiment 1 does not exist", record.select, experiments=[1])
+    refuses(DataError, "at least one", record.select, inputs=[])
+    refuses(DataError, "window 150:201", record.window, 150, 201)
 
 
 def test_join_refuses_what_does_not_belong_together(record):
     other = Data(record.u, record.y, 0.1, ["valve", "fan"], "level", ["%", "V"], "m")
-    refused(r"data set 2 has inputs \('valve', 'fan'\)", Data.join, record, other)
+    refuses(DataError, r"data set 2 has inputs \('valve', 'fan'\)", Data.join, record, other)
     slow = Data(record.u, record.y, 0.2, ["valve", "pump"], "level", ["%", "V"], "m")
-    refused("dt 0.2, the first has 0.1", Data.join, record, slow)
-    refused(r"raw\(\)", Data.join, record, record.detrend())
-    refused("at least one", Data.join)
+    refuses(DataError, "dt 0.2, the first has 0.1", Data.join, record, slow)
+    refuses(DataError, r"raw\(\)", Data.join, record, record.detrend())
+    refuses(DataError, "at least one", Data.join)
 
 
 # -- changes of the samples
@@ -229,14 +229,14 @@ def test_a_drift_leaves_the_outputs_and_only_them():
     keep = ~np.isnan(raw)
     expected = drifting[keep] - np.polyfit(t[keep], drifting[keep], 1)[0] * (t[keep] - t.mean())
     np.testing.assert_allclose(raw[keep], expected)
-    refused("order 2", data.detrend, 2)
+    refuses(DataError, "order 2", data.detrend, 2)
 
 
 def test_scale_refuses_what_has_no_scale(record):
     flat = Data(np.column_stack([np.ones(9) * 0.1, np.arange(9.0)]), np.arange(9.0))
-    refused("'u1' is constant", flat.scale)
-    refused(r"no channel 'valv'. Did you mean 'valve'\?", record.scale, {"valv": 2.0})
-    refused("'pump' is -1", record.scale, {"pump": -1.0})
+    refuses(DataError, "'u1' is constant", flat.scale)
+    refuses(DataError, r"no channel 'valv'. Did you mean 'valve'\?", record.scale, {"valv": 2.0})
+    refuses(DataError, "'pump' is -1", record.scale, {"pump": -1.0})
 
 
 def test_decimate_is_the_filter_of_scipy_inside_and_true_at_the_ends():
@@ -250,10 +250,10 @@ def test_decimate_is_the_filter_of_scipy_inside_and_true_at_the_ends():
 
 
 def test_decimate_refuses_gaps_and_short_records(record):
-    refused("'level': 0.50% of the samples are missing", record.decimate, 2)
+    refuses(DataError, "'level': 0.50% of the samples are missing", record.decimate, 2)
     whole = record.window(8, 200)
     assert whole.decimate(1) is whole
-    refused("192 samples, the anti-alias filter for q = 10 has 201 taps", whole.decimate, 10)
+    refuses(DataError, "192 samples, the anti-alias filter for q = 10 has 201 taps", whole.decimate, 10)
     with pytest.raises(DataError, match="positive integer"):
         whole.decimate(1.5)  # pyright: ignore[reportArgumentType]
 

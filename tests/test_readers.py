@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 import pytest
-from refusals import refused
+from refusals import refuses
 from scipy.io import savemat
 
 import optid
@@ -60,7 +60,7 @@ def test_parquet_without_pyarrow(tmp_path, monkeypatch):
     pl.DataFrame({"u": [1.0, 2.0], "y": [3.0, None]}).write_parquet(tmp_path / "r.parquet")
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     np.testing.assert_array_equal(read(tmp_path / "r.parquet").y, [[3.0], [np.nan]])
-    refused(r'needs pyarrow: pip install "optid\[tables\]"', open_stream, tmp_path / "r.parquet")
+    refuses(DataError, r'needs pyarrow: pip install "optid\[tables\]"', open_stream, tmp_path / "r.parquet")
 
 
 def test_arrays_npz_and_npy(tmp_path):
@@ -90,11 +90,11 @@ def test_mat_files_of_both_kinds(tmp_path, monkeypatch):
     with open(tmp_path / "new.mat", "r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
     same(read(tmp_path / "new.mat"))
-    refused("no column 'title'", read, tmp_path / "new.mat", inputs="title")
+    refuses(DataError, "no column 'title'", read, tmp_path / "new.mat", inputs="title")
     np.testing.assert_array_equal(read(tmp_path / "new.mat", outputs={"y": "log.y"}).y, Y)
     write(tmp_path, "raise ImportError('No module named h5py')", "h5py.py")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))  # the file is read by a process of its own
-    refused(r'7.3, which needs h5py: pip install "optid\[mat\]"', read, tmp_path / "new.mat")
+    refuses(DataError, r'7.3, which needs h5py: pip install "optid\[mat\]"', read, tmp_path / "new.mat")
 
 
 def test_matlab_bytes_are_doubles_again(tmp_path):
@@ -133,9 +133,9 @@ def test_list_of_sources(tmp_path):
     assert data.n_experiments == 2 and data.dt == 0.1 and data.experiments[1].start == 5.0
     np.testing.assert_array_equal(data.u[1][:, 0], [8.0, 7.0])
     third = write(tmp_path, "t,u,y\n0,1,1\n0.2,2,2\n", "c.csv")
-    refused(r"c.csv: dt = 0.1, but the time stamps step by 0.2", read, [first, third])
-    refused("has channels", read, [first, {"u": np.ones((3, 2)), "y": np.ones(3)}])
-    refused("list of sources is empty", read, [])
+    refuses(DataError, r"c.csv: dt = 0.1, but the time stamps step by 0.2", read, [first, third])
+    refuses(DataError, "has channels", read, [first, {"u": np.ones((3, 2)), "y": np.ones(3)}])
+    refuses(DataError, "list of sources is empty", read, [])
 
 
 def test_experiment_column(tmp_path):
@@ -146,9 +146,9 @@ def test_experiment_column(tmp_path):
     frame = pl.DataFrame({"run": [1, 1, 2], "u": [1.0, 2.0, 3.0], "y": [1.0, 2.0, 3.0]})
     assert [e.n_samples for e in read(frame, experiment="run").experiments] == [2, 1]
     write(tmp_path, "run,u,y\na,1,1\nb,2,2\na,3,3\n")
-    refused("experiment 'a' starts again at row 3. Sort", read, path, experiment="run")
+    refuses(DataError, "experiment 'a' starts again at row 3. Sort", read, path, experiment="run")
     write(tmp_path, "run,u,y\na,1,1\n,2,2\n")
-    refused("row 2 does not say which experiment", read, path, experiment="run")
+    refuses(DataError, "row 2 does not say which experiment", read, path, experiment="run")
 
 
 # -- time stamps
@@ -288,7 +288,7 @@ def test_a_file_of_old_line_ends(tmp_path):
 
 @pytest.mark.parametrize("delimiter", ["", ",,", "a", '"', "\n", None, 3])
 def test_bad_delimiter(tmp_path, delimiter):
-    refused("one character", read, write(tmp_path, CSV), delimiter=delimiter)
+    refuses(DataError, "one character", read, write(tmp_path, CSV), delimiter=delimiter)
 
 
 def test_a_hundred_thousand_columns(tmp_path):
@@ -297,7 +297,7 @@ def test_a_hundred_thousand_columns(tmp_path):
     started = time.process_time()
     data = read(path, outputs=["y", "c7", "c99997"])
     assert data.n_samples == 9 and data.y[8, 2] == 0.5
-    refused("no column 'voltage'.*and 99[0-9]* more", read, path, inputs="voltage")
+    refuses(DataError, "no column 'voltage'.*and 99[0-9]* more", read, path, inputs="voltage")
     with pytest.raises(DataError, match="row 3 after the header has 1 cells, the header has 100000"):
         read(write(tmp_path, ",".join(names) + "\n" + (",".join(["0.5"] * 100_000) + "\n") * 2 + "1\n"))
     assert time.process_time() - started < 15  # seconds where columns are searched one by one: over 100
@@ -306,19 +306,19 @@ def test_a_hundred_thousand_columns(tmp_path):
 def test_bad_row_is_counted_across_blocks(tmp_path):
     rows = ["1,2"] * 70_000
     rows[69_998] = "1,x"
-    refused("row 69999 ", read, write(tmp_path, "u,y\n" + "\n".join(rows)))
+    refuses(DataError, "row 69999 ", read, write(tmp_path, "u,y\n" + "\n".join(rows)))
     rows[69_998] = "1"
-    refused("row 69999 ", read, tmp_path / write(tmp_path, "u,y\n" + "\n".join(rows)))
+    refuses(DataError, "row 69999 ", read, tmp_path / write(tmp_path, "u,y\n" + "\n".join(rows)))
     rows[69_998:] = [""] * 3
     assert read(write(tmp_path, "u,y\n" + "\n".join(rows))).n_samples == 69_998
 
 
 def test_bad_files(tmp_path):
     write(tmp_path, CSV)
-    refused("no file .*missing.csv.* There: record.csv", read, tmp_path / "missing.csv")
-    refused(r"unknown kind of file '.xlsx'. Known: .csv", read, tmp_path / "r.xlsx")
+    refuses(DataError, "no file .*missing.csv.* There: record.csv", read, tmp_path / "missing.csv")
+    refuses(DataError, r"unknown kind of file '.xlsx'. Known: .csv", read, tmp_path / "r.xlsx")
     (tmp_path / "r.csv").write_bytes(b"u,y\n\xff\xfe1,2\n")
-    refused(r"UTF-8|not a text table", read, tmp_path / "r.csv")
+    refuses(DataError, r"UTF-8|not a text table", read, tmp_path / "r.csv")
     np.savez(tmp_path / "r.npz", u=U, y=Y)
     pl.DataFrame({"u": [1.0], "y": [2.0]}).write_parquet(tmp_path / "r.parquet")
     savemat(tmp_path / "r.mat", {"u": U, "y": Y})
@@ -327,26 +327,26 @@ def test_bad_files(tmp_path):
         whole = (tmp_path / f"r.{kind}").read_bytes()
         for damaged in (whole[: len(whole) // 2], b"nonsense" * 40):
             (tmp_path / f"r.{kind}").write_bytes(damaged)
-            refused(f"r.{kind} is", read, tmp_path / f"r.{kind}")
+            refuses(DataError, f"r.{kind} is", read, tmp_path / f"r.{kind}")
         (tmp_path / f"r.{kind}").write_bytes(b"")
-        refused("is empty", read, tmp_path / f"r.{kind}")
+        refuses(DataError, "is empty", read, tmp_path / f"r.{kind}")
     np.save(tmp_path / "o.npy", np.array([None, 1]))
-    refused("plain numbers", read, tmp_path / "o.npy")
+    refuses(DataError, "plain numbers", read, tmp_path / "o.npy")
 
 
 def test_bad_tables():
-    refused("column 'u' is of type String", read, pl.DataFrame({"u": ["a"], "y": [1.0]}))
-    refused("column 'u' is of type Boolean", read, pd.DataFrame({"u": [True], "y": [1.0]}))
-    refused("no rows", read, pl.DataFrame({"u": [], "y": []}))
-    refused(r"cannot read data from a LazyFrame: .*collect", read, pl.LazyFrame({"u": [1.0], "y": [1.0]}))
-    refused("cannot read data from a int", read, 3)
-    refused(r"9007199254740994.*2\*\*53", read, pl.DataFrame({"u": [2**53 + 2, None], "y": [1.0, 2.0]}))
-    refused("column 'u' has shape .*transpose", read, {"u": np.ones((1, 9)), "y": np.ones(9)})
-    refused("u has 9 samples and y has 8", read, {"u": np.ones(9), "y": np.ones(8)})
-    refused("'u2' has 8 samples, 'u1' has 9", read, {"u1": np.ones(9), "u2": np.ones(8), "y": np.ones(9)})
-    refused("'t' has 8 stamps for 9 samples", read, {"u": np.ones(9), "y": np.ones(9), "t": np.arange(8)})
-    refused("holds no arrays", read, {})
-    refused(r"shape \(2, 2, 2\)", read, np.ones((2, 2, 2)))
+    refuses(DataError, "column 'u' is of type String", read, pl.DataFrame({"u": ["a"], "y": [1.0]}))
+    refuses(DataError, "column 'u' is of type Boolean", read, pd.DataFrame({"u": [True], "y": [1.0]}))
+    refuses(DataError, "no rows", read, pl.DataFrame({"u": [], "y": []}))
+    refuses(DataError, r"cannot read data from a LazyFrame: .*collect", read, pl.LazyFrame({"u": [1.0], "y": [1.0]}))
+    refuses(DataError, "cannot read data from a int", read, 3)
+    refuses(DataError, r"9007199254740994.*2\*\*53", read, pl.DataFrame({"u": [2**53 + 2, None], "y": [1.0, 2.0]}))
+    refuses(DataError, "column 'u' has shape .*transpose", read, {"u": np.ones((1, 9)), "y": np.ones(9)})
+    refuses(DataError, "u has 9 samples and y has 8", read, {"u": np.ones(9), "y": np.ones(8)})
+    refuses(DataError, "'u2' has 8 samples, 'u1' has 9", read, {"u1": np.ones(9), "u2": np.ones(8), "y": np.ones(9)})
+    refuses(DataError, "'t' has 8 stamps for 9 samples", read, {"u": np.ones(9), "y": np.ones(9), "t": np.arange(8)})
+    refuses(DataError, "holds no arrays", read, {})
+    refuses(DataError, r"shape \(2, 2, 2\)", read, np.ones((2, 2, 2)))
 
 
 # -- streams
@@ -442,15 +442,15 @@ def test_stream_checks_time_across_chunks(tmp_path):
 
 
 def test_bad_streams(tmp_path):
-    refused("chunk must be a positive integer", open_stream, write(tmp_path, CSV), chunk=0)
-    refused("no file", open_stream, tmp_path / "missing.npy")
-    refused("use read", open_stream, write(tmp_path, "x", "r.mat"))
+    refuses(DataError, "chunk must be a positive integer", open_stream, write(tmp_path, CSV), chunk=0)
+    refuses(DataError, "no file", open_stream, tmp_path / "missing.npy")
+    refuses(DataError, "use read", open_stream, write(tmp_path, "x", "r.mat"))
     with pytest.raises(DataError, match="no rows"):
         list(open_stream(write(tmp_path, "u,y\n", "e.csv")))
     with pytest.raises(DataError, match="'oops'"):
         list(open_stream(write(tmp_path, "u,y\n1,2\n3,oops\n", "e.csv"), chunk=1))
     write(tmp_path, "nonsense", "r.parquet")
-    refused("not a Parquet file", open_stream, tmp_path / "r.parquet")
+    refuses(DataError, "not a Parquet file", open_stream, tmp_path / "r.parquet")
     pl.DataFrame({"u": ["a"], "y": [1.0]}).write_parquet(tmp_path / "r.parquet")
     with pytest.raises(DataError, match="column 'u' is of type String, numbers"):
         list(open_stream(tmp_path / "r.parquet"))
@@ -460,18 +460,19 @@ def test_bad_streams(tmp_path):
         (np.ones(4, dtype=bool), "holds bool"),
     ]:
         np.save(tmp_path / "r.npy", array)
-        refused(message, open_stream, tmp_path / "r.npy")
+        refuses(DataError, message, open_stream, tmp_path / "r.npy")
     np.save(tmp_path / "r.npy", np.ones((9, 2)))
     whole = (tmp_path / "r.npy").read_bytes()
     (tmp_path / "r.npy").write_bytes(whole[:-8])
-    refused("truncated: its header says 18 numbers, 17 are there", open_stream, tmp_path / "r.npy")
+    refuses(DataError, "truncated: its header says 18 numbers, 17 are there", open_stream, tmp_path / "r.npy")
     (tmp_path / "r.npy").write_bytes(b"nonsense" * 9)
-    refused("not an npy file", open_stream, tmp_path / "r.npy")
+    refuses(DataError, "not an npy file", open_stream, tmp_path / "r.npy")
     np.save(tmp_path / "u.npy", np.ones(5))
     np.save(tmp_path / "y.npy", np.ones(6))
-    refused(r"different lengths: \{'u': 5, 'y': 6\}", open_stream, {"u": tmp_path / "u.npy", "y": tmp_path / "y.npy"})
+    refuses(DataError, r"different lengths: \{'u': 5, 'y': 6\}", open_stream, {"u": tmp_path / "u.npy",
+            "y": tmp_path / "y.npy"})
     np.save(tmp_path / "y.npy", np.ones((5, 2)))
-    refused("y.npy has 2 columns", open_stream, {"u": tmp_path / "u.npy", "y": tmp_path / "y.npy"})
+    refuses(DataError, "y.npy has 2 columns", open_stream, {"u": tmp_path / "u.npy", "y": tmp_path / "y.npy"})
 
 
 # -- time indices and foreign tables
@@ -487,8 +488,8 @@ def test_a_time_index_sets_the_sampling_time(index):
     data = read(frame)
     assert data.dt == 0.02 and data.inputs == ("u",)
     assert read(frame, dt=0.02).dt == 0.02 and read(frame, time=False).dt == 1.0 and read(frame, time=True).dt == 0.02
-    refused("dt = 1, but the time stamps step by 0.02", read, frame, dt=1.0)
-    refused("not uniform", read, frame.drop(frame.index[2]))
+    refuses(DataError, "dt = 1, but the time stamps step by 0.02", read, frame, dt=1.0)
+    refuses(DataError, "not uniform", read, frame.drop(frame.index[2]))
     assert list(frame.columns) == ["u", "y"]  # the caller's frame is as it was
     if index.name == "stamp":
         assert read(frame, time="stamp").dt == 0.02
@@ -522,5 +523,5 @@ def test_arrow_and_xarray(tmp_path):
 def test_fit_names_the_way_to_a_record():
     frame = pd.DataFrame({"u": U[:, 0], "y": Y[:, 0]})
     for source in (frame, pl.DataFrame(frame), {"u": U, "y": Y}, U):
-        refused(r"optid\.read\(df, ", optid.fit, source)
-    refused(r"fit\(optid.read\('r.csv', ", optid.fit, "r.csv")
+        refuses(DataError, r"optid\.read\(df, ", optid.fit, source)
+    refuses(DataError, r"fit\(optid.read\('r.csv', ", optid.fit, "r.csv")

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from refusals import refused, refuses
+from refusals import refuses
 from test_regressors import assert_gram, cases, formed
 
 import optid
@@ -233,7 +233,8 @@ def test_parts_that_do_not_join_are_refused(record, folders):
         optid.open_stream(folders).ranges()
     other = pd.read_parquet(folders[1] / "part.3.parquet").rename(columns={"u": "v"})
     other.to_parquet(folders[1] / "part.3.parquet")
-    refused("part.3.parquet has other columns than part.0.parquet .differing: u, v", optid.open_stream, folders[1])
+    refuses(DataError, "part.3.parquet has other columns than part.0.parquet .differing: u, v", optid.open_stream,
+            folders[1])
 
 
 def _timed(folder, *pieces, gap=0.0):

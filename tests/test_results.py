@@ -7,7 +7,7 @@ import sys
 
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import refuses
 from sample_fits import example_fit, linear_fit, mimo_fit
 
 import optid
@@ -56,7 +56,7 @@ def test_intervals_widen_with_their_level_and_are_named_after_it():
     half, most = noisy.conf_int(0.5), noisy.conf_int(0.99)
     assert all(b.lower < a.lower < a.estimate < a.upper < b.upper for a, b in zip(half, most) if a.error > 0)
     assert "99 % low" in str(most)
-    refused("level", fit.conf_int, 1.5, error=StructureError)
+    refuses(StructureError, "level", fit.conf_int, 1.5)
 
 
 def _noisy() -> optid.Data:

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from refusals import refused
+from refusals import refuses
 from scipy.signal import lfilter
 
 import optid
 from optid.data.stretches import between_gaps, with_whole_inputs
-from optid.errors import DataWarning, OptidError
+from optid.errors import DataError, DataWarning, OptidError
 
 ORDERS = {"na": 2, "nb": 2, "nk": 1}
 
@@ -33,7 +33,7 @@ def test_stretches_of_several_experiments():
         assert e.start == data.experiments[i].start + part.start * 0.5
     assert cut.transform == data.transform and cut.input_units == ("V", "A")
     assert [e.n_samples for e in between_gaps(data, 11).experiments] == [14]  # ten outputs in the last stretch
-    refused("no stretch of 15 samples", between_gaps, data, 15)
+    refuses(DataError, "no stretch of 15 samples", between_gaps, data, 15)
     with pytest.warns(DataWarning, match=r"'u1' \(3 samples\), 'u2' \(2 samples\).*33 of 42 samples.*3 stretches.*; 1 "
                                          "shorter than 5 outputs is left out"):
         assert with_whole_inputs(data, 5).n_samples == 33
