@@ -13,7 +13,7 @@ from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.models import HammersteinTF
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
-from optid.structures.least_squares import LeastSquaresStructure
+from optid.structures.least_squares import LinearStructure
 
 
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
@@ -66,5 +66,5 @@ def _programme(problem: EquationError) -> Program:
     return Program(
         "arx", objective, constraints, {**linear, **b, "residual": r}, {}, recover,
         problem.view({**linear, **b}), structural=frozenset(constraints), derived={"residual": residual},
-        structure=LeastSquaresStructure(problem.problem, (*linear, *b)), scale=problem.problem.scale,
+        structure=LinearStructure(problem.problem, (*linear, *b)), scale=problem.problem.scale,
         unit=problem.unit, compressed=problem)

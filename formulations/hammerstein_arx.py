@@ -29,7 +29,7 @@ from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
 from optid.structures.bilinear import starts
-from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
+from optid.structures.least_squares import LinearStructure, RankOneStructure
 from optid.structures.lifted_regression import leading_pairs
 
 
@@ -200,7 +200,7 @@ def _relaxed(problem: EquationError, builders: Sequence[Any], gauge: str, weight
     objective = cp.Minimize(squares if weight is None else squares + 2 / problem.unit * tau * norms)
     constraints = {"residual": (r == residual,)}
 
-    form: dict[str, Any] = {"structure": LeastSquaresStructure(problem.problem, (*linear, *theta))}
+    form: dict[str, Any] = {"structure": LinearStructure(problem.problem, (*linear, *theta))}
     if weight is not None:
         form = {"parameters": {"weight": tau},
                 "certify": partial(certify_nuclear, problem.problem, heights / problem.unit)}

@@ -47,7 +47,7 @@ from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.statistics.linearised import Linearised
-from optid.structures.least_squares import LeastSquaresStructure
+from optid.structures.least_squares import LinearStructure
 
 Array = np.ndarray
 Orders = int | Sequence[int]
@@ -194,7 +194,7 @@ class _Fit(TangentFit):
         program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
                           {**usual, "residual": at.whole[1]}, self.recover, view, frozenset(structural),
                           derived={"residual": residual}, scale=self.criterion.energy, compressed=compressed,
-                          structure=None if damping else LeastSquaresStructure(compressed.problem,
+                          structure=None if damping else LinearStructure(compressed.problem,
                                                                                tuple(self.places.names)),
                           unit=self.criterion.unit)
         return program.subject_to(*self.constraints)

@@ -49,7 +49,7 @@ from optid.program.solution import Bound, Solution, Status
 from optid.program.units import energy_unit, outer_bases
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.least_squares import LeastSquaresStructure, RankOneStructure
+from optid.structures.least_squares import LinearStructure, RankOneStructure
 
 # multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme
 RELAXED = 150
@@ -103,31 +103,38 @@ def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block
 def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
     """Pose the least squares of a plan under its constraints on coefficients; ``recover`` gives the model."""
     problem, form, units = realisation.problem, realisation.form, plan.units
-    shape = form.n if form.experiments == 1 else (form.n, form.experiments)
-    linear = {"x0": cp.Variable(shape, name="x0")} | ({"offset": cp.Variable(form.l, name="offset")}
-                                                      if form.offset else {})
-    names = realisation.names
+    names, linear = realisation.names, ("x0", "offset") if form.offset else ("x0",)
     if realisation.factored:
-        mus = [cp.Variable(p, name=mu) for (mu, _, _), (p, _) in zip(names, form.blocks)]
-        bs = [cp.Variable(entries, name=b) for (_, b, _), (_, entries) in zip(names, form.blocks)]
-        thetas = [cp.outer(mu, b) for mu, b in zip(mus, bs)]
-        variables = linear | {one.name(): one for pair in zip(mus, bs) for one in pair}
-        gauge = {"gauge": tuple(cp.sum_squares(b) == 1 for b in bs)}
-        structure = RankOneStructure(problem, tuple(linear), tuple((mu, b) for mu, b, _ in names), "norm")
-        certify = partial(certify_rank_one, max_size=RELAXED)
+        structure = RankOneStructure(problem, linear, tuple((mu, b) for mu, b, _ in names), "norm")
+        certify, structural = partial(certify_rank_one, max_size=RELAXED), frozenset({"residual", "gauge"})
     else:
-        thetas = [cp.Variable(shape, name=theta) for (_, _, theta), shape in zip(names, form.blocks)]
-        variables = linear | {theta.name(): theta for theta in thetas}
-        gauge, structure, certify = {}, LeastSquaresStructure(problem, tuple(variables)), None
-    error = problem.root @ cp.hstack([flat(part) for part in (*linear.values(), *thetas)]) - problem.target
-    residual = cp.Variable(error.size, name="residual")
-    structural = {"residual": (residual == error,), **gauge}
+        structure = LinearStructure(problem, (*linear, *(theta for _, _, theta in names)))
+        certify, structural = None, frozenset({"residual"})
+
+    def statement() -> dict[str, Any]:
+        shape = form.n if form.experiments == 1 else (form.n, form.experiments)
+        variables = {name: cp.Variable(shape if name == "x0" else form.l, name=name) for name in linear}
+        gauge = {}
+        if realisation.factored:
+            mus = [cp.Variable(p, name=mu) for (mu, _, _), (p, _) in zip(names, form.blocks)]
+            bs = [cp.Variable(entries, name=b) for (_, b, _), (_, entries) in zip(names, form.blocks)]
+            thetas = [cp.outer(mu, b) for mu, b in zip(mus, bs)]
+            factors = {one.name(): one for pair in zip(mus, bs) for one in pair}
+            gauge = {"gauge": tuple(cp.sum_squares(b) == 1 for b in bs)}
+        else:
+            thetas = [cp.Variable(shape, name=theta) for (_, _, theta), shape in zip(names, form.blocks)]
+            factors = {theta.name(): theta for theta in thetas}
+        error = problem.root @ cp.hstack([flat(part) for part in (*variables.values(), *thetas)]) - problem.target
+        residual = cp.Variable(error.size, name="residual")
+        variables |= factors
+        return {"objective": cp.Minimize(cp.sum_squares(residual) + problem.remainder),
+                "constraints": {"residual": (residual == error,), **gauge}, "derived": {"residual": error},
+                "variables": {**variables, "residual": residual}, "view": _view(realisation, units, variables, thetas)}
+
     relative = np.any(form.weights != 1)  # to the sizes of the outputs, which have the same unit as the residuals
-    return Program(
-        plan.name, cp.Minimize(cp.sum_squares(residual) + problem.remainder), structural,
-        {**variables, "residual": residual}, realisation.start(), partial(realisation.model, plan.data),
-        _view(realisation, units, variables, thetas), structural=frozenset(structural), derived={"residual": error},
-        scale=problem.scale, unit=1.0 if relative else energy_unit(units),
+    return Program.deferred(
+        plan.name, statement, start=realisation.start(), recover=partial(realisation.model, plan.data),
+        structural=structural, scale=problem.scale, unit=1.0 if relative else energy_unit(units),
         structure=structure, certify=certify).subject_to(*plan.about("coefficients"))
 
 

@@ -228,7 +228,7 @@ def test_nothing_is_printed_unless_asked(name, capfd):
     assert captured.out == "" and captured.err == ""
 
 
-NO_TOLERANCE = {"glpk", "scipy", "scip", "ipopt", "fatrop", "uno", "gauss_newton", "alternating", "admm",
+NO_TOLERANCE = {"glpk", "scipy", "scip", "ipopt", "fatrop", "uno", "gauss_newton", "lstsq", "alternating", "admm",
                 "block_descent"}
 
 

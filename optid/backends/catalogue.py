@@ -10,7 +10,7 @@ from typing import Any
 
 from optid.backends.back_end import Answer, BackEnd
 from optid.structures.group_sparse import GroupSparseStructure
-from optid.structures.least_squares import RankOneStructure
+from optid.structures.least_squares import LinearStructure, RankOneStructure
 from optid.structures.nuclear_norm import NuclearNormStructure
 
 CONIC: dict[str, tuple[str, str, str]] = {
@@ -70,6 +70,8 @@ def back_ends() -> list[BackEnd]:
         BackEnd("uno", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.uno:run"),
                 installed=_is_installed("unopy") and _is_installed("sparsediffpy"), pip="unopy sparsediffpy", warm=True,
                 about="SQP through CVXPY's derivative engine; small dense programmes"),
+        BackEnd("lstsq", frozenset(), partial(_run, "optid.backends.lstsq:run"), structures=(LinearStructure,),
+                about="one factorisation, for least squares without products and constraints"),
         BackEnd("gauss_newton", frozenset(), partial(_run, "optid.backends.gauss_newton:run"),
                 structures=(RankOneStructure,), warm=True, thorough={"starts": 32, "directions": 16, "descents": 12},
                 about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints"),

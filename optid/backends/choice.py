@@ -58,7 +58,7 @@ def find(name: str) -> BackEnd:
 
 
 AUTO: dict[str, tuple[str, ...]] = {
-    "rank-one": ("gauss_newton",), "nuclear": ("admm",), "group-sparse": ("block_descent",),
+    "linear": ("lstsq",), "rank-one": ("gauss_newton",), "nuclear": ("admm",), "group-sparse": ("block_descent",),
     "small NLP": ("uno", "ipopt"), "NLP": ("ipopt", "uno"), "convex": ("clarabel", "scs"),
 }
 """What `choose` chooses from: the first installed back end of a structure or class of programme."""

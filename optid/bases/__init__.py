@@ -119,8 +119,11 @@ def fitted_bases(data: "Data | Stream", basis: Bases) -> tuple[Basis, ...]:
 
 def feedback_bases(data: "Data", given: FeedbackBases) -> list[Basis | None]:
     """Return one basis with an interval, or None, per output, as `fitted_bases` does for the inputs."""
-    y = np.concatenate([e.y for e in data.experiments])
-    return _one_each(given, data.outputs, "output", (np.fmin.reduce(y), np.fmax.reduce(y)), "feedback ")
+    low, high = np.zeros((2, data.l))
+    if given is not None:
+        y = np.concatenate([e.y for e in data.experiments])
+        low, high = np.fmin.reduce(y), np.fmax.reduce(y)
+    return _one_each(given, data.outputs, "output", (low, high), "feedback ")
 
 
 def _one_each(given: Any, channels: Sequence[str], kind: str, ranges: Sequence[Any], feedback: str = "") -> list[Any]:

@@ -40,14 +40,20 @@ def own_units(data: Any, linear: Sequence[bool] = (), centred: bool = True) -> T
 
 def _moments(arrays: Sequence[np.ndarray], centred: bool) -> tuple[np.ndarray, np.ndarray]:
     """Means (zero unless centred) of the channels of arrays (N, channels), and standard deviations about them."""
-    count = sum(np.sum(~np.isnan(array), axis=0) for array in arrays)
+    count = sum(_sums(1.0 - np.isnan(array)) for array in arrays)
     level = np.zeros(arrays[0].shape[1])
     for _ in range(2 if centred else 0):  # a second pass removes the rounding of the first
-        level = level + sum(np.nansum(array - level, axis=0) for array in arrays) / np.maximum(count, 1)
-    energy = sum(np.nansum((array - level) ** 2, axis=0) for array in arrays)
+        level = level + sum(_sums(array - level) for array in arrays) / np.maximum(count, 1)
+    energy = sum(_sums((array - level) ** 2) for array in arrays)
     spread = np.sqrt(energy / np.maximum(count, 1))
     spread[spread <= 4 * np.finfo(float).eps * np.abs(level)] = 0.0  # a constant channel varies by rounding alone
     return level, spread
+
+
+def _sums(array: np.ndarray) -> np.ndarray:
+    """Sums of the columns without what is missing; a product is several times faster than a reduction of rows."""
+    found = np.ones(len(array)) @ array
+    return np.nansum(array, axis=0) if np.isnan(found).any() else found
 
 
 def in_units(data: Any, units: Transform) -> Any:

@@ -207,13 +207,14 @@ def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Seq
     """
     m = len(inputs)
     for kind, names, columns in (("input", inputs, slice(0, m)), ("output", outputs, slice(m, None))):
-        samples = np.concatenate([record[:, columns] for record in records])
-        present = ~np.isnan(samples @ np.ones(len(names)))
-        samples = samples if present.all() else samples[present]
-        if len(samples) <= len(names) + 1:
-            raise DataError(f"only {len(samples)} samples have all {kind}s at once: {len(names)} {kind}s cannot be "
+        rows = np.ones((sum(map(len, records)), 1 + len(names)))
+        np.concatenate([record[:, columns] for record in records], out=rows[:, 1:])
+        present = ~np.isnan(rows @ np.ones(1 + len(names)))
+        rows = rows if present.all() else rows[present]
+        if len(rows) <= len(names) + 1:
+            raise DataError(f"only {len(rows)} samples have all {kind}s at once: {len(names)} {kind}s cannot be "
                             "told apart from so few.")
-        root = root_of_rows(np.hstack([np.ones((len(samples), 1)), samples]))
+        root = root_of_rows(rows)
         for c, name in enumerate(names, start=1):
             if np.abs(root[c, c]) <= 10 * ROUNDING["qr"] * np.linalg.norm(root[:, c]):
                 if np.linalg.norm(root[1 : c + 1, c]) <= 10 * ROUNDING["qr"] * np.linalg.norm(root[:, c]):

@@ -20,8 +20,6 @@ class LeastSquaresStructure(Structure):
     The structural constraints of its programme only fix directions that do not change F.
     """
 
-    word: ClassVar[str] = "least-squares"
-    constrained: ClassVar[bool] = True
     problem: Any  # the numbers, see `optid.program.compressed.Compressed`
     linear: tuple[str, ...]  # names of the linear variables in the order of z (each flattened column by column)
     blocks: tuple[tuple[str, str], ...] = ()  # (mu name, b name) of every rank-one block; none without products
@@ -58,19 +56,6 @@ class LeastSquaresStructure(Structure):
             worst = max(worst, relative_gradient(np.abs(pull[first:last]), effort[first:last], yardstick, size))
         return value, worst
 
-
-@dataclass(frozen=True, eq=False)
-class RankOneStructure(LeastSquaresStructure):
-    """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate."""
-
-    word: ClassVar[str] = "rank-one"
-    problem: RankOne
-
-    @property
-    def about(self) -> str:
-        """What the programme is and how large."""
-        return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
-
     def named(self, point: Point, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
         """Name the parts of a point, in the shapes of the variables."""
         parts = np.split(point.w, np.cumsum([prod(shapes[name]) for name in self.linear])[:-1])
@@ -90,6 +75,32 @@ class RankOneStructure(LeastSquaresStructure):
             worst = worst if amount <= worst else amount  # also nan
         found["residual"] = self.problem.root @ self.point(found).lift() - self.problem.target
         return found, worst, "gauge" if worst else ""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearStructure(LeastSquaresStructure):
+    """Least squares without products, which a matrix factorisation solves."""
+
+    word: ClassVar[str] = "linear"
+
+    @property
+    def about(self) -> str:
+        """What the programme is and how large."""
+        return f"least squares with {self.problem.root.shape[1]} unknowns and no products"
+
+
+@dataclass(frozen=True, eq=False)
+class RankOneStructure(LeastSquaresStructure):
+    """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate."""
+
+    word: ClassVar[str] = "rank-one"
+    constrained: ClassVar[bool] = True
+    problem: RankOne
+
+    @property
+    def about(self) -> str:
+        """What the programme is and how large."""
+        return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
 
 
 def rank_one_of(program: Any) -> RankOneStructure | None:

@@ -100,7 +100,7 @@ def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, of
         units = Transform.identity(data.m, data.l)
     inner = [one and one.mapped(1 / scale, -level / scale)[0]
              for one, scale, level in zip(outputs, units.y_scale, units.y_offset)]
-    return Plan(name, in_units(data, units), basis=inner_bases(inputs, units), feedback_basis=inner or None,
+    return Plan(name, in_units(data, units), basis=inner_bases(inputs, units), feedback_basis=inner if any(inner) else None,
                 offset=bool(offset), units=units, **settings)
 
 

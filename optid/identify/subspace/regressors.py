@@ -119,7 +119,8 @@ class ObserverForm:
             y = target[start : start + chunk].T
             for o in range(self.l):
                 rows = self._rows(o, signals, out[o], y[o])
-                rows *= self.weights[o]
+                if self.weights[o] != 1:
+                    rows *= self.weights[o]
                 present = ~np.isnan(y[o])
                 yield rows if present.all() else rows[:, present]
 

@@ -1,0 +1,26 @@
+"""Least squares without products or constraints by one factorisation, beside the iterations of general solvers."""
+
+import numpy as np
+
+from optid.backends.back_end import Answer, Settings
+from optid.program.program import Program
+from optid.program.solution import Status
+from optid.structures.least_squares import LinearStructure
+from optid.structures.rank_one import Point
+
+
+def run(program: Program, settings: Settings) -> Answer:
+    """Solve a programme that carries a `LinearStructure` and no further constraints; there are no options.
+
+    Of several minimisers it returns the shortest, with the columns at length one.
+    """
+    from scipy.linalg import lstsq
+
+    form = program.structure
+    assert isinstance(form, LinearStructure)
+    root, target = form.problem.root, form.problem.target
+    lengths = np.linalg.norm(root, axis=0)
+    lengths[lengths == 0] = 1.0
+    z = lstsq(root / lengths, target, lapack_driver="gelsy")[0] / lengths
+    values = form.named(Point(z, (), ()), program.shapes)
+    return Answer(Status.LOCAL, "factorised", values, {"residual": -2.0 * (root @ z - target)})
