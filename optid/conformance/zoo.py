@@ -15,7 +15,7 @@ import numpy as np
 from optid.program.program import Program
 from optid.program.view import View
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
-from optid.structures.least_squares import RankOneStructure
+from optid.structures.least_squares import LinearStructure, RankOneStructure
 from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
 from optid.structures.rank_one import RankOne
 
@@ -39,7 +39,7 @@ class Case:
 @cache
 def cases() -> tuple[Case, ...]:
     """Return every case, classes LP, QP, SOCP, SDP, conic, NLP, rank-one, nuclear and group-sparse among them."""
-    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), *_rank_one(), _nuclear(), _group_sparse())
+    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), _least_squares(), *_rank_one(), _nuclear(), _group_sparse())
 
 
 def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: Sequence[cp.Variable],
@@ -188,11 +188,31 @@ def planted_fit() -> tuple[np.ndarray, np.ndarray]:
     return matrix, matrix @ truth + 0.1 * rng.standard_normal(60)
 
 
-def _rank_one() -> list[Case]:
+def _compressed_fit() -> RankOne:
     matrix, y = planted_fit()
     triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, y]), mode="r"))
-    root, target, remainder, scale = triangle[:-1, :-1], triangle[:-1, -1], float(triangle[-1, -1] ** 2), float(y @ y)
-    structure = RankOneStructure(RankOne(root, target, remainder, ((4, 2),), 1, scale), ("a",), (("mu", "b"),))
+    return RankOne(triangle[:-1, :-1], triangle[:-1, -1], float(triangle[-1, -1] ** 2), ((4, 2),), 1, float(y @ y))
+
+
+def _least_squares() -> Case:
+    """The same fit without the products, by the normal equations."""
+    (matrix, y), fit = planted_fit(), _compressed_fit()
+    best = np.linalg.solve(matrix.T @ matrix, matrix.T @ y)
+
+    def statement(z: Any, r: Any) -> tuple:
+        residual = fit.root @ z - fit.target
+        return cp.sum_squares(r) + fit.remainder, {"residual": r == residual}, {
+            "structural": frozenset({"residual"}), "derived": {"r": residual}, "structure": LinearStructure(fit, ("z",)),
+            "scale": fit.scale}
+
+    return _case("qp_compressed_fit", {"z": 9, "r": 9}, statement, {"z": np.zeros(9)},
+                 value=float(np.sum((y - matrix @ best) ** 2)), point={"z": best})
+
+
+def _rank_one() -> list[Case]:
+    problem = _compressed_fit()
+    root, target, remainder, scale = problem.root, problem.target, problem.remainder, problem.scale
+    structure = RankOneStructure(problem, ("a",), (("mu", "b"),))
     rising = {"mu": np.array([-1.0, 0.0, 0.0, 1.0]), "b": np.array([0.7, 0.7])}
 
     def bilinear(name: str, sign: float, convex: bool, value: float) -> Case:

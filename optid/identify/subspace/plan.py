@@ -100,8 +100,8 @@ def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, of
         units = Transform.identity(data.m, data.l)
     inner = [one and one.mapped(1 / scale, -level / scale)[0]
              for one, scale, level in zip(outputs, units.y_scale, units.y_offset)]
-    return Plan(name, in_units(data, units), basis=inner_bases(inputs, units), feedback_basis=inner if any(inner) else None,
-                offset=bool(offset), units=units, **settings)
+    return Plan(name, in_units(data, units), basis=inner_bases(inputs, units), offset=bool(offset), units=units,
+                feedback_basis=inner if any(inner) else None, **settings)
 
 
 def in_record_units(procedure: Procedure, plan: Plan) -> Procedure:
