@@ -56,4 +56,4 @@ def test_a_solver_that_was_asked_for_is_not_replaced(monkeypatch):
     monkeypatch.setattr(optid.solving.solve, "choose", failing)
     monkeypatch.setattr(optid.backends.choice, "FALLBACKS", ())
     with pytest.raises(SolverFailed, match="clarabel gave no usable answer .*numbers ran out"):
-        optid.fit(level(), "oe.exact", na=2, nb=2)
+        optid.fit(level(), "oe.exact", na=2, nb=2, constraints=["stable:0.999"])

@@ -21,7 +21,7 @@ def run(program: Program, settings: Settings) -> Answer:
     root, target = form.problem.root, form.problem.target
     lengths = np.linalg.norm(root, axis=0)
     lengths[lengths == 0] = 1.0
-    scaled, *_ = lstsq(root / lengths, target, lapack_driver="gelsy")
-    z = np.asarray(scaled) / lengths
+    found = lstsq(root / lengths, target, lapack_driver="gelsy")
+    z = found[0] / lengths  # pyright: ignore[reportOptionalSubscript]
     values = form.named(Point(z, (), ()), program.shapes)
     return Answer(Status.LOCAL, "factorised", values, {"residual": -2.0 * (root @ z - target)})

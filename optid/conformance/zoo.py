@@ -39,7 +39,8 @@ class Case:
 @cache
 def cases() -> tuple[Case, ...]:
     """Return every case, classes LP, QP, SOCP, SDP, conic, NLP, rank-one, nuclear and group-sparse among them."""
-    return (*_linear(), *_quadratic(), *_conic(), *_nonlinear(), _least_squares(), *_rank_one(), _nuclear(), _group_sparse())
+    return (*_linear(), *_quadratic(), _least_squares(), *_conic(), *_nonlinear(), *_rank_one(), _nuclear(),
+            _group_sparse())
 
 
 def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: Sequence[cp.Variable],
@@ -202,8 +203,8 @@ def _least_squares() -> Case:
     def statement(z: Any, r: Any) -> tuple:
         residual = fit.root @ z - fit.target
         return cp.sum_squares(r) + fit.remainder, {"residual": r == residual}, {
-            "structural": frozenset({"residual"}), "derived": {"r": residual}, "structure": LinearStructure(fit, ("z",)),
-            "scale": fit.scale}
+            "structural": frozenset({"residual"}), "derived": {"r": residual}, "scale": fit.scale,
+            "structure": LinearStructure(fit, ("z",))}
 
     return _case("qp_compressed_fit", {"z": 9, "r": 9}, statement, {"z": np.zeros(9)},
                  value=float(np.sum((y - matrix @ best) ** 2)), point={"z": best})
