@@ -172,3 +172,41 @@ def test_without_an_actuator_that_moves_it_is_said_what_is_out_of_reach():
     np.testing.assert_allclose(target.y, dead.equilibrium(np.zeros(2))[1])
     with pytest.raises(StructureError, match="not reachable: nothing acts on y1, y2"):
         left.controller()
+
+
+@pytest.mark.parametrize(("direct", "room"), [(0.0, 0.048), (1.0, 0.048), (200.0, None)])
+def test_the_margin_of_a_range_is_what_the_noise_hides(direct, room):
+    """A static plant y = direct f(u) + x, whose noise and slope are known: room = a tenth of the noise over the slope."""
+    from fault_plants import noisy
+
+    from optid.bases import Polynomial
+    from optid.faults.ranges import known_range
+    from optid.models import Nonlinearity
+
+    f = Nonlinearity(Polynomial(2, interval=(-1.2, 1.2)), np.array([2.0, 0.0]))
+    slow = noisy([[0.5]], [[0.0]], [[1.0]], [[1.0]], [[3.0]], D=[[direct]], nonlinearities=(f,))
+    (low,), (high,) = known_range(slow)
+    if room is None:
+        change = f(-1.2 + 0.048) - f(-1.2)
+        room = 0.048 * 0.1 * np.sqrt(slow.noise.innovation[0, 0]) / (direct * change)
+        assert room < 0.002
+    assert (low, high) == pytest.approx((-1.2 - room, 1.2 + room))
+
+
+def test_a_direct_effect_just_outside_the_range_raises_no_alarm():
+    """Readings almost without noise show by how little an input left its range: that is told, and is no fault."""
+    from fault_plants import noisy
+
+    from optid.bases import Polynomial
+    from optid.faults import Monitor
+    from optid.models import Nonlinearity
+
+    def plant(outside):
+        f = tuple(Nonlinearity(Polynomial(2, (-1.2, 1.2), outside=outside), np.array([1.0, 0.0])) for _ in range(2))
+        return noisy([[0.7]], [[1.0, 0.5]], [[1.0], [0.4]], [[1e-4]], np.eye(2) * 1e-4, nonlinearities=f,
+                     D=[[1.0, 0.0], [0.0, 1.0]])
+
+    u = levels(600, 3)
+    u[300:310, 1], u[400:410, 0] = 1.24, -1.24
+    events = Monitor(plant("clamp"), window=30, thresholds=np.full(9, 30.0)).run(u, inject(plant("extrapolate"), u, (), seed=4))
+    assert [(e.kind, e.sample) for e in events if e.kind != "inside"] == [("outside", 300), ("outside", 400)]

@@ -11,12 +11,19 @@ import numpy as np
 from optid.arrays import Array
 from optid.bases import UserFunctions
 from optid.errors import DataError
+from optid.models.model import impulse_response
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
-TOLERATED = 0.01
-"""Share of the range by which an input may leave it without a word."""
+TOLERATED = 0.02
+"""Share of the range by which an input may leave it without a word, as long as nothing is seen of that."""
+
+UNSEEN = 0.1
+"""Standard deviations of the noise that the unknown part of the effect may shift an output by."""
+
+REACH = 50
+"""Samples after which the effect of an input is not looked at any more."""
 
 MOST = 400
 """Samples outside at most."""
@@ -54,15 +61,34 @@ def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
         u: (N, m) inputs.
     """
     found = []
-    for column, (f, c) in enumerate(zip(model.nonlinearities, model.input_of)):
-        interval = f.basis.interval
-        if interval is None or isinstance(f.basis, UserFunctions):
-            continue
-        slack = TOLERATED * (interval[1] - interval[0])
-        samples = np.flatnonzero((u[:, c] < interval[0] - slack) | (u[:, c] > interval[1] + slack))
+    for column, (low, high) in enumerate(zip(*known_range(model))):
+        x = u[:, model.input_of[column]]
+        samples = np.flatnonzero((x < low) | (x > high))
         if samples.size:
-            found.append(Outside(model.inputs[c], column, interval, samples))
+            interval = model.nonlinearities[column].basis.interval
+            found.append(Outside(model.inputs[model.input_of[column]], column, interval, samples))
     return found
+
+
+def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
+    """Return (low, high), both (K,), between which every function of an input is known well enough.
+
+    That is its interval and what is `TOLERATED` beyond, less where the outputs would show it: outside its interval a
+    function may stand still or go on as it likes, and an input with direct effect tells that from the noise at once.
+    """
+    low, high = np.full((2, len(model.nonlinearities)), np.inf) * [[-1.0], [1.0]]
+    response = impulse_response(model.A, model.B, model.C, model.D, REACH)
+    noise = np.sqrt(np.diag(model.noise.innovation)) if model.noise is not None else np.zeros(model.l)
+    for column, f in enumerate(model.nonlinearities):
+        if f.basis.interval is None or isinstance(f.basis, UserFunctions):
+            continue
+        first, last = f.basis.interval
+        room = TOLERATED * (last - first)
+        change = max(abs(f(first + room) - f(first)), abs(f(last) - f(last - room)))
+        seen = change * np.max(np.abs(response[:, :, column]), axis=0)  # of every output
+        room *= min(1.0, float(np.min(UNSEEN * noise / np.maximum(seen, 1e-300))))
+        low[column], high[column] = first - room, last + room
+    return low, high
 
 
 def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:

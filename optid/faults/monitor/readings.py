@@ -6,6 +6,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.monitor.events import Event
+from optid.faults.ranges import known_range
 from optid.models import HammersteinSS
 
 DEAD = 10
@@ -16,9 +17,6 @@ FROZEN = 5
 
 CHANCE = 1e-10
 """Probability of so many identical readings in a row from a healthy sensor, at most."""
-
-MARGIN = 0.02
-"""Share of the identified range by which an input may leave it."""
 
 
 class Screened(NamedTuple):
@@ -52,11 +50,8 @@ class ReadingChecks:
         """Begin a stream."""
         m, l = model.m, model.l  # noqa: E741
         self.model, self.low, self.high = model, np.full(m, -np.inf), np.full(m, np.inf)
-        for c, function in zip(model.input_of, model.nonlinearities):
-            low, high = function.basis.interval or (-np.inf, np.inf)
+        for c, low, high in zip(model.input_of, *known_range(model)):
             self.low[c], self.high[c] = max(self.low[c], low), min(self.high[c], high)
-        room = MARGIN * np.where(np.isfinite(self.high - self.low), self.high - self.low, 0.0)
-        self.low, self.high = self.low - room, self.high + room
         self.memory: dict[str, Any] = {"last": [None] * l, "frozen": [False] * l, "outside": [-1] * m}
         self.memory |= {word: [0] * l for word in ("run", "repeats", "seen", "missing")}
 
