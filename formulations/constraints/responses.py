@@ -49,7 +49,6 @@ def step_response(sign: str = "positive", horizon: float = HORIZON, low: float |
     By default the step goes over the interval of the basis. Other arguments as in `impulse_response`, as are the errors
     raised.
     """
-
     return _response("step_response", sign, horizon, channel, output, lambda basis: _step(basis, low, high),
                      summed=True)
 
