@@ -1,0 +1,123 @@
+"""What a page asks for: channels, a window, a formulation with its arguments, and constraints set by hand."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from optid.data.record import Data
+from optid.errors import DataError, StructureError
+from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, named_constraint
+
+BAND = "step_band"
+"""The constraint that is a tangent at a model where there are past outputs."""
+
+PASSES = 3
+"""Fits around the model of the one before until the step response itself obeys a band."""
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A named constraint: the word of its function, its arguments, and the name under which its price is shown."""
+
+    word: str
+    arguments: Mapping[str, Any]
+    name: str
+
+    def rule(self, **more: Any) -> Any:
+        """Build it."""
+        try:
+            return entry_point(CONSTRAINTS, self.word).load()(**self.arguments, **more).named(self.name)
+        except TypeError as error:
+            raise StructureError(f"constraint {self.word!r}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Request:
+    """One state of the page.
+
+    Attributes:
+        inputs: names of the inputs.
+        outputs: names of the outputs.
+        window: first sample and the one after the last.
+        formulation: its name.
+        arguments: of the formulation.
+        constraints: set by hand.
+    """
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    window: tuple[int, int]
+    formulation: str
+    arguments: Mapping[str, Any]
+    constraints: tuple[Constraint, ...] = ()
+
+    @classmethod
+    def parse(cls, state: Any) -> "Request":
+        """Read a state as the page sends it; anything else is a `DataError` or a `StructureError`."""
+        try:
+            constraints = tuple(Constraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
+                                for c in state["constraints"])
+            first, last = map(int, state["window"])
+            arguments = {str(key): value for key, value in state["arguments"].items() if value not in (None, "", [])}
+            found = cls(tuple(map(str, state["inputs"])), tuple(map(str, state["outputs"])), (first, last),
+                        str(state["formulation"]), arguments, constraints)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise DataError(f"the page sent a state that cannot be read ({type(error).__name__}: {error})") from None
+        entry_point(FORMULATIONS, found.formulation)
+        return found
+
+    @property
+    def key(self) -> str:
+        """A text that two states share where they ask for the same fit."""
+        constraints = [(c.word, dict(c.arguments), c.name) for c in self.constraints]
+        return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints],
+                          sort_keys=True)
+
+    def record(self, data: Data) -> Data:
+        """Return the channels and the window of a record."""
+        if not self.inputs or not self.outputs:
+            raise DataError("choose at least one input and one output")
+        return data.select(inputs=list(self.inputs), outputs=list(self.outputs)).window(*self.window)
+
+    def fit(self, data: Data) -> Any:
+        """Fit the record; a band of the step response by repeated fits, each around the model of the one before."""
+        from optid.identify.fitting import fit
+
+        record, rules = self.record(data), [c.rule() for c in self.constraints if c.word != BAND]
+        bands = [c for c in self.constraints if c.word == BAND]
+        if not (bands and self.arguments.get("na", 0)):
+            rules += [c.rule() for c in bands]
+            return fit(record, self.formulation, constraints=rules, **self.arguments)
+        found = fit(record, self.formulation, constraints=rules, **self.arguments)
+        for _ in range(PASSES):
+            around = [c.rule(around=found.model) for c in bands]
+            found = fit(record, self.formulation, constraints=[*rules, *around], **self.arguments)
+        return found
+
+
+def suggested(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the state a page begins with: that of a built-in example, or small orders for any record.
+
+    Args:
+        data: the record.
+        suggestion: arguments of a fit, with constraints as words.
+    """
+    orders = {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8"}
+    arguments = {key: suggestion.get(key, value) for key, value in orders.items()}
+    constraints = []
+    for text in suggestion.get("constraints", ()):
+        rule = named_constraint(text)
+        constraints.append({"word": text.partition(":")[0], "name": rule.name, "arguments": bound(rule.call)})
+    shortest = min(e.n_samples for e in data.experiments)
+    return {"inputs": list(data.inputs), "outputs": list(data.outputs), "window": [0, shortest],
+            "formulation": "hammerstein_arx.exact", "arguments": arguments, "constraints": constraints}
+
+
+def bound(call: tuple[str, str, tuple[Any, ...], Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the arguments of a recorded call by name."""
+    import inspect
+    from importlib import import_module
+
+    module, function, args, kwargs = call
+    return dict(inspect.signature(getattr(import_module(module), function)).bind(*args, **kwargs).arguments)
