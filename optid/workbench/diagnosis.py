@@ -1,4 +1,4 @@
-"""A diagnosis on the page: the record, how likely every fault is by its onset, the set, and what would be without one."""
+"""A diagnosis on the page: the record, how likely every fault is by its onset, the set; and all that without some."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -64,7 +64,7 @@ def _charts(found: Any, first: int) -> list[dict[str, Any]]:
         peaks = np.nanmax(np.where(np.isnan(seen.gains), -np.inf, seen.gains), axis=1)
         order = [int(i) for i in np.argsort(-peaks)[:SHOWN] if np.isfinite(peaks[i])]
         series = [Series(seen.labels[i], k, seen.gains[i], colour=f"c{j}", width=1.8) for j, i in enumerate(order)]
-        charts.append(Chart("Likelihood of each fault by its onset", "Energy that a fault explains beyond the threshold "
-                            "of an alarm: above zero a healthy plant hardly gets.", Axis("onset (sample)"),
+        charts.append(Chart("Likelihood of each fault by its onset", "Energy that a fault explains beyond the "
+                            "threshold of an alarm: above zero a healthy plant hardly gets.", Axis("onset (sample)"),
                             Axis("energy beyond the threshold"), series, "fault", height=320))
     return [coded(one) for one in charts]

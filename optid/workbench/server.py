@@ -75,8 +75,8 @@ class Server(ThreadingHTTPServer):
     @cached_property
     def scripts(self) -> str:
         """The scripts of the page."""
-        folder = files("optid") / "show" / "templates"
-        return "\n".join((folder / name).read_text(encoding="utf-8") for name in ("plot.js", "parts.js", "workbench.js"))
+        folder, names = files("optid") / "show" / "templates", ("plot.js", "parts.js", "workbench.js")
+        return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
 
     def page(self, secret: str) -> tuple[str, str]:
         """Return the page and its policy."""
@@ -87,7 +87,8 @@ class Server(ThreadingHTTPServer):
         data = self.source.data
         begin = {
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
-            "samples": min(e.n_samples for e in data.experiments), "origin": data.experiments[0].start, "inputs": list(data.inputs), "outputs": list(data.outputs),
+            "samples": min(e.n_samples for e in data.experiments), "origin": data.experiments[0].start,
+            "inputs": list(data.inputs), "outputs": list(data.outputs),
             "experiments": data.n_experiments, "model": self.source.model is not None,
             "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
         lead = f"{data.n_samples} samples every {data.dt:g}"
@@ -106,8 +107,8 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Open a page for who knows the token."""
         asked = urlsplit(self.path)
-        token = parse_qs(asked.query).get("token", [""])[0]
-        if not self._own() or asked.path != "/" or not secrets.compare_digest(token.encode(), self.server.token.encode()):
+        token = parse_qs(asked.query).get("token", [""])[0].encode()
+        if not (self._own() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
             return self._send(403, "Open the address that optid workbench has printed, with its token.", "text/plain")
         body, policy = self.server.page(self.server.opened())
         self._send(200, body, "text/html", policy)

@@ -88,7 +88,8 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
         value = shown(model)
         band = None if known is None else known.of(shown)
         density, edges = np.histogram(samples[np.isfinite(samples)], bins=40, range=(low, high))
-        bars = Series("density of the samples", edges[:-1], density / max(density.max(), 1), "bars", "muted", aside=True)
+        bars = Series("density of the samples", edges[:-1], density / max(density.max(), 1), "bars", "muted",
+                      aside=True)
         for what, at, x, extra in (
                 ("static", points, Axis(_named(channel, record.input_units[c])), [bars]),
                 ("step", model.dt * np.arange(count), Axis("time"), [])):
@@ -104,7 +105,7 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
 
 
 def static(model: Any, c: int, points: Array) -> Array:
-    """Return the first output at rest while an input is held at points (k,) and the functions of the others are zero."""
+    """Return the first output at rest with an input held at points (k,), the functions of the others at zero."""
     if model.structure == "ss":
         rest = np.eye(model.nx) - model.A
         gain = model.C[0] @ np.linalg.solve(rest, model.B[:, c]) + model.D[0, c]
