@@ -53,19 +53,21 @@ class Bench:
             return {"error": str(error)}
 
     def _found(self, asked: Mapping[str, Any]) -> tuple[Any, Any]:
+        request = Request.parse(asked.get("state"))
+        with SOLVING, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what they say stands in the findings
+            return self._kept(request)
+
+    def _kept(self, request: Request) -> tuple[Any, Any]:
         from optid.show.charts import free_run
 
-        request = Request.parse(asked.get("state"))
-        with SOLVING:
-            if request.key not in self.fits:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")  # what they say stands in the findings
-                    fit = request.fit(self.source.data)
-                    self.fits[request.key] = fit, free_run(fit.model, fit.data.raw())
-            self.fits.move_to_end(request.key)
-            while len(self.fits) > KEPT:
-                self.fits.popitem(last=False)
-            return self.fits[request.key]
+        if request.key not in self.fits:
+            fit = request.fit(self.source.data, lambda free: self._kept(free)[0])
+            self.fits[request.key] = fit, free_run(fit.model, fit.data.raw())
+        self.fits.move_to_end(request.key)
+        while len(self.fits) > KEPT:
+            self.fits.popitem(last=False)
+        return self.fits[request.key]
 
     def _fit(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         started = time.perf_counter()

@@ -1,8 +1,8 @@
 """What a page asks for: channels, a window, a formulation with its arguments, and constraints set by hand."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from optid.data.record import Data
@@ -80,8 +80,13 @@ class Request:
             raise DataError("choose at least one input and one output")
         return data.select(inputs=list(self.inputs), outputs=list(self.outputs)).window(*self.window)
 
-    def fit(self, data: Data) -> Any:
-        """Fit the record; a band of the step response by repeated fits, each around the model of the one before."""
+    def fit(self, data: Data, begun: Callable[["Request"], Any] | None = None) -> Any:
+        """Fit the record; a band of the step response by repeated fits, each around the model of the one before.
+
+        Args:
+            data: the whole record.
+            begun: returns the fit of the same request without bands, where it may be known.
+        """
         from optid.identify.fitting import fit
 
         record, rules = self.record(data), [c.rule() for c in self.constraints if c.word != BAND]
@@ -89,7 +94,8 @@ class Request:
         if not (bands and self.arguments.get("na", 0)):
             rules += [c.rule() for c in bands]
             return fit(record, self.formulation, constraints=rules, **self.arguments)
-        found = fit(record, self.formulation, constraints=rules, **self.arguments)
+        free = replace(self, constraints=tuple(c for c in self.constraints if c.word != BAND))
+        found = free.fit(data) if begun is None else begun(free)
         for _ in range(PASSES):
             around = [c.rule(around=found.model) for c in bands]
             found = fit(record, self.formulation, constraints=[*rules, *around], **self.arguments)

@@ -15,7 +15,7 @@ from optid.show.sections import TONES, Axis, Chart, Series
 BINS = 700
 """Stretches of the time axis, of each of which the extremes are drawn."""
 
-POINTS, STEPS = 61, 120
+POINTS, STEPS = 41, 60
 """Places of the band of a characteristic; samples of a step response at most."""
 
 
