@@ -85,7 +85,7 @@ let plots = 0;
 // spec: label, x and y axes {title, log, categories, ticks, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
 // rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off. Curves may have lows
 // (bands); `aside` keeps a series out of the extent, `equal` makes both units as long, `cursor` shows every curve at a place,
-// and `moved(low, high)` hears of another extent of x. `above(frame)` returns what a tool draws over the curves, and
+// and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws under the curves, and
 // `grab(event, x, y, frame)` may take a press of the mouse for it, and then returns true.
 function makePlot(host, spec, hidden) {
   const id = "plot" + ++plots, box = element("div", { class: "plot" });
@@ -166,8 +166,8 @@ function makePlot(host, spec, hidden) {
       body.append(element("svg:line", { class: "rule", x1: f.left, x2: right, y1: y, y2: y }),
         element("svg:text", { x: right - 4, y: y - 5, "text-anchor": "end" }, rule.label));
     }
+    if (spec.below) body.append(...spec.below(f));
     for (const one of series) if (!hidden.has(one.name)) body.append(...drawn(one, f, right));
-    if (spec.above) body.append(...spec.above(f));
     svg.replaceChildren(element("svg:defs", {}, clip), ...parts, body);
   }
 

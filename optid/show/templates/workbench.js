@@ -113,7 +113,7 @@ function drawChart(figure, chart, key) {
   };
   addLegend(host, chart.title, series, hidden, () => kept.plot.draw());
   kept.plot = makePlot(host, { ...chart, label: `${chart.title}. ${chart.caption}`, series, moved: chart.group ? moved : null,
-    above: (f) => (tool ? hands(kept.chart, f) : []), grab: (event, x, y, f) => tool && grab(event, x, y, f, kept) }, hidden);
+    below: (f) => (tool ? hands(kept.chart, f) : []), grab: (event, x, y, f) => tool && grab(event, x, y, f, kept) }, hidden);
   kept.update = (next) => { kept.chart = next; heading.textContent = next.title; kept.plot.setSeries(withPins(next), dragged || (tool === "time" && view)); };
   return kept;
 }
@@ -153,6 +153,7 @@ function pixels(c, chart, f) {
 }
 
 function hands(chart, f) {
+  const taken = [];
   return mine(chart).flatMap((c) => {
     const p = pixels(c, chart, f), price = priced(c), mx = (p.x0 + p.x1) / 2, my = (p.y0 + p.y1) / 2, parts = [], style = { class: price?.binding ? "hand" : "hand idle", "data-constraint": c.name };
     if (c.word === "disc") parts.push(element("svg:circle", { ...style, cx: mx, cy: my, r: (p.x1 - p.x0) / 2 }), element("svg:circle", { class: "grip", cx: p.x1, cy: my, r: 5 }));
@@ -164,7 +165,10 @@ function hands(chart, f) {
     if (c.word !== "saturation") parts.push(element("svg:circle", { class: "grip", "data-constraint": c.name, cx: mx, cy: my, r: 5.5 }));
     const word = !price ? c.name : price.binding && price.price !== null ? `${significant(price.price, 2)} points per 1 %` : price.binding ? "active" : "not active";
     const x = Math.min(Math.max(mx, f.left + 65), f.width - f.right - 65), above = Math.min(p.y0, p.y1) - 9;
-    return [...parts, element("svg:text", { class: "price", x, y: above > f.top + 12 ? above : Math.min(Math.max(p.y0, p.y1) + 18, f.height - f.bottom - 6), "text-anchor": "middle" }, word)];
+    let y = above > f.top + 12 ? above : Math.min(Math.max(p.y0, p.y1) + 18, f.height - f.bottom - 6);
+    for (let k = 0; k < 9 && taken.some(([u, v]) => Math.abs(u - x) < 130 && Math.abs(v - y) < 16); k++) y = y > f.height - f.bottom - 20 ? f.top + 14 : y + 16;
+    taken.push([x, y]);
+    return [...parts, element("svg:text", { class: "price", x, y, "text-anchor": "middle" }, word)];
   });
 }
 
