@@ -89,7 +89,8 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
     """Return the inequalities in the P and Q of a shift step; refuse a formulation without (`StructureError`)."""
     if not isinstance(view.poles, tuple):
         raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
-                             "coefficients of a polynomial, for which only 'stable' is available, and 'disc' up to na = 2")
+                             "coefficients of a polynomial, for which only 'stable' is available, and up to na = 2 "
+                             "'disc'")
     p, q = view.poles
     return [cp.kron(side.constant, p) + cp.kron(side.linear, q) + cp.kron(side.linear.T, q.T) >> 0 for side in sides]
 
