@@ -109,7 +109,7 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
         return "" if obeys else (f"constraint {name!r}: the step response goes from {np.min(found):.4g} to "
                                  f"{np.max(found):.4g}; fit again around this model")
 
-    return Rule(name, build, verify)
+    return Rule(name, build, verify, tangent=around is not None)
 
 
 @recorded

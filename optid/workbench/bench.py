@@ -53,7 +53,7 @@ class Bench:
             return {"error": str(error)}
 
     def _found(self, asked: Mapping[str, Any]) -> tuple[Any, Any]:
-        request = Request.parse(asked.get("state"))
+        request = Request.parse(asked.get("state"), bool(asked.get("draft")))
         with SOLVING, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what they say stands in the findings
             return self._kept(request)

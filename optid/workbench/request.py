@@ -43,6 +43,7 @@ class Request:
         formulation: its name.
         arguments: of the formulation.
         constraints: set by hand.
+        passes: fits around the model of the one before, for bands of the step response.
     """
 
     inputs: tuple[str, ...]
@@ -51,17 +52,18 @@ class Request:
     formulation: str
     arguments: Mapping[str, Any]
     constraints: tuple[Constraint, ...] = ()
+    passes: int = PASSES
 
     @classmethod
-    def parse(cls, state: Any) -> "Request":
-        """Read a state as the page sends it; anything else is a `DataError` or a `StructureError`."""
+    def parse(cls, state: Any, draft: bool = False) -> "Request":
+        """Read a state as the page sends it, a `draft` while a hand moves; anything else is a `DataError`."""
         try:
             constraints = tuple(Constraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
                                 for c in state["constraints"])
             first, last = map(int, state["window"])
             arguments = {str(key): value for key, value in state["arguments"].items() if value not in (None, "", [])}
             found = cls(tuple(map(str, state["inputs"])), tuple(map(str, state["outputs"])), (first, last),
-                        str(state["formulation"]), arguments, constraints)
+                        str(state["formulation"]), arguments, constraints, PASSES - draft)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise DataError(f"the page sent a state that cannot be read ({type(error).__name__}: {error})") from None
         entry_point(FORMULATIONS, found.formulation)
@@ -71,8 +73,8 @@ class Request:
     def key(self) -> str:
         """A text that two states share where they ask for the same fit."""
         constraints = [(c.word, dict(c.arguments), c.name) for c in self.constraints]
-        return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints],
-                          sort_keys=True)
+        return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints,
+                           self.passes if BAND in [c.word for c in self.constraints] else 0], sort_keys=True)
 
     def record(self, data: Data) -> Data:
         """Return the channels and the window of a record."""
@@ -96,7 +98,7 @@ class Request:
             return fit(record, self.formulation, constraints=rules, **self.arguments)
         free = replace(self, constraints=tuple(c for c in self.constraints if c.word != BAND))
         found = free.fit(data) if begun is None else begun(free)
-        for _ in range(PASSES):
+        for _ in range(self.passes):
             around = [c.rule(around=found.model) for c in bands]
             found = fit(record, self.formulation, constraints=[*rules, *around], **self.arguments)
         return found

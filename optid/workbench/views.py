@@ -1,22 +1,24 @@
 """What the page shows of a fit: at once what a hand moves, and later what takes time, the verdict and the tests."""
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.data.record import Data
+from optid.errors import OptidError
+from optid.identify.uncertainty import uncertainty
 from optid.models.functions import step_length
 from optid.show import charts, summary
-from optid.show.estimates import uncertainty
 from optid.show.page import coded
 from optid.show.sections import TONES, Axis, Chart, Series
 
 BINS = 700
 """Stretches of the time axis, of each of which the extremes are drawn."""
 
-POINTS, STEPS = 41, 60
-"""Places of the band of a characteristic; samples of a step response at most."""
+POINTS, STEPS, DRAWS = 41, 60, 1000
+"""Places of the band of a characteristic; samples of a step response at most; draws for a band under constraints."""
 
 
 def quick(fit: Any, run: list[Array] | None) -> dict[str, Any]:
@@ -71,7 +73,9 @@ def reduced(t: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
 def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
     """Return the static characteristic and the step response of every input, with bands where they are known."""
     model, found = fit.model, []
-    known = None if getattr(model, "latent", ()) or getattr(model, "feedback", ()) else uncertainty(fit)[0]
+    known = None
+    with suppress(OptidError):  # some fits have no intervals
+        known = uncertainty(fit, draws=DRAWS)
     count = min(step_length(model), STEPS)
     for c, channel in enumerate(record.inputs):
         basis = model.nonlinearities[c].basis

@@ -26,7 +26,7 @@ async function refit() {
   document.documentElement.dataset.busy = "yes";
   while (wanted) {
     wanted = false;
-    const clock = performance.now(), asked = JSON.stringify(state), found = await ask("fit", { state, view }).catch((error) => ({ error: String(error) }));
+    const clock = performance.now(), asked = JSON.stringify(state), found = await ask("fit", { state, view, draft: dragged }).catch((error) => ({ error: String(error) }));
     at("trouble").textContent = found.error || "";
     document.querySelectorAll("#plots, #verdict").forEach((one) => one.classList.toggle("stale", !!found.error));
     if (!found.error) { shown = { ...found, asked }; show(found); await new Promise(requestAnimationFrame); timings.push(performance.now() - clock); }
