@@ -2,6 +2,8 @@
 
 import http.client
 import json
+import subprocess
+import sys
 import threading
 import warnings
 from contextlib import contextmanager
@@ -249,6 +251,49 @@ def test_fits_follow_the_mouse(bench_page):
     assert 100 < first < 200 and 400 < last < 500
     assert not browser.complaints()
     assert all(url.startswith(f"http://127.0.0.1:{server.server_port}/") for url in browser.requests())
+
+
+@pytest.mark.slow
+def test_a_click_saves_a_script_that_repeats_the_page(bench_page, tmp_path):
+    server, browser = bench_page
+    goto(browser, server)
+    draw(browser, "static", "Corridor", (0.4, 0.55), (0.6, 0.7))
+    browser.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+    browser.click("[data-export=script]")
+    for _ in range(200):
+        if (tmp_path / "fit.py").exists():
+            break
+        browser.wait("new Promise((done) => setTimeout(() => done(true), 50))")
+    lines = (tmp_path / "fit.py").read_text() + "print('objective', repr(fit.solution.objective))\n"
+    done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, check=True)
+    assert float(done.stdout.split()[-1]) == browser.run("shown.objective")
+    assert not browser.complaints()
+
+
+@pytest.mark.slow
+def test_a_page_diagnoses_and_asks_what_if(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    chosen = example("broken_thruster")
+    start = suggested(chosen.data, chosen.suggestion)
+    start |= {"formulation": "hammerstein_ss.asivid", "arguments": {"nx": 2, "basis": "triangular:10"},
+              "window": [0, 240], "constraints": []}
+    with served(Source(chosen.data, "", start)) as server, Browser(tmp_path) as browser:
+        goto(browser, server)
+        browser.click("#diagnose")
+        browser.wait("document.documentElement.dataset.diagnosed")
+        assert "actuator:current loss" in browser.run("document.querySelector('#found tbody').textContent")
+        assert browser.run("document.querySelectorAll('#faultcharts svg.chart').length") == 2
+        browser.click("#labels label:nth-child(3)")
+        browser.wait("document.documentElement.dataset.diagnosed > 1")
+        assert "actuator:current loss" not in browser.run("document.getElementById('found').textContent")
+        browser.run("document.getElementById('to').value = ''")
+        browser.click("#to")
+        browser.write("220")
+        browser.press("Tab")
+        browser.wait("document.documentElement.dataset.diagnosed > 2")
+        assert browser.run("document.querySelector('#found .word').textContent").startswith("healthy")
+        assert not browser.run(CONTRAST) and not browser.run(OVERLAPS) and not browser.complaints()
 
 
 @pytest.mark.slow

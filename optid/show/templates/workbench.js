@@ -44,7 +44,7 @@ async function judge() {
   if (found.error || JSON.stringify(state) !== asked) return;
   at("verdict").className = `verdict ${found.tone}`;
   at("word").textContent = `The model is ${found.word}`;
-  at("sentence").textContent = found.parts.filter((part) => part[2] === "FAIL").map((part) => `${part[0]}: ${part[1]}`).join("; ") || "Every test of the verdict passes.";
+  at("sentence").textContent = found.sentence;
   at("parts").replaceChildren(...found.parts.map((part) => row(...part)));
   drawAll(at("testcharts"), found.charts);
   document.documentElement.dataset.judged = asked;
@@ -355,6 +355,7 @@ document.querySelectorAll("[data-export]").forEach((one) => one.addEventListener
 at("from").value = 0; at("to").value = BEGIN.samples;
 at("kinds").replaceChildren(...KINDS.map((kind) => tick(kind, kinds.has(kind), (on) => (on ? kinds.add(kind) : kinds.delete(kind)))));
 at("diagnose").addEventListener("click", diagnose);
+["from", "to", "kinds"].forEach((id) => at(id).addEventListener("change", () => at("faults").hidden || diagnose()));
 addEventListener("keydown", (event) => {
   if (!(event.ctrlKey || event.metaKey) || event.key.toLowerCase() !== "z" || event.target.tagName === "INPUT") return;
   event.preventDefault();
