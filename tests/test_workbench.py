@@ -2,15 +2,18 @@
 
 import http.client
 import json
+import signal
 import subprocess
 import sys
 import threading
+import urllib.request
 import warnings
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, NO_BROWSER, Browser
+from sample_fits import two_by_two
 from test_pages import CONTRAST, OVERLAPS
 
 import optid
@@ -121,6 +124,34 @@ def test_the_script_repeats_the_numbers(constraints):
     assert np.array_equal(found["fit"].model.a, kept.model.a)
     assert json.loads(bench.answer("export", {"what": "model", "state": state})["text"])
     assert "<!DOCTYPE html>" in bench.answer("export", {"what": "page", "state": state})["text"]
+
+
+def test_every_experiment_is_fitted_as_a_whole():
+    record = two_by_two().select(outputs="level_a", inputs="valve <1>")
+    state = {**suggested(record, {}), "constraints": []}
+    bench = Bench(Source(record, "record", state))
+    shown = bench.answer("fit", {"state": state})
+    assert "experiment 1 of 3" in shown["time"][0]["title"]
+    assert next(iter(bench.fits.values()))[0].figures["candidates"] > record.n_samples - 20
+    assert ".window" not in bench.answer("export", {"what": "script", "state": state})["text"]
+    cut = bench.answer("export", {"what": "script", "state": {**state, "window": [5, 90]}})["text"]
+    assert ".window(5, 90)" in cut
+
+
+def test_the_command_serves_until_it_is_interrupted(tmp_path):
+    table = np.column_stack([example("thruster").data.u, example("thruster").data.y])
+    np.savetxt(tmp_path / "rig.csv", table, delimiter=",", header="u,y", comments="")
+    words = ["-m", "optid", "workbench", str(tmp_path / "rig.csv"), "--dt", "0.1", "--no-browser"]
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        said = process.stdout.readline() + process.stdout.readline()
+        address = next(word for word in said.split() if word.startswith("http://127.0.0.1:"))
+        with urllib.request.urlopen(address, timeout=30) as page:
+            text = page.read().decode()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+    begin = json.loads(text.partition('id="begin">')[2].partition("</script>")[0])
+    assert begin["inputs"] == ["u"] and begin["samples"] == 600 and begin["secret"] not in address
 
 
 @pytest.mark.filterwarnings("ignore:constraint 'step_band'")  # of the passes before the last

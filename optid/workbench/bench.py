@@ -89,7 +89,8 @@ class Bench:
 
         what = asked.get("what")
         if what == "script":
-            return {"name": "fit.py", "text": script(Request.parse(asked.get("state")), self.source.expression)}
+            request, of = Request.parse(asked.get("state")), self.source
+            return {"name": "fit.py", "text": script(request, of.expression, request.whole(of.data))}
         fit = self._found(asked)[0]
         if what == "model":
             with TemporaryDirectory() as folder:

@@ -80,7 +80,12 @@ class Request:
         """Return the channels and the window of a record."""
         if not self.inputs or not self.outputs:
             raise DataError("choose at least one input and one output")
-        return data.select(inputs=list(self.inputs), outputs=list(self.outputs)).window(*self.window)
+        chosen = data.select(inputs=list(self.inputs), outputs=list(self.outputs))
+        return chosen if self.whole(data) else chosen.window(*self.window)
+
+    def whole(self, data: Data) -> bool:
+        """Whether the window leaves nothing out: of several experiments it counts in the shortest."""
+        return self.window == (0, shortest(data))
 
     def fit(self, data: Data, begun: Callable[["Request"], Any] | None = None) -> Any:
         """Fit the record; a band of the step response by repeated fits, each around the model of the one before.
@@ -104,6 +109,11 @@ class Request:
         return found
 
 
+def shortest(data: Data) -> int:
+    """Return the number of samples of the shortest experiment."""
+    return min(e.n_samples for e in data.experiments)
+
+
 def suggested(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
     """Return the state a page begins with: that of a built-in example, or small orders for any record.
 
@@ -117,8 +127,7 @@ def suggested(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
     for text in suggestion.get("constraints", ()):
         rule = named_constraint(text)
         constraints.append({"word": text.partition(":")[0], "name": rule.name, "arguments": bound(rule.call)})
-    shortest = min(e.n_samples for e in data.experiments)
-    return {"inputs": list(data.inputs), "outputs": list(data.outputs), "window": [0, shortest],
+    return {"inputs": list(data.inputs), "outputs": list(data.outputs), "window": [0, shortest(data)],
             "formulation": "hammerstein_arx.exact", "arguments": arguments, "constraints": constraints}
 
 

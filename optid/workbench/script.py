@@ -7,19 +7,20 @@ from optid.registry import CONSTRAINTS, entry_point
 from optid.workbench.request import BAND, PASSES, Constraint, Request
 
 
-def script(request: Request, source: str) -> str:
+def script(request: Request, source: str, whole: bool = False) -> str:
     """Write a fit as a script.
 
     Args:
         request: what was fitted.
         source: expression that reads the whole record.
+        whole: whether its window leaves nothing out.
     """
     homes: dict[str, set[str]] = {}
     for c in request.constraints:
         point = entry_point(CONSTRAINTS, c.word)
         homes.setdefault(point.module, set()).add(point.attr)
     imports = [f"from {module} import {', '.join(sorted(names))}" for module, names in sorted(homes.items())]
-    first, last = request.window
+    window = "" if whole else f".window({request.window[0]}, {request.window[1]})"
     known = [_call(c) for c in request.constraints if c.word != BAND]
     bands = [c for c in request.constraints if c.word == BAND]
     repeated = bool(bands and request.arguments.get("na", 0))
@@ -30,8 +31,7 @@ def script(request: Request, source: str) -> str:
     lines = [
         '"""A fit, written by the optid workbench."""', "", "import optid", *imports, "",
         f"data = {source}",
-        f"data = data.select(inputs={list(request.inputs)!r}, outputs={list(request.outputs)!r})"
-        f".window({first}, {last})",
+        f"data = data.select(inputs={list(request.inputs)!r}, outputs={list(request.outputs)!r}){window}",
         "constraints = [", *(f"    {one}," for one in known), "]",
         f"fit = {fit % 'constraints'}",
     ]

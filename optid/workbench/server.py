@@ -24,6 +24,7 @@ from optid import __version__
 from optid.errors import DataError, OptidError
 from optid.registry import FORMULATIONS, registered
 from optid.workbench.bench import Bench, Source
+from optid.workbench.request import shortest
 
 PAGES = 16
 """Pages that may be open at a time; the oldest gives way."""
@@ -87,7 +88,7 @@ class Server(ThreadingHTTPServer):
         data = self.source.data
         begin = {
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
-            "samples": min(e.n_samples for e in data.experiments), "origin": data.experiments[0].start,
+            "samples": shortest(data), "origin": data.experiments[0].start,
             "inputs": list(data.inputs), "outputs": list(data.outputs),
             "experiments": data.n_experiments, "model": self.source.model is not None,
             "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}

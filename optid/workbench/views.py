@@ -43,6 +43,7 @@ def quick(fit: Any, run: list[Array] | None) -> dict[str, Any]:
 def time_chart(record: Data, run: list[Array] | None, first: int, last: int) -> list[dict[str, Any]]:
     """Return outputs, measured and simulated, and inputs between two samples of the first experiment."""
     e, found = record.experiments[0], []
+    several = f", experiment 1 of {record.n_experiments}" if record.n_experiments > 1 else ""
     first, last = max(first, 0), min(last, e.n_samples)
     t = e.start + record.dt * np.arange(first, last, dtype=float)
     for o, name in enumerate(record.outputs):
@@ -52,7 +53,7 @@ def time_chart(record: Data, run: list[Array] | None, first: int, last: int) -> 
         found.append((f"Output {name}", name, record.output_units[o], series, 250))
     for c, name in enumerate(record.inputs):
         found.append((f"Input {name}", name, record.input_units[c], [(name, e.u[first:last, c], "muted", 1.1)], 150))
-    return [coded(Chart(title, "", Axis("time"), Axis(f"{name} ({unit})" if unit else name, unit=unit),
+    return [coded(Chart(title + several, "", Axis("time"), Axis(f"{name} ({unit})" if unit else name, unit=unit),
                         [Series(label, *reduced(t, values), colour=colour, width=width)
                          for label, values, colour, width in series], "time", height=height)) | {"tool": "time"}
             for title, name, unit, series, height in found]
