@@ -85,7 +85,8 @@ let plots = 0;
 // spec: label, x and y axes {title, log, categories, ticks, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
 // rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off. Curves may have lows
 // (bands); `aside` keeps a series out of the extent, `equal` makes both units as long, `cursor` shows every curve at a place,
-// and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws under the curves, and
+// and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws under the curves,
+// `places(axis)` where on an axis it does so, and
 // `grab(event, x, y, frame)` may take a press of the mouse for it, and then returns true.
 function makePlot(host, spec, hidden) {
   const id = "plot" + ++plots, box = element("div", { class: "plot" });
@@ -122,6 +123,7 @@ function makePlot(host, spec, hidden) {
         });
       }
       for (const rule of a ? spec.rules || [] : []) { low = Math.min(low, Math.log10(rule.y)); high = Math.max(high, Math.log10(rule.y)); }
+      for (const place of spec.places ? spec.places(a).filter(Number.isFinite) : []) { low = Math.min(low, place); high = Math.max(high, place); }
       if (low > high) [low, high] = [0, 1];
       const room = (high - low) * 0.04 || 0.5, above = a && spec.rules ? 2 * room : room;
       const at = (v) => (axis.log ? Math.log10(v) : v);

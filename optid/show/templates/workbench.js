@@ -75,6 +75,7 @@ function drawAll(host, charts) {
   for (const figure of [...host.children]) if (!keys.includes(figure.dataset.key)) { drawn.delete(figure.dataset.key); figure.remove(); }
   charts.forEach((chart, k) => {
     const known = drawn.get(keys[k]);
+    if (known && dragged) return known.update(chart); // a hand is on it
     if (known && known.chart.series.map((s) => s.name).join() === chart.series.map((s) => s.name).join() && known.pins === pins.length) return known.update(chart);
     const figure = element("figure", { "data-key": keys[k] }), old = host.querySelector(`[data-key="${CSS.escape(keys[k])}"]`);
     old ? old.replaceWith(figure) : host.append(figure);
@@ -113,6 +114,7 @@ function drawChart(figure, chart, key) {
   };
   addLegend(host, chart.title, series, hidden, () => kept.plot.draw());
   kept.plot = makePlot(host, { ...chart, label: `${chart.title}. ${chart.caption}`, series, moved: chart.group ? moved : null,
+    places: (axis) => (tool ? mine(kept.chart).map((c) => boxOf(c, kept.chart)).flatMap((b) => (axis ? [b.y0, b.y1] : [b.x0, b.x1])) : []),
     below: (f) => (tool ? hands(kept.chart, f) : []), grab: (event, x, y, f) => tool && grab(event, x, y, f, kept) }, hidden);
   kept.update = (next) => { kept.chart = next; heading.textContent = next.title; kept.plot.setSeries(withPins(next), dragged || (tool === "time" && view)); };
   return kept;
