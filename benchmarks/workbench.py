@@ -1,7 +1,8 @@
 """Time from a movement of the mouse to the fit on the page: a record of 100,000 samples, dragged in headless Chromium.
 
 Prints the median and the extremes over refits by constraints drawn on the plots, from the script's question to the next
-frame of the page that shows the answer, and the same without what the machine does besides: seconds of the server.
+frame of the page that shows the answer; beside them the processor time of the server alone, which a busy machine
+lengthens less.
 """
 
 import sys
@@ -34,7 +35,7 @@ def main(samples: int = 100_000, moves: int = 12) -> None:
         browser.window(1300, 900)
         browser.send("Page.navigate", url=server.address)
         browser.wait("document.documentElement?.dataset.judged")
-        print(f"{samples} samples; milliseconds from question to picture (median, least, most; of them on the server)")
+        print(f"{samples} samples; milliseconds from question to picture (median, least, most; processor time)")
         for tool, mode, start, end in GESTURES:
             browser.run("state.constraints.length = 0; settle()")
             browser.wait("!document.documentElement.dataset.busy")
