@@ -39,6 +39,7 @@ class Bench:
 
     source: Source
     fits: "OrderedDict[str, tuple[Any, Any]]" = field(default_factory=OrderedDict)
+    moving: tuple[str, Any] = ("", None)  # what a hand that draws a band has reached, by the key without the band
 
     def answer(self, question: str, asked: Mapping[str, Any]) -> Any:
         """Answer a question of the page; what cannot be fitted is said in its message."""
@@ -61,8 +62,14 @@ class Bench:
     def _kept(self, request: Request) -> tuple[Any, Any]:
         from optid.show.charts import free_run
 
+        def begun(free: Request) -> Any:
+            found = self.moving[1] if request.draft and self.moving[0] == free.key else self._kept(free)[0]
+            self.moving = free.key, found
+            return found
+
         if request.key not in self.fits:
-            fit = request.fit(self.source.data, lambda free: self._kept(free)[0])
+            fit = request.fit(self.source.data, begun)
+            self.moving = self.moving[0], fit
             self.fits[request.key] = fit, free_run(fit.model, fit.data.raw())
         self.fits.move_to_end(request.key)
         while len(self.fits) > KEPT:

@@ -43,7 +43,7 @@ class Request:
         formulation: its name.
         arguments: of the formulation.
         constraints: set by hand.
-        passes: fits around the model of the one before, for bands of the step response.
+        draft: whether a hand is moving it, so that one pass for bands of the step response is enough.
     """
 
     inputs: tuple[str, ...]
@@ -52,7 +52,7 @@ class Request:
     formulation: str
     arguments: Mapping[str, Any]
     constraints: tuple[Constraint, ...] = ()
-    passes: int = PASSES
+    draft: bool = False
 
     @classmethod
     def parse(cls, state: Any, draft: bool = False) -> "Request":
@@ -63,7 +63,7 @@ class Request:
             first, last = map(int, state["window"])
             arguments = {str(key): value for key, value in state["arguments"].items() if value not in (None, "", [])}
             found = cls(tuple(map(str, state["inputs"])), tuple(map(str, state["outputs"])), (first, last),
-                        str(state["formulation"]), arguments, constraints, PASSES - draft)
+                        str(state["formulation"]), arguments, constraints, draft)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise DataError(f"the page sent a state that cannot be read ({type(error).__name__}: {error})") from None
         entry_point(FORMULATIONS, found.formulation)
@@ -74,7 +74,7 @@ class Request:
         """A text that two states share where they ask for the same fit."""
         constraints = [(c.word, dict(c.arguments), c.name) for c in self.constraints]
         return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints,
-                           self.passes if BAND in [c.word for c in self.constraints] else 0], sort_keys=True)
+                           self.draft and BAND in [c.word for c in self.constraints]], sort_keys=True)
 
     def record(self, data: Data) -> Data:
         """Return the channels and the window of a record."""
@@ -92,7 +92,7 @@ class Request:
 
         Args:
             data: the whole record.
-            begun: returns the fit of the same request without bands, where it may be known.
+            begun: returns the fit to begin with, that of the same request without bands, where it may be known.
         """
         from optid.identify.fitting import fit
 
@@ -103,7 +103,7 @@ class Request:
             return fit(record, self.formulation, constraints=rules, **self.arguments)
         free = replace(self, constraints=tuple(c for c in self.constraints if c.word != BAND))
         found = free.fit(data) if begun is None else begun(free)
-        for _ in range(self.passes):
+        for _ in range(1 if self.draft else PASSES):
             around = [c.rule(around=found.model) for c in bands]
             found = fit(record, self.formulation, constraints=[*rules, *around], **self.arguments)
         return found

@@ -90,7 +90,6 @@ class Server(ThreadingHTTPServer):
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
             "samples": shortest(data), "origin": data.experiments[0].start,
             "inputs": list(data.inputs), "outputs": list(data.outputs),
-            "experiments": data.n_experiments, "model": self.source.model is not None,
             "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
         lead = f"{data.n_samples} samples every {data.dt:g}"
         body = template("workbench.html.j2").render(
