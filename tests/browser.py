@@ -15,7 +15,8 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", 
 NO_BROWSER = "no chromium, chromium-browser or google-chrome on PATH"
 QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
          "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage")
-DRIVEN = ("--allow-pre-commit-input", "--host-resolver-rules=MAP * ~NOTFOUND", "--remote-debugging-pipe")
+DRIVEN = ("--allow-pre-commit-input", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
+          "--remote-debugging-pipe")
 KEYS = {"Enter": (13, "\r"), "Tab": (9, ""), "Escape": (27, ""), "ArrowLeft": (37, ""), "ArrowRight": (39, ""),
         "ArrowUp": (38, ""), "ArrowDown": (40, ""), " ": (32, " ")}
 

@@ -96,7 +96,7 @@ def test_every_region_has_a_word_and_is_about_poles(word, name):
     (lambda: strip(0.9, 0.1), "low < high"),
     (lambda: sector(2.0), r"\(0, pi/2\]"),
     (lambda: damped(1.0), r"\(0, 1\)"),
-    (lambda: disc(0.2, 0.5).build(View({"a": cp.Variable(2)})), "only 'stable' is available"),
+    (lambda: disc(0.2, 0.5).build(View({"a": cp.Variable(3)})), "only 'stable' is available"),
     (lambda: stable(real=0.3).build(View({"P": cp.Variable((2, 2)), "Q": cp.Variable((2, 2))})), "not for a matrix A"),
 ])
 def test_bad_arguments(call, words):

@@ -6,17 +6,17 @@ is linear, which is what constrained subspace identification uses (Lacy and Bern
 2013). One P serves several regions at once, without loss. These rules act in the shift step of the state-space
 formulations.
 
-For the coefficients of a polynomial A there is `stable` alone. It is exact for na <= 2 (the stability triangle); above
-that it is a stated convex inner region around a reference polynomial C: ``Re(A(e^{iw}) / C(e^{iw})) > 0`` on the
-circle, which makes A as stable as C (strict positive realness; Henrion, Sebek and Kucera 2003 use the same central
-polynomial in LMI form). It is imposed on a grid of frequencies that is dense where a root of C is near the circle, as
-linear inequalities; the roots are verified after the fit. In the steps of an output-error fit C is the current iterate,
-pulled inwards only as far as the iterate stays inside the region: no step is therefore cut off, and every iterate is
-stable by construction.
+For the coefficients of a polynomial A there are `stable` and, up to na = 2, `disc`. The former is exact for na <= 2
+(the stability triangle); above that it is a stated convex inner region around a reference polynomial C: ``Re(A(e^{iw})
+/ C(e^{iw})) > 0`` on the circle, which makes A as stable as C (strict positive realness; Henrion, Sebek and Kucera 2003
+use the same central polynomial in LMI form). It is imposed on a grid of frequencies that is dense where a root of C is
+near the circle, as linear inequalities; the roots are verified after the fit. In the steps of an output-error fit C is
+the current iterate, pulled inwards only as far as the iterate stays inside the region: no step is therefore cut off,
+and every iterate is stable by construction.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cvxpy as cp
@@ -89,7 +89,8 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
     """Return the inequalities in the P and Q of a shift step; refuse a formulation without (`StructureError`)."""
     if not isinstance(view.poles, tuple):
         raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
-                             "coefficients of a polynomial, for which only 'stable' is available")
+                             "coefficients of a polynomial, for which only 'stable' is available, and up to na = 2 "
+                             "'disc'")
     p, q = view.poles
     return [cp.kron(side.constant, p) + cp.kron(side.linear, q) + cp.kron(side.linear.T, q.T) >> 0 for side in sides]
 
@@ -98,13 +99,27 @@ def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
 def disc(centre: float, radius: float) -> Rule:
     """All poles lie in the disc of a given radius around a point of the real axis.
 
+    For the coefficients of a polynomial it is defined, and exact, up to na = 2.
+
     Raises:
         StructureError: a radius that is not positive.
     """
     if not radius > 0:
         raise StructureError(f"disc needs a positive radius; got {radius!r}")
-    return region_rule(f"disc:{centre:g},{radius:g}", [disc_side(radius * (1 - MARGIN), float(centre))],
-                       f"the disc of radius {radius:g} around {centre:g}")
+    held, sides = radius * (1 - MARGIN), [disc_side(radius * (1 - MARGIN), float(centre))]
+    rule = region_rule(f"disc:{centre:g},{radius:g}", sides, f"the disc of radius {radius:g} around {centre:g}")
+
+    def build(view: View) -> Any:
+        a = view.poles
+        if a is None or isinstance(a, tuple) or a.ndim != 1 or a.size > 2:
+            return lmi(view, sides, rule.name)
+        if a.size == 1:
+            return [Limit(centre + a <= held), Limit(centre + a >= -held)]
+        # the triangle of the polynomial in w, for z = centre + w
+        first, second = 2 * centre + a[0], centre**2 + centre * a[0] + a[1]
+        return _triangle(first, second, held)
+
+    return replace(rule, build=build)
 
 
 @recorded
@@ -202,10 +217,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         if na == 1:
             return [Limit(a <= radius), Limit(a >= -radius)]
         if na == 2:
-            first, second = a[0] / radius, a[1] / radius**2
-            along, across = first / radius, 2 * second / radius  # minus the derivatives by the radius
-            return [Limit(1 + first + second >= 0, -along - across), Limit(1 - first + second >= 0, along - across),
-                    Limit(second <= 1, across)]
+            return _triangle(a[0], a[1], radius)
         reference = np.asarray(view.reference.get("a", np.zeros(na)), dtype=float)
         rows, levels, centre = inner_region(reference, radius, keep=view.iterate)
         grid = frequencies(roots_of(scaled(centre, radius)))
@@ -222,6 +234,14 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         return f"constraint {name!r}: the largest pole has modulus {largest:.6g}; ask for a smaller radius"
 
     return Rule(name, build, verify, frozenset({"poles"}))
+
+
+def _triangle(first: Any, second: Any, radius: float) -> list[Limit]:
+    """The roots of ``z² + first z + second`` in the disc of a radius around zero."""
+    first, second = first / radius, second / radius**2
+    along, across = first / radius, 2 * second / radius  # minus the derivatives by the radius
+    return [Limit(1 + first + second >= 0, -along - across), Limit(1 - first + second >= 0, along - across),
+            Limit(second <= 1, across)]
 
 
 def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False

@@ -1,22 +1,24 @@
-"""Constraints on the responses of a state-space model, in the step that chooses B and D with A and C held.
+"""Constraints on responses: of a state-space model in the step that chooses B and D with A and C held.
 
 With ``Theta_c = functions x [B_c; D_c]`` the effect of an input on an output after k samples is linear in Theta:
 ``C A^(k-1) B`` and, at once, D. Positive realness is a linear matrix inequality in (B, D) and a matrix P of its own
-when it is stated on the transposed system. ``channel`` and ``output`` are names, needed where there are several.
+when it is stated on the transposed system. The step response of a polynomial model, too, can be kept in a band, by its
+tangent. ``channel`` and ``output`` are names, needed where there are several.
 """
 
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from scipy.linalg import toeplitz
 
-from formulations.constraints.rule import Rule, label, recorded, sign_of
+from formulations.constraints.rule import Rule, check_bounds, label, recorded, sign_of
 from formulations.constraints.shape import slopes_at
 from optid.errors import StructureError
 from optid.program.limits import Limit
 from optid.program.view import View
 
-__all__ = ["impulse_response", "no_effect", "positive_real", "step_response"]
+__all__ = ["impulse_response", "no_effect", "positive_real", "step_band", "step_response"]
 
 HORIZON = 50  # samples over which the sign of a response is imposed
 REAL = 1e-9  # least eigenvalue in the inequality of positive realness, relative to the size of C
@@ -47,13 +49,67 @@ def step_response(sign: str = "positive", horizon: float = HORIZON, low: float |
     By default the step goes over the interval of the basis. Other arguments as in `impulse_response`, as are the errors
     raised.
     """
+    return _response("step_response", sign, horizon, channel, output, lambda basis: _step(basis, low, high),
+                     summed=True)
 
-    def rows(basis: Any) -> np.ndarray:
-        ends = basis.interval[0] if low is None else low, basis.interval[1] if high is None else high
-        values = basis.values(np.array(ends, dtype=float))
-        return values[1] - values[0]
 
-    return _response("step_response", sign, horizon, channel, output, rows, summed=True)
+@recorded
+def step_band(low: float | None = None, high: float | None = None, first: float = 0, last: float = HORIZON,
+              channel: str | None = None, output: str | None = None, around: Any = None) -> Rule:
+    """The response to a step of the input over the interval of its basis lies in [low, high] from sample first to last.
+
+    Exact in the state-space formulations, and for equation errors without past outputs. With past outputs the response
+    is bilinear in A and the rest; the rule is then its tangent at a model. Repeated fits, each around the model of the
+    fit before, end where the response itself obeys; the fit says whether it does.
+
+    Args:
+        low: lower bound, in units of the output.
+        high: upper bound.
+        first: first sample, counted from that of the step.
+        last: last sample.
+        around: the model for the tangent, such as that of the fit without this rule.
+
+    Raises:
+        StructureError: no bound, crossing bounds, no sample, or no model where one is needed.
+    """
+    check_bounds("step_band", low, high)
+    if not 0 <= first <= last:
+        raise StructureError(f"the samples of step_band are 0 <= first <= last; got {first!r}, {last!r}")
+    name, count = label("step_band", channel, output), int(last) + 1
+
+    def build(view: View) -> Any:
+        one = view.channel(channel)
+        theta, step = view[view.key("Theta", one)], _step(view.basis(one), None, None)
+        if view.holds_matrices:
+            response = np.cumsum(markov_rows(view, one, output, count), axis=0) @ theta.T @ step
+        elif one not in view.delays or view["offset"].size > 1:
+            raise StructureError("step_band is defined for equation errors of one output, and for state-space "
+                                 "formulations that choose B and D with A and C held")
+        else:
+            reached = np.subtract.outer(np.arange(count) - view.delays[one], np.arange(theta.shape[1])) >= 0
+            response = reached.astype(float) @ theta.T @ step
+            if "a" in view:
+                if around is None:
+                    raise StructureError("step_band needs around=, the model of a fit without it, where there are "
+                                         "past outputs")
+                a, c = np.asarray(around.a, dtype=float), around.inputs.index(one)
+                before = _stepped(around, c, count)
+                moved = toeplitz(np.append(0.0, before[:-1]), np.zeros(a.size)) @ (view["a"] - a)
+                response = np.linalg.inv(toeplitz(np.eye(count)[0] + np.pad(a, (1, count))[:count],
+                                                  np.zeros(count))) @ (response - moved)
+        inside = response[int(first):]
+        return [*([Limit(inside >= low, bound="low")] if low is not None else []),
+                *([Limit(inside <= high, bound="high")] if high is not None else [])]
+
+    def verify(model: Any) -> str:
+        c = 0 if channel is None else model.inputs.index(channel)
+        found = _stepped(model, c, count, 0 if output is None else model.outputs.index(output))[int(first):]
+        room = 1e-3 * float(np.ptp(found))
+        obeys = (low is None or np.min(found) >= low - room) and (high is None or np.max(found) <= high + room)
+        return "" if obeys else (f"constraint {name!r}: the step response goes from {np.min(found):.4g} to "
+                                 f"{np.max(found):.4g}; fit again around this model")
+
+    return Rule(name, build, verify, tangent=around is not None)
 
 
 @recorded
@@ -116,6 +172,19 @@ def markov_rows(view: View, channel: str | None, output: str | None, count: int)
         found.append(view.weights(channel, row, output, direct=0.0))
         row = row @ a
     return np.array(found)
+
+
+def _stepped(model: Any, c: int, count: int, o: int = 0) -> np.ndarray:
+    """Response (count,) of an output to a step of an input over the interval of its basis."""
+    f = model.nonlinearities[c]
+    return model.step_response(count).reshape(count, model.l, -1)[:, o, c] * (_step(f.basis, None, None) @ f.mu)
+
+
+def _step(basis: Any, low: float | None, high: float | None) -> np.ndarray:
+    """What every function of a basis does in a step from ``low`` to ``high``, by default over its interval."""
+    ends = [end if given is None else given for given, end in zip((low, high), basis.interval)]
+    values = basis.values(np.array(ends, dtype=float))
+    return values[1] - values[0]
 
 
 def _response(word: str, sign: str, horizon: float, channel: str | None, output: str | None, rows: Any, *,

@@ -120,14 +120,29 @@ def slope(low: float | None = None, high: float | None = None, channel: str | No
 
 
 @recorded
-def value_range(low: float | None = None, high: float | None = None, channel: str | None = None,
-                output: str | None = None) -> Rule:
-    """The static characteristic lies in [low, high] over the interval of the basis (units of the output).
+def value_range(low: float | None = None, high: float | None = None, first: float | None = None,
+                last: float | None = None, channel: str | None = None, output: str | None = None) -> Rule:
+    """The static characteristic lies in [low, high] (units of the output) where the input lies in [first, last].
 
     Exact for `Triangular`, on a dense grid for the other bases.
+
+    Args:
+        low: lower bound.
+        high: upper bound.
+        first: where the corridor begins; default the lower end of the interval of the basis.
+        last: where it ends; default the upper end.
+
+    Raises:
+        StructureError: no bound, crossing bounds, or a corridor outside the interval.
     """
     def rows(basis: Any) -> np.ndarray:
-        return basis.values(basis.nodes if isinstance(basis, Triangular) else basis.grid())
+        ends = [end if given is None else float(given) for given, end in zip((first, last), basis.interval)]
+        inside = np.clip(ends, *basis.interval)
+        if ends[0] > ends[1] or not np.any(inside == ends):
+            raise StructureError(f"the corridor [{ends[0]:g}, {ends[1]:g}] lies outside the interval "
+                                 f"[{basis.interval[0]:g}, {basis.interval[1]:g}] of the input")
+        points = basis.nodes if isinstance(basis, Triangular) else basis.grid()
+        return basis.values(np.unique([*inside, *points[(points > inside[0]) & (points < inside[1])]]))
 
     return _static("range", low, high, channel, output, rows, offset=True)
 

@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 import typer
 
+from optid.cli.bench import workbench
 from optid.cli.comparing import compare
 from optid.cli.derived import ComparingCommand, FittingCommand
 from optid.cli.designing import design, order
@@ -84,6 +85,6 @@ register(app, fit, FittingCommand)
 for function in (validate, solvers, formulations, constraints, examples, identify):
     register(app, function, Command)
 register(app, compare, ComparingCommand)
-for function in (design, diagnose, isolability, monitor, reformulate, order):
+for function in (design, diagnose, isolability, monitor, reformulate, order, workbench):
     register(app, function, Command)
 app.add_typer(study, name="study")

@@ -20,7 +20,7 @@ from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
-from optid.program.solution import Solution, Status
+from optid.program.solution import Bound, Solution, Status
 from optid.progress import log
 from optid.registry import Rendered, check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
@@ -64,7 +64,13 @@ class Fit(Rendered):
     def solution(self) -> Solution:
         """Status, proof, residuals and times."""
         solution, evidence = self.outcome.solution, self.outcome.evidence
-        return replace(solution, bound=evidence.bound()) if evidence and callable(evidence.bound) else solution
+        if evidence and callable(evidence.bound):
+            solution = replace(solution, bound=evidence.bound())
+        tangents = _tangents(self.arguments)
+        if not tangents or solution.status not in (Status.OPTIMAL, Status.LOCAL):
+            return solution
+        reason = f"constraint {tangents[0]!r} is imposed by its tangent"
+        return replace(solution, status=Status.LOCAL, bound=Bound.none(reason), reason=reason)
 
     @cached_property
     def _completed(self) -> tuple[Any, dict[str, Any]]:
@@ -281,7 +287,8 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     if isinstance(data, Data):
         findings = examine(data, fitted_bases(data, words.get("basis", Linear())), words)
     problem = pose(data, **arguments)
-    settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate, "prove": prove,
+    settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate,
+                "prove": prove and not _tangents(arguments),
                 **(solver_options or {})}
     return _finished(data, name, arguments, findings, problem, solver, settings, raises, started)
 
@@ -332,6 +339,11 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
 def _in_raw_units(model: Any, data: Data | Stream) -> Any:
     transform = getattr(data, "transform", None)
     return model if model is None or transform is None or transform.is_identity else model.with_transform(transform)
+
+
+def _tangents(arguments: Mapping[str, Any]) -> list[str]:
+    """Names of the constraints that stand for what is not convex by its tangent."""
+    return [rule.name for rule in arguments.get("constraints", ()) if getattr(rule, "tangent", False)]
 
 
 def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:

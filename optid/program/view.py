@@ -34,6 +34,7 @@ class View(Mapping[str, cp.Expression]):
         outputs: names of the outputs, where constraints may have to choose one.
         units: from the units of the programme to those of the record, in which the expressions are; None where they
             are the same.
+        delays: of the inputs in samples, where the model is a polynomial one that knows them.
         iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
     """
 
@@ -46,6 +47,7 @@ class View(Mapping[str, cp.Expression]):
     outputs: tuple[str, ...] = ()
     units: Transform | None = None
     iterate: bool = False
+    delays: Mapping[str, int] = field(default_factory=dict)
     _auxiliaries: set[int] = field(default_factory=set, init=False)
 
     @cached_property

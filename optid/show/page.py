@@ -5,7 +5,7 @@ import hashlib
 import json
 import platform
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-SCRIPTS = ("plot.js", "charts.js")
+SCRIPTS = ("plot.js", "parts.js", "charts.js")
 
 MOST = 20_000
 """Samples of a curve that a page carries; of a longer one the extremes of half as many stretches."""
@@ -42,7 +42,7 @@ def render(document: Document) -> str:
     shown: list[dict[str, Any]] = []
 
     def place(chart: Chart) -> int:
-        shown.append(_coded(chart))
+        shown.append(coded(chart))
         return len(shown) - 1
 
     script = "\n".join((files("optid") / "show" / "templates" / name).read_text(encoding="utf-8") for name in SCRIPTS)
@@ -50,7 +50,7 @@ def render(document: Document) -> str:
     names = {"trust": "Verdict", "optimum": "Solution"}
     body = template("document.html.j2").render(
         version=__version__, title=document.title, lead=document.lead, parts=sections, place=place,
-        breakable=_breakable, charts=lambda: _embedded(shown), script=Markup(script),
+        breakable=_breakable, charts=lambda: embedded(shown), script=Markup(script),
         digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         sections=[(s.id, s.title or names.get(s.id, s.id)) for s, _ in sections])
     return body
@@ -61,7 +61,7 @@ def _breakable(equation: str) -> str:
     return re.sub(r" (?![+-] )", "\N{NO-BREAK SPACE}", equation)
 
 
-def _coded(chart: Chart) -> dict[str, Any]:
+def coded(chart: Chart) -> dict[str, Any]:
     """Return a chart as JSON types for the script of the page."""
     axes = {name: {key: value for key, value in asdict(axis).items() if value not in (None, False, "")}
             for name, axis in (("x", chart.x), ("y", chart.y))}
@@ -93,7 +93,7 @@ def _numbers(values: np.ndarray, kind: str) -> Any:
     return [float(f"{v:.9g}") if np.isfinite(v) else None for v in values]
 
 
-def _embedded(payload: Sequence[Any]) -> Markup:
+def embedded(payload: Any) -> Markup:
     """Return a value as JSON that can stand inside a script element: no text in it can end the element."""
     text = json.dumps(payload, allow_nan=False, separators=(",", ":"))
     return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))

@@ -82,7 +82,8 @@ class EquationError:
         """Return the expressions that constraints may use."""
         full, inputs = solve_triangular(self.problem.root, self.problem.target), self.layout.inputs
         return View(expressions, channels=inputs, bases=dict(zip(inputs, self.bases)), gauge=gauge,
-                    reference=self.linear_part(full[: self.problem.linear]), units=self.units)
+                    reference=self.linear_part(full[: self.problem.linear]), units=self.units,
+                    delays=dict(zip(inputs, self.layout.nk)))
 
     def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Split the linear part of z into values of ``a`` and ``offset``."""

@@ -85,7 +85,9 @@ let plots = 0;
 // spec: label, x and y axes {title, log, categories, ticks, format, low, high}, series [{name, colour, dash, kind, xs, ys, halves}],
 // rules [{y, label}], tip(series, i), open(series, i); hidden: set of the names that are switched off. Curves may have lows
 // (bands); `aside` keeps a series out of the extent, `equal` makes both units as long, `cursor` shows every curve at a place,
-// and `moved(low, high)` hears of another extent of x.
+// and `moved(low, high)` hears of another extent of x. `below(frame)` returns what a tool draws under the curves,
+// `places(axis)` where on an axis it does so, and
+// `grab(event, x, y, frame)` may take a press of the mouse for it, and then returns true.
 function makePlot(host, spec, hidden) {
   const id = "plot" + ++plots, box = element("div", { class: "plot" });
   const svg = element("svg:svg", { class: "chart", role: "img", tabindex: "0", "aria-label": spec.label, "aria-describedby": id + "-keys" });
@@ -99,9 +101,8 @@ function makePlot(host, spec, hidden) {
   host.append(box);
 
   const axes = [spec.x, spec.y];
-  const series = spec.series.map((one) => ({ ...one, tx: transformed(one.xs, spec.x), ty: transformed(one.ys, spec.y), tl: one.lows && transformed(one.lows, spec.y) }));
-  const whole = extent();
-  let view = [...whole], frame = null, drag = null;
+  const prepared = (all) => all.map((one) => ({ ...one, tx: transformed(one.xs, spec.x), ty: transformed(one.ys, spec.y), tl: one.lows && transformed(one.lows, spec.y) }));
+  let series = prepared(spec.series), whole = extent(), view = [...whole], frame = null, drag = null;
   const touches = new Map();
 
   function transformed(values, axis) {
@@ -122,6 +123,7 @@ function makePlot(host, spec, hidden) {
         });
       }
       for (const rule of a ? spec.rules || [] : []) { low = Math.min(low, Math.log10(rule.y)); high = Math.max(high, Math.log10(rule.y)); }
+      for (const place of spec.places ? spec.places(a).filter(Number.isFinite) : []) { low = Math.min(low, place); high = Math.max(high, place); }
       if (low > high) [low, high] = [0, 1];
       const room = (high - low) * 0.04 || 0.5, above = a && spec.rules ? 2 * room : room;
       const at = (v) => (axis.log ? Math.log10(v) : v);
@@ -166,6 +168,7 @@ function makePlot(host, spec, hidden) {
       body.append(element("svg:line", { class: "rule", x1: f.left, x2: right, y1: y, y2: y }),
         element("svg:text", { x: right - 4, y: y - 5, "text-anchor": "end" }, rule.label));
     }
+    if (spec.below) body.append(...spec.below(f));
     for (const one of series) if (!hidden.has(one.name)) body.append(...drawn(one, f, right));
     svg.replaceChildren(element("svg:defs", {}, clip), ...parts, body);
   }
@@ -307,6 +310,7 @@ function makePlot(host, spec, hidden) {
 
   svg.addEventListener("pointerdown", (event) => {
     touches.set(event.pointerId, place(event));
+    if (spec.grab && spec.grab(event, ...place(event), frame)) return touches.delete(event.pointerId);
     if (event.pointerType === "touch") return;
     drag = { from: place(event), box: null };
     svg.setPointerCapture(event.pointerId);
@@ -365,5 +369,14 @@ function makePlot(host, spec, hidden) {
   });
   new ResizeObserver(() => { if (frame && Math.abs(measure().width - frame.width) > 1) draw(); }).observe(box);
   draw();
-  return { draw, svg, setX: (low, high) => setView([low, high, view[2], view[3]], true) };
+  // Other curves at the same view; one that shows everything goes on to do so, unless it is `held`.
+  function setSeries(next, held) {
+    const all = view.every((v, k) => v === whole[k]);
+    series = prepared(next);
+    if (held) return draw();
+    whole = extent();
+    if (all) view = [...whole];
+    draw();
+  }
+  return { draw, svg, place, setSeries, reset, setX: (low, high) => setView([low, high, view[2], view[3]], true) };
 }

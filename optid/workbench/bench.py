@@ -1,0 +1,113 @@
+"""The bench of one page: a record, the fits that were asked for, and the answers to what the page asks."""
+
+import threading
+import time
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from optid.data.record import Data
+from optid.errors import DataError, OptidError
+from optid.workbench import views
+from optid.workbench.request import Request
+from optid.workbench.script import script
+
+KEPT = 40
+"""Fits that a page keeps: what was undone comes back at once."""
+
+SOLVING = threading.Lock()
+"""CVXPY and the solvers work for one page at a time."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A record, the expression of Python that reads it, and the state a page begins with."""
+
+    data: Data
+    expression: str
+    start: Mapping[str, Any]
+    model: Any = None
+
+
+@dataclass
+class Bench:
+    """What belongs to one page; no other page reaches it."""
+
+    source: Source
+    fits: "OrderedDict[str, tuple[Any, Any]]" = field(default_factory=OrderedDict)
+    moving: tuple[str, Any] = ("", None)  # what a hand that draws a band has reached, by the key without the band
+
+    def answer(self, question: str, asked: Mapping[str, Any]) -> Any:
+        """Answer a question of the page; what cannot be fitted is said in its message."""
+        known: dict[str, Callable[[Mapping[str, Any]], Any]] = {
+            "fit": self._fit, "judge": self._judge, "time": self._time, "export": self._export,
+            "diagnose": self._diagnose}
+        if question not in known:
+            raise DataError(f"the page asks for {question!r}, which there is not")
+        try:
+            return known[question](asked)
+        except OptidError as error:
+            return {"error": str(error)}
+
+    def _found(self, asked: Mapping[str, Any]) -> tuple[Any, Any]:
+        request = Request.parse(asked.get("state"), bool(asked.get("draft")))
+        with SOLVING, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what they say stands in the findings
+            return self._kept(request)
+
+    def _kept(self, request: Request) -> tuple[Any, Any]:
+        from optid.show.charts import free_run
+
+        def begun(free: Request) -> Any:
+            found = self.moving[1] if request.draft and self.moving[0] == free.key else self._kept(free)[0]
+            self.moving = free.key, found
+            return found
+
+        if request.key not in self.fits:
+            fit = request.fit(self.source.data, begun)
+            self.moving = self.moving[0], fit
+            self.fits[request.key] = fit, free_run(fit.model, fit.data.raw())
+        self.fits.move_to_end(request.key)
+        while len(self.fits) > KEPT:
+            self.fits.popitem(last=False)
+        return self.fits[request.key]
+
+    def _fit(self, asked: Mapping[str, Any]) -> dict[str, Any]:
+        started = time.thread_time()
+        fit, run = self._found(asked)
+        found = views.quick(fit, run)
+        return {**found, "time": self._time(asked), "seconds": time.thread_time() - started}
+
+    def _time(self, asked: Mapping[str, Any]) -> list[dict[str, Any]]:
+        fit, run = self._found(asked)
+        record = fit.data.raw()
+        first, last = asked.get("view") or (0, record.experiments[0].n_samples)
+        return views.time_chart(record, run, int(first), int(last))
+
+    def _judge(self, asked: Mapping[str, Any]) -> dict[str, Any]:
+        return views.judged(self._found(asked)[0])
+
+    def _export(self, asked: Mapping[str, Any]) -> dict[str, str]:
+        from optid.show.report import render
+
+        what = asked.get("what")
+        if what == "script":
+            request, of = Request.parse(asked.get("state")), self.source
+            return {"name": "fit.py", "text": script(request, of.expression, request.whole(of.data))}
+        fit = self._found(asked)[0]
+        if what == "model":
+            with TemporaryDirectory() as folder:
+                fit.save(path := Path(folder) / "model.json")
+                return {"name": path.name, "text": path.read_text(encoding="utf-8")}
+        return {"name": "report.html", "text": render(fit, command="optid workbench")}
+
+    def _diagnose(self, asked: Mapping[str, Any]) -> dict[str, Any]:
+        from optid.workbench.diagnosis import diagnosed
+
+        fit = None if self.source.model is not None else self._found(asked)[0]
+        with SOLVING:
+            return diagnosed(self.source.model if fit is None else fit, self.source.data, asked)

@@ -1,0 +1,70 @@
+"""A diagnosis on the page: the record, how likely every fault is by its onset, the set; and all that without some."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optid.data.record import Data
+from optid.errors import StructureError
+from optid.show.page import coded
+from optid.show.sections import Axis, Chart, Series
+from optid.workbench.views import reduced
+
+TONES = {"healthy": "good", "faulty": "bad"}
+SHOWN = 8
+"""Candidates whose energy is drawn, those that explain most."""
+
+
+def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, Any]:
+    """Diagnose a window of a record.
+
+    Args:
+        source: a state-space model with noise covariances, or a fit of one.
+        data: the whole record.
+        asked: ``window``, ``kinds`` of faults, ``without`` (labels taken out of the dictionary).
+    """
+    from optid.faults import diagnose, dictionary
+    from optid.faults.diagnosis import words
+
+    model = getattr(source, "model", source)
+    if model.structure != "ss" or model.noise is None:
+        raise StructureError("faults are judged with a state-space model that has noise covariances: choose the "
+                             "formulation hammerstein_ss.asivid, or start with optid workbench --model model.json")
+    whole = dictionary(model, kinds=list(asked.get("kinds") or ["bias", "loss", "spike"]))
+    without = set(asked.get("without") or ())
+    kept = [i for i, label in enumerate(whole.labels) if label not in without]
+    if not kept:
+        raise StructureError("no fault is left in the dictionary: keep at least one")
+    faults = replace(whole, candidates=tuple(whole.candidates[i] for i in kept), sines=whole.sines[np.ix_(kept, kept)])
+    first, last = map(int, asked.get("window") or (0, data.experiments[0].n_samples))
+    record = data.select(inputs=list(model.inputs), outputs=list(model.outputs), experiments=0).window(first, last)
+    found = diagnose(source, record, faults)
+    answers = [[answer.label, f"{answer.posterior:.3f}",
+                "; ".join(words.onset_words(f).removeprefix("onset ") for f in answer.faults),
+                "; ".join(line for f in answer.faults for line in words.size_words(f))] for answer in found.candidates]
+    return {"word": f"{found.verdict}: {words.headline(found)}", "tone": TONES.get(found.verdict, "fair"),
+            "sentences": list(words.explained(found, notes=False)), "labels": list(whole.labels), "answers": answers,
+            "charts": _charts(found, first)}
+
+
+def _charts(found: Any, first: int) -> list[dict[str, Any]]:
+    seen = found.evidence
+    k = first + np.arange(len(seen.r), dtype=float)
+    charts = []
+    for o, name in enumerate(found.outputs or [f"y{o + 1}" for o in range(seen.r.shape[1])]):
+        r = np.where(seen.present[:, o], seen.r[:, o], np.nan)
+        series = [Series("innovation", *reduced(k, r), colour="muted", width=1.0)]
+        if seen.fitted[:, o].any():
+            series.append(Series("the best answer", *reduced(k, seen.fitted[:, o]), colour="c1", width=2.0))
+        charts.append(Chart(f"Whitened innovations of {name}", "Mostly within 2 when healthy.", Axis("sample"),
+                            Axis("standard deviations"), series, "fault", height=220))
+    if seen.labels:
+        peaks = np.nanmax(np.where(np.isnan(seen.gains), -np.inf, seen.gains), axis=1)
+        order = [int(i) for i in np.argsort(-peaks)[:SHOWN] if np.isfinite(peaks[i])]
+        series = [Series(seen.labels[i], k, seen.gains[i], colour=f"c{j}", width=1.8) for j, i in enumerate(order)]
+        charts.append(Chart("Likelihood of each fault by its onset", "Energy that a fault explains beyond the "
+                            "threshold of an alarm: above zero a healthy plant hardly gets.", Axis("onset (sample)"),
+                            Axis("energy beyond the threshold"), series, "fault", height=320))
+    return [coded(one) for one in charts]

@@ -1,0 +1,140 @@
+"""What a page asks for: channels, a window, a formulation with its arguments, and constraints set by hand."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from optid.data.record import Data
+from optid.errors import DataError, StructureError
+from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, named_constraint
+
+BAND = "step_band"
+"""The constraint that is a tangent at a model where there are past outputs."""
+
+PASSES = 3
+"""Fits around the model of the one before until the step response itself obeys a band."""
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """A named constraint: the word of its function, its arguments, and the name under which its price is shown."""
+
+    word: str
+    arguments: Mapping[str, Any]
+    name: str
+
+    def rule(self, **more: Any) -> Any:
+        """Build it."""
+        try:
+            return entry_point(CONSTRAINTS, self.word).load()(**self.arguments, **more).named(self.name)
+        except TypeError as error:
+            raise StructureError(f"constraint {self.word!r}: {error}") from None
+
+
+@dataclass(frozen=True)
+class Request:
+    """One state of the page.
+
+    Attributes:
+        inputs: names of the inputs.
+        outputs: names of the outputs.
+        window: first sample and the one after the last.
+        formulation: its name.
+        arguments: of the formulation.
+        constraints: set by hand.
+        draft: whether a hand is moving it, so that one pass for bands of the step response is enough.
+    """
+
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    window: tuple[int, int]
+    formulation: str
+    arguments: Mapping[str, Any]
+    constraints: tuple[Constraint, ...] = ()
+    draft: bool = False
+
+    @classmethod
+    def parse(cls, state: Any, draft: bool = False) -> "Request":
+        """Read a state as the page sends it, a `draft` while a hand moves; anything else is a `DataError`."""
+        try:
+            constraints = tuple(Constraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
+                                for c in state["constraints"])
+            first, last = map(int, state["window"])
+            arguments = {str(key): value for key, value in state["arguments"].items() if value not in (None, "", [])}
+            found = cls(tuple(map(str, state["inputs"])), tuple(map(str, state["outputs"])), (first, last),
+                        str(state["formulation"]), arguments, constraints, draft)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise DataError(f"the page sent a state that cannot be read ({type(error).__name__}: {error})") from None
+        entry_point(FORMULATIONS, found.formulation)
+        return found
+
+    @property
+    def key(self) -> str:
+        """A text that two states share where they ask for the same fit."""
+        constraints = [(c.word, dict(c.arguments), c.name) for c in self.constraints]
+        return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints,
+                           self.draft and BAND in [c.word for c in self.constraints]], sort_keys=True)
+
+    def record(self, data: Data) -> Data:
+        """Return the channels and the window of a record."""
+        if not self.inputs or not self.outputs:
+            raise DataError("choose at least one input and one output")
+        chosen = data.select(inputs=list(self.inputs), outputs=list(self.outputs))
+        return chosen if self.whole(data) else chosen.window(*self.window)
+
+    def whole(self, data: Data) -> bool:
+        """Whether the window leaves nothing out: of several experiments it counts in the shortest."""
+        return self.window == (0, shortest(data))
+
+    def fit(self, data: Data, begun: Callable[["Request"], Any] | None = None) -> Any:
+        """Fit the record; a band of the step response by repeated fits, each around the model of the one before.
+
+        Args:
+            data: the whole record.
+            begun: returns the fit to begin with, that of the same request without bands, where it may be known.
+        """
+        from optid.identify.fitting import fit
+
+        record, rules = self.record(data), [c.rule() for c in self.constraints if c.word != BAND]
+        bands = [c for c in self.constraints if c.word == BAND]
+        if not (bands and self.arguments.get("na", 0)):
+            rules += [c.rule() for c in bands]
+            return fit(record, self.formulation, constraints=rules, **self.arguments)
+        free = replace(self, constraints=tuple(c for c in self.constraints if c.word != BAND))
+        found = free.fit(data) if begun is None else begun(free)
+        for _ in range(1 if self.draft else PASSES):
+            around = [c.rule(around=found.model) for c in bands]
+            found = fit(record, self.formulation, constraints=[*rules, *around], **self.arguments)
+        return found
+
+
+def shortest(data: Data) -> int:
+    """Return the number of samples of the shortest experiment."""
+    return min(e.n_samples for e in data.experiments)
+
+
+def suggested(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the state a page begins with: that of a built-in example, or small orders for any record.
+
+    Args:
+        data: the record.
+        suggestion: arguments of a fit, with constraints as words.
+    """
+    orders = {"na": 2, "nb": 2, "nk": 0, "basis": "triangular:8"}
+    arguments = {key: suggestion.get(key, value) for key, value in orders.items()}
+    constraints = []
+    for text in suggestion.get("constraints", ()):
+        rule = named_constraint(text)
+        constraints.append({"word": text.partition(":")[0], "name": rule.name, "arguments": bound(rule.call)})
+    return {"inputs": list(data.inputs), "outputs": list(data.outputs), "window": [0, shortest(data)],
+            "formulation": "hammerstein_arx.exact", "arguments": arguments, "constraints": constraints}
+
+
+def bound(call: tuple[str, str, tuple[Any, ...], Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the arguments of a recorded call by name."""
+    import inspect
+    from importlib import import_module
+
+    module, function, args, kwargs = call
+    return dict(inspect.signature(getattr(import_module(module), function)).bind(*args, **kwargs).arguments)

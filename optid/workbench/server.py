@@ -1,0 +1,178 @@
+"""Hand the workbench to a browser on this machine, and to nothing else.
+
+The server listens on 127.0.0.1. A page opens with the token of the start; every page that opens gets a bench of its own
+under a secret of its own, which it sends in a header with every question. A request under another host name (DNS
+rebinding), from another origin, without the secret or with that of no page is refused. No answer may be read by a page
+of another origin, and the page itself may ask this server only.
+"""
+
+import base64
+import hashlib
+import json
+import secrets
+import threading
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable
+from functools import cached_property
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from optid import __version__
+from optid.errors import DataError, OptidError
+from optid.registry import FORMULATIONS, registered
+from optid.workbench.bench import Bench, Source
+from optid.workbench.request import shortest
+
+PAGES = 16
+"""Pages that may be open at a time; the oldest gives way."""
+
+LARGEST = 1 << 20
+"""Bytes of a question."""
+
+SHOWN = ("arx", "hammerstein_arx.exact", "hammerstein_arx.overparametrised", "hammerstein_oe.exact",
+         "hammerstein_ss.sivid", "hammerstein_ss.asivid", "hammerstein_ss.exact")
+"""Formulations that a page offers: those that are fitted while a hand moves, and the state-space ones for faults."""
+
+
+class Server(ThreadingHTTPServer):
+    """The server of one record.
+
+    Attributes:
+        source: the record.
+        token: opens a page.
+        benches: by the secret of their page.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, source: Source, port: int = 0) -> None:
+        super().__init__(("127.0.0.1", port), _Handler)
+        self.source, self.token = source, secrets.token_urlsafe(24)
+        self.benches: OrderedDict[str, Bench] = OrderedDict()
+        self.lock = threading.Lock()
+
+    @property
+    def address(self) -> str:
+        """What to open in the browser."""
+        return f"http://127.0.0.1:{self.server_port}/?token={self.token}"
+
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """Names under which the server answers."""
+        return f"127.0.0.1:{self.server_port}", f"localhost:{self.server_port}"
+
+    def opened(self) -> str:
+        """Return the secret of a new page."""
+        secret = secrets.token_urlsafe(24)
+        with self.lock:
+            self.benches[secret] = Bench(self.source)
+            while len(self.benches) > PAGES:
+                self.benches.popitem(last=False)
+        return secret
+
+    @cached_property
+    def scripts(self) -> str:
+        """The scripts of the page."""
+        folder, names = files("optid") / "show" / "templates", ("plot.js", "parts.js", "workbench.js")
+        return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+
+    def page(self, secret: str) -> tuple[str, str]:
+        """Return the page and its policy."""
+        from markupsafe import Markup
+
+        from optid.show.page import embedded, template
+
+        data = self.source.data
+        begin = {
+            "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
+            "samples": shortest(data), "origin": data.experiments[0].start,
+            "inputs": list(data.inputs), "outputs": list(data.outputs),
+            "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
+        lead = f"{data.n_samples} samples every {data.dt:g}"
+        body = template("workbench.html.j2").render(
+            version=__version__, title=data.name or "Record", lead=lead, sections=[], begin=embedded(begin),
+            script=Markup(self.scripts))
+        digest = base64.b64encode(hashlib.sha256(self.scripts.encode()).digest()).decode()
+        return body, (f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; img-src data:; "
+                      "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Server
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        """Open a page for who knows the token."""
+        asked = urlsplit(self.path)
+        token = parse_qs(asked.query).get("token", [""])[0].encode()
+        if not (self._own() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
+            return self._send(403, "Open the address that optid workbench has printed, with its token.", "text/plain")
+        body, policy = self.server.page(self.server.opened())
+        self._send(200, body, "text/html", policy)
+
+    def do_POST(self) -> None:
+        """Answer a question of a page."""
+        bench = self.server.benches.get(self.headers.get("X-Optid-Page", ""))
+        size = self.headers.get("Content-Length", "")
+        if not self._own() or bench is None or not size.isdecimal() or int(size) > LARGEST:
+            self.close_connection = True
+            return self._send(403, json.dumps({"error": "this page is not known here: open it again"}))
+        try:
+            asked = json.loads(self.rfile.read(int(size)))
+            if not isinstance(asked, dict):
+                raise DataError("a question is an object")
+            code, answer = 200, bench.answer(self.path.removeprefix("/"), asked)
+        except (OptidError, ValueError, TypeError, KeyError) as error:
+            code, answer = 400, {"error": f"{type(error).__name__}: {error}"}
+        except Exception as error:  # a defect must not leave the page waiting
+            code, answer = 500, {"error": f"a defect of optid: {type(error).__name__}: {error}"}
+        self._send(code, json.dumps(answer))
+
+    def _own(self) -> bool:
+        """Whether a request was meant for this server, by a page of this server."""
+        origin = self.headers.get("Origin")
+        return self.headers.get("Host") in self.server.hosts and (
+            origin is None or origin in [f"http://{host}" for host in self.server.hosts]) and (
+            self.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"))
+
+    def _send(self, code: int, text: str, kind: str = "application/json", policy: str = "default-src 'none'") -> None:
+        body = text.encode()
+        self.send_response(code)
+        for key, value in {
+            "Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body)), "Cache-Control": "no-store",
+            "Content-Security-Policy": policy, "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin", "Cross-Origin-Opener-Policy": "same-origin",
+        }.items():
+            self.send_header(key, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing: the terminal is the user's."""
+
+
+def serve(source: Source, port: int = 0, ready: Callable[[str], None] = print) -> None:
+    """Serve a record until it is interrupted.
+
+    Args:
+        source: the record.
+        port: of 127.0.0.1; any free one by default.
+        ready: hears the address.
+
+    Raises:
+        DataError: the port is taken.
+    """
+    try:
+        server = Server(source, port)
+    except OSError as error:
+        raise DataError(f"port {port} of 127.0.0.1 cannot be used: {error.strerror}") from None
+    with server, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ready(server.address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            return
