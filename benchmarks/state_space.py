@@ -203,7 +203,7 @@ def beyond(x: Any, width: float) -> Any:
 
 
 def cascade(v: Any) -> dict[str, Any]:
-    """Return the level changes of two tanks, of which the upper one spills into the lower one, and the voltage shown."""
+    """Return the level changes of two tanks, the upper of which spills into the lower, and the voltage shown."""
     down = v["upper"] * v["h1"] ** 0.5 + beyond(v["h1"] - v["rim1"], 0.3)
     out = v["lower"] * v["h2"] ** 0.5 + beyond(v["h2"] - v["rim2"], 0.3)
     return {"h1": v["pump"] * beyond(v["u"] - v["dead"], 0.1) - down, "h2": down - out,
