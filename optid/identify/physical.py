@@ -344,5 +344,6 @@ class CompressedPhysical(CompressedStates):
         found = [names[j] for j in np.flatnonzero(part > NAMED * part.max())]
         listed = ", ".join(map(repr, found))
         what = "can change together without any" if len(found) > len(still) else f"ha{'ve' if found[1:] else 's'} no"
-        raise RankError(f"{listed} {what} effect on the outputs of this record. Write a known value in place of a parameter, hold one by a constraint such as "
-                        f"lambda v: v[{found[0]!r}] == 1, or record what moves it")
+        raise RankError(f"{listed} {what} effect on the outputs of this record. Write a known value in place of a "
+                        f"parameter, hold one by a constraint such as lambda v: v[{found[0]!r}] == 1, or record what "
+                        "moves it")
