@@ -274,6 +274,14 @@ def test_steps_are_solved_to_the_size_of_the_states_or_end_the_run(scale):
     assert len(escaping) == len(u) and np.isfinite(escaping[0]) and np.isnan(escaping[-1])
 
 
+def test_a_tank_may_run_empty(tanks):
+    _, fit = tanks
+    dry = fit.model.simulate(np.zeros(200), x0=np.array([1.0, 1.0]))
+    assert np.isfinite(dry).all() and np.abs(dry[-20:]).max() < 0.05 and np.ptp(dry[-20:]) < 1e-9
+    record = Data(np.zeros(200), dry, fit.model.dt, inputs=fit.model.inputs, outputs=fit.model.outputs)
+    assert np.ravel(fit.model.simulate(record, x0="fit")) == pytest.approx(np.ravel(dry), abs=1e-6)
+
+
 def test_a_record_too_long_is_refused():
     with pytest.raises(StructureError, match="takes up to"):
         quiet(Data(np.zeros(30_000) + np.arange(30_000) % 7, np.arange(30_000) % 5.0), LINEAR)

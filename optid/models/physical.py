@@ -21,6 +21,7 @@ from optid.models.state_simulation import allowed_range
 CHUNK = 64  # samples run at a time, after which a run that has left the numbers ends
 NEWTON = {"abstol": 1e-13, "abstolStep": 1e-13, "max_iter": 20, "error_on_fail": False, "show_eval_warnings": False}
 SOLVED = 1e-8  # error of an implicit step, relative to the state, beyond which it has no solution and the run ends
+EDGE = 1e-12  # distance from a lower bound, relative, at which roots and logarithms that end there have a slope
 LEAST = 1e-9  # size of a state, as a share of the largest, that its tolerance is relative to at least
 
 
@@ -234,9 +235,10 @@ class Runs:
             raise StructureError("the equations of the model file cannot be read by this version of CasADi") from error
         if not right.is_a("SXFunction"):
             raise StructureError("the equations of the model file are not plain expressions")
-        low, high = (ca.DM(end) for end in zip(*bounds))
+        low, high = np.array(bounds).T
+        low = low + EDGE * np.abs(np.nan_to_num(low, neginf=0.0)) + 1e-100
         x, u, p = (ca.SX.sym(name, right.size1_in(i)) for i, name in enumerate("xup"))
-        inside = right(ca.fmin(ca.fmax(x, low), high), u, p)
+        inside = right(ca.fmin(ca.fmax(x, ca.DM(low)), ca.DM(high)), u, p)
         return cls(ca.Function("right", [x, u, p], list(inside)), steps, hold, dt)
 
     @cached_property
@@ -282,16 +284,15 @@ class Runs:
 
     @cached_property
     def _trapezoid(self) -> Any:
-        """One step of the trapezoidal rule, solved by Newton's method from Euler's step."""
+        """One step of the trapezoidal rule, solved by Newton's method; NaN where there is no solution."""
         n, m, q = (self.right.size1_in(i) for i in range(3))
         w, given = ca.SX.sym("w", n), ca.SX.sym("g", n + 2 * m + q)
         x, u, after, p = (given[a:b] for a, b in zip((0, n, n + m, n + 2 * m), (n, n + m, n + 2 * m, n + 2 * m + q)))
         half = self.dt / self.steps / 2
         now = half * self.right(x, u, p)[0]
-        euler = x + 2 * now
-        size = ca.fabs(x) + ca.fabs(now) + ca.fabs(half * self.right(euler, after, p)[0])
+        size = ca.fabs(x) + ca.fabs(now) + ca.fabs(half * self.right(x + 2 * now, after, p)[0])
         size = ca.fmax(size, LEAST * ca.mmax(size) + 1e-100)
-        z = euler + size * w
+        z = x + size * w
         rest = (z - x - now - half * self.right(z, after, p)[0]) / size
         solved = ca.rootfinder("trapezoid", "newton", {"x": w, "p": given, "g": rest}, NEWTON)
         found = ca.Function("found", [w, given], [ca.if_else(ca.mmax(ca.fabs(rest)) < SOLVED, z, ca.SX.nan(n))])
