@@ -254,7 +254,7 @@ def test_bad_equations_are_refused_by_name(given, words):
     (lambda v: {"x": v["a"] * v["x"] ** 3 + v["b"] * v["u"], "y": v["x"]}, 30.0, "discrete")])
 def test_equations_that_explode_from_every_start_are_refused_in_seconds(right, start, time):
     plant, started = Equations(right, {"x": 1.0}, {"a": start, "b": 1.0}, time=time), process_time()
-    with pytest.raises((StructureError, RankError), match="leaves the range of num.* a = |'a', 'b' have no effect"):
+    with pytest.raises((StructureError, RankError), match="leaves the range of numbers.* a = |no effect"):
         quiet(bent(), plant, starts=2)
     assert process_time() - started < 30
 
