@@ -8,6 +8,9 @@
   ``z_o = Cz_o x + Dz_o u + const``, from the optimum of the model with h the identity; f is the identity for Wiener
   models.
 
+Rules about the shape of h (`shape.convex`, `shape.odd`, ...) name the latent signal as their channel, "z1", "z2", ...;
+``mu latent[z1]`` are the coefficients of h in its basis.
+
 The errors are minimised over all parts, z included, by the programmes of `formulations.state_space`.
 """
 

@@ -54,7 +54,8 @@ def physical(data: Data, *, equations: Equations | str, starts: int = 6, seed: i
         constraints: builders such as ``lambda v: v["k1"] <= v["k2"]``.
 
     Raises:
-        StructureError: equations that do not fit the record or have no value at the start, too many samples.
+        StructureError: equations that do not fit the record, have no value at the start, or whose run explodes; too
+            many samples.
         DataError: no stretch of some length in which every input is present.
         RankError: parameters that the record does not determine, by name.
     """
@@ -81,8 +82,10 @@ def _procedure(errors: PhysicalErrors, starts: int, seed: int, constraints: tupl
     if not solution.has_point:
         return None
     program.assign(solution.values)
-    if solution.status in (Status.LOCAL, Status.OPTIMAL) and isinstance(program.compressed, CompressedPhysical):
+    if isinstance(program.compressed, CompressedPhysical):
         program.compressed.settle(program)
+        if solution.status in (Status.LOCAL, Status.OPTIMAL):
+            program.compressed.refuse_undetermined(program)
     return program.recover(solution.values)
 
 

@@ -142,10 +142,16 @@ class StateSpaceFit(TangentFit):
 
         residual = matrix @ step + errors
         structural = {"residual": (r == residual,)}
-        expansion, units = self.criterion.unknowns.expansion, self.units
-        view = View({**variables, **self._products(variables, values)}, iterate=True, gauge="norm",
+        unknowns, units = self.criterion.unknowns, self.units
+        expansion = unknowns.expansion
+        latent = {f"z{i}": one for i, one in enumerate(unknowns.latent, start=1)}
+        functions = {f"mu latent[{z}]": one.vectors @ variables[self.criterion.key("c", i)]
+                     for i, (z, one) in enumerate(latent.items()) if one.row is None}
+        bases = dict(zip(expansion.input_names, outer_bases(expansion.inputs, units)))
+        view = View({**variables, **self._products(variables, values), **functions}, iterate=True, gauge="norm",
                     channels=expansion.input_names, outputs=expansion.output_names, reference=values, units=units,
-                    bases=dict(zip(expansion.input_names, outer_bases(expansion.inputs, units))))
+                    bases=bases | {z: one.basis for z, one in latent.items()},
+                    spans={z: one.vectors for z, one in latent.items()})
         program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
                           {**values, "residual": errors}, self.recover, view, frozenset(structural),
                           derived={"residual": residual}, compressed=compressed, scale=self.criterion.energy)

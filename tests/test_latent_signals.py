@@ -8,6 +8,7 @@ from scipy.signal import lfilter
 from state_systems import by_hand
 
 import optid
+from formulations.constraints import shape
 from optid.bases import BSpline, Polynomial, UserFunctions
 from optid.data.channels import Transform
 from optid.data.record import Data
@@ -332,3 +333,72 @@ def test_words_are_refused():
                       {"latent_basis": "spline"}):
         with pytest.raises(OptidError):
             optid.fit(data, "lfr.exact", nx=1, **arguments)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_rest_is_judged_by_the_terms_that_cancel_there(scale):
+    """A fed-back output and two functions of about one, which cancel, leave a state that is rounding."""
+    rng = np.random.default_rng(0)
+    model = latent(A=0.3 * rng.normal(size=(3, 3)), feedback=(), E=np.zeros((3, 0)), output_of=(),
+                   offset_x=np.zeros(3), offset_z=np.array([0.4, -0.5]), Ez=scale * rng.normal(size=(3, 2)),
+                   Cz=0.4 * rng.normal(size=(2, 3)) / scale, C=0.1 * rng.normal(size=(2, 3)),
+                   Fz=np.zeros((2, 2)), offset_y=scale * np.ones(2))
+    level = model.latent_values(model.latent_signals(np.zeros((1, 3)), np.zeros((1, 2))))[0]
+    model = replace(model, L=-model.Ez * level / scale)
+    x, y = model.equilibrium(np.zeros(2))
+    assert np.abs(x).max() < 1e-13 * scale and y == pytest.approx(scale * np.ones(2), rel=1e-13)
+
+
+def wiener_record(samples=500):
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, samples)
+    z = lfilter([0.0, 0.5, 0.2], [1.0, -1.1, 0.4], u)
+    return Data(u, np.tanh(1.5 * z) + 0.1 * rng.normal(size=samples))
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+def test_shapes_of_output_functions_hold_and_have_prices():
+    data, settings = wiener_record(), {"nx": 2, "output_basis": "bspline:6"}
+    free = optid.fit(data, "wiener_ss.exact", **settings)
+    grid = np.linspace(-1.0, 1.0, 400)
+    assert np.diff(free.model.latent[0](grid)).min() < -1e-5  # the noise bends the ends down
+    basis = replace(BSpline(6), interval=(-1.0, 1.0))
+
+    def rising(slack):
+        return optid.fit(data, "wiener_ss.exact", **settings, constraints=[
+            lambda v: {"rising": basis.increments() @ v["mu latent[z1]"] >= slack}])
+
+    fit = optid.fit(data, "wiener_ss.exact", **settings, constraints=[shape.monotone("increasing", "z1")])
+    assert np.diff(fit.model.latent[0](grid)).min() >= -1e-7
+    assert fit.solution.objective == pytest.approx(rising(0.0).solution.objective, rel=1e-6)
+    step = 1e-4
+    slope = (rising(step).solution.objective - rising(-step).solution.objective) / (2 * step)
+    (price,) = rising(0.0).prices
+    assert price.binding and abs(price.multiplier) == pytest.approx(slope, rel=0.05)
+    odd = optid.fit(data, "wiener_ss.exact", **settings, constraints=[shape.odd("z1")]).model.latent[0]
+    assert odd(grid) + odd(-grid) == pytest.approx(2 * odd(np.zeros(1)) * np.ones(400), abs=1e-8)
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+def test_functions_of_latent_signals_are_bent_as_asked_or_the_question_is_refused():
+    rng = np.random.default_rng(0)
+    u, y = rng.uniform(-1, 1, 300), np.zeros(300)
+    for k in range(299):
+        y[k + 1] = 0.6 * y[k] + 0.8 * u[k] + 0.4 * max(y[k] - 0.2, 0.0) - 0.3 * max(-y[k] - 0.9, 0.0)
+    data = Data(u, y + 0.05 * rng.normal(size=300))
+
+    def fit(*rules):
+        return optid.fit(data, "lfr.exact", nx=1, latent_basis="bspline:4", tries=1, iterations=40, constraints=rules)
+
+    grid = np.linspace(-1.0, 1.0, 200)
+    free = fit()
+    bend = np.diff(free.model.latent[0](grid), 2)
+    assert bend.min() < -1e-7 and bend.max() > 1e-7
+    held = fit(shape.convex("z1"))
+    assert np.diff(held.model.latent[0](grid), 2).min() >= -1e-9
+    assert held.solution.objective == pytest.approx(free.solution.objective, rel=0.2)
+    for rule, words in ((shape.monotone("increasing", "z1"), "slope of the function of z1"),
+                        (shape.even("z1"), "slope of the function"), (shape.gain(1.0, channel="z1"), "no static"),
+                        (shape.convex("z2"), "a latent signal is z1"), (shape.monotone("decreasing", "z1"), "-z1")):
+        with pytest.raises(StructureError, match=words):
+            fit(rule)

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import replace
+from time import process_time
 
 import cvxpy as cp
 import numpy as np
@@ -246,6 +247,39 @@ def test_equations_are_written_as_by_hand():
 def test_bad_equations_are_refused_by_name(given, words):
     with pytest.raises((StructureError, LookupFailed), match=words):
         quiet(record(50), given() if callable(given) else given)
+
+
+@pytest.mark.parametrize(("right", "start", "time"), [
+    (lambda v: {"x": v["a"] * v["x"] + v["b"] * v["u"], "y": v["x"]}, 50.0, "continuous"),
+    (lambda v: {"x": v["a"] * v["x"] ** 3 + v["b"] * v["u"], "y": v["x"]}, 30.0, "discrete")])
+def test_equations_that_explode_from_every_start_are_refused_in_seconds(right, start, time):
+    plant, started = Equations(right, {"x": 1.0}, {"a": start, "b": 1.0}, time=time), process_time()
+    with pytest.raises((StructureError, RankError), match="leaves the range of numbers.* a = |no effect"):
+        quiet(bent(), plant, starts=2)
+    assert process_time() - started < 30
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_steps_are_solved_to_the_size_of_the_states_or_end_the_run(scale):
+    def right(v):
+        return {"x": -v["a"] * v["x"] ** 2 / scale + v["b"] * scale * v["u"], "y": v["x"]}
+
+    u = bent().u
+    model = PhysicalErrors.of(Data(u, scale * u), Equations(right, {"x": scale}, {"a": 0.3, "b": 0.1}))
+    p = np.array([0.3, 0.1])
+    x = np.vstack([states for states, _ in model.runs.over(u, np.array([scale]), p)])[:20, 0] / scale
+    middle = (x[1:] ** 2 + x[:-1] ** 2) / 2
+    assert x[1:] - x[:-1] == pytest.approx(-0.3 * middle + 0.1 * u[:19, 0], abs=1e-12)
+    escaping = np.vstack([y for _, y in model.runs.over(u, np.array([-100 * scale]), p)])
+    assert len(escaping) == len(u) and np.isfinite(escaping[0]) and np.isnan(escaping[-1])
+
+
+def test_a_tank_may_run_empty(tanks):
+    _, fit = tanks
+    dry = fit.model.simulate(np.zeros(200), x0=np.array([1.0, 1.0]))
+    assert np.isfinite(dry).all() and np.abs(dry[-20:]).max() < 0.05 and np.ptp(dry[-20:]) < 1e-9
+    record = Data(np.zeros(200), dry, fit.model.dt, inputs=fit.model.inputs, outputs=fit.model.outputs)
+    assert np.ravel(fit.model.simulate(record, x0="fit")) == pytest.approx(np.ravel(dry), abs=1e-6)
 
 
 def test_a_record_too_long_is_refused():

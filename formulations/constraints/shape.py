@@ -15,7 +15,9 @@ For state-space models they act in the step that chooses B and D ("realisation")
 observer gain is held at its mean there. The rules of `formulations.constraints.responses` belong to that step alone.
 
 Every rule takes the name of an input as ``channel`` (None means every input, or the only one where a static
-characteristic is meant) and, about a static characteristic, that of an output, where there are several.
+characteristic is meant) and, about a static characteristic, that of an output, where there are several. Rules about
+shape also take a latent signal, "z1", "z2", ...: those on the slope of its function (monotone, even, dead zones) only
+where it has one of its own, as in Wiener models; elsewhere what is linear in z may stand in the matrices as well.
 """
 
 from collections.abc import Callable, Sequence
@@ -274,7 +276,10 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
     """Rows on f that are not negative; ``heights`` says that they are differences of its values."""
 
     def build(view: View) -> Any:
-        found = [Limit(rows(view.basis(one)) @ curve >= 0, bound=one,
+        if direction == "decreasing" and channel in view.spans:
+            raise StructureError(f"what decreases in {channel} increases in -{channel}, which gives the same outputs: "
+                                 "ask for increasing")
+        found = [Limit(_rows(view, one, rows) @ curve >= 0, bound=one,
                        step=_range_of(view.basis(one), curve) if heights else None, words=RANGE if heights else "")
                  for one in _inputs(view, channel) for curve in view.curves(one)]
         ways: dict[str, Any] = {one: view.direction(one) for one in _inputs(view, channel)}
@@ -285,14 +290,29 @@ def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], 
 
 
 def _linear(word: str, channel: str | None, rows: Callable[[Any], np.ndarray]) -> Rule:
-    def limit(basis: Any, coefficients: Any) -> Limit:
-        whole = rows(basis)
+    def limit(view: View, one: str) -> Limit:
+        whole, coefficients = _rows(view, one, rows), view.function(one)
         matrix = _independent(whole)
-        return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(basis, coefficients),
+        return Limit(matrix @ coefficients == 0, band=whole, span=matrix, step=_range_of(view.basis(one), coefficients),
                      words=RANGE)
 
-    return Rule(label(word, channel),
-                lambda view: [limit(view.basis(one), view.function(one)) for one in _inputs(view, channel)])
+    return Rule(label(word, channel), lambda view: [limit(view, one) for one in _inputs(view, channel)])
+
+
+def _rows(view: View, channel: str, rows: Callable[[Any], np.ndarray]) -> np.ndarray:
+    """Return the rows of a condition; refuse one on the slope of a latent function that has none of its own."""
+    basis = view.basis(channel)
+    found, span = rows(basis), view.spans.get(channel)
+    if span is None:
+        return found
+    z = basis.grid()
+    straight = np.linalg.lstsq(basis.values(z), z)[0]
+    apart = np.abs(straight - span @ (span.T @ straight)).max() > 1e-9 * np.abs(straight).max()
+    if apart and np.abs(found @ straight).max() > 1e-9 * np.abs(found).max():
+        raise StructureError(f"the slope of the function of {channel} is not determined: what is linear in the "
+                             "latent signal may stand in A, B, C and D as well. Ask for convex, concave or odd")
+    sizes = np.linalg.norm(found @ span, axis=1)
+    return found[sizes > 1e-9 * sizes.max()]  # the others hold for every function: natural splines end straight
 
 
 def _static(word: str, low: Any, high: Any, channel: str | None, output: str | None,

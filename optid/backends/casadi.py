@@ -27,6 +27,8 @@ from optid.program.program import Program
 from optid.program.solution import Status
 
 LIMIT = 3000  # iterations
+# iterations from where no run of the equations exists: thousands of states are either in reach soon or not at all
+FAR = 300
 
 STATUS = {
     "Solve_Succeeded": Status.LOCAL, "Feasible_Point_Found": Status.LOCAL,
@@ -234,6 +236,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
         chosen = {"ipopt.obj_scaling_factor": 1.0 / program.scale} | chosen
     if name == "ipopt" and program.settled and settings.warm:  # a large barrier would throw away the start
         chosen = {"ipopt.mu_init": 1e-6} | chosen
+    if name == "ipopt" and program.courses and not program.settled and chosen["ipopt.max_iter"] == LIMIT:
+        chosen["ipopt.max_iter"] = FAR
     graph = kept(program.problem, "casadi", lambda: translate(form))
     solver = kept(program.problem, (name, repr(sorted(chosen.items()))),
                   lambda: ca.nlpsol("solver", name, graph, chosen))

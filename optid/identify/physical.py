@@ -312,18 +312,23 @@ class CompressedPhysical(CompressedStates):
         self.criterion, self.outward = errors, Transform.identity(errors.data.m, errors.data.l)
 
     def settle(self, program: Program) -> None:
-        """Linearise the errors where the variables of the programme stand; refuse what is left open (`RankError`)."""
+        """Linearise the errors where the variables of the programme stand; refuse a run that explodes there."""
         super().settle(program)
-        equal, above, slack = constraint_rows(program, tuple(self.places.names))
-        self._refuse_undetermined(np.vstack([equal, above[slack <= BINDING * (1 + np.abs(slack).max(initial=0.0))]]))
+        if not np.isfinite(self.at.value):
+            names, (p, _) = self.criterion.unknowns.names, self.criterion.split(self.reference)
+            at = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, p))
+            raise StructureError(f"the run of the equations, or its slope, leaves the range of numbers where the "
+                                 f"solver ended: {at}. Start parameters nearer to the truth, or bound them")
 
     def spread(self, z: Array, moves: Array) -> Spread:
         """Return the scatter, which may be coloured, with the noise in units of the objective."""
         found = super().spread(z, moves)
         return replace(found, noise=found.noise / self.criterion.unit)
 
-    def _refuse_undetermined(self, rows: Array) -> None:
-        """Refuse what has no effect beside the gradients (k, p) of binding constraints (`RankError`)."""
+    def refuse_undetermined(self, program: Program) -> None:
+        """Refuse what neither the record nor binding constraints determine (`RankError`)."""
+        equal, above, slack = constraint_rows(program, tuple(self.places.names))
+        rows = np.vstack([equal, above[slack <= BINDING * (1 + np.abs(slack).max(initial=0.0))]])
         matrix, errors = self.at.whole[0], self.criterion
         initial = [f"initial {name}" for name in errors.equations.states] * errors.unknowns.experiments
         names = [*errors.unknowns.names, *initial]
@@ -338,7 +343,7 @@ class CompressedPhysical(CompressedStates):
         part = np.abs(still).max(axis=0)
         found = [names[j] for j in np.flatnonzero(part > NAMED * part.max())]
         listed = ", ".join(map(repr, found))
-        what = (f"{listed} can change together without any effect on the outputs of this record"
-                if len(found) > len(still) else f"{listed} has no effect on the outputs of this record")
-        raise RankError(f"{what}. Write a known value in place of a parameter, hold one by a constraint such as "
-                        f"lambda v: v[{found[0]!r}] == 1, or record what moves it")
+        what = "can change together without any" if len(found) > len(still) else f"ha{'ve' if found[1:] else 's'} no"
+        raise RankError(f"{listed} {what} effect on the outputs of this record. Write a known value in place of a "
+                        f"parameter, hold one by a constraint such as lambda v: v[{found[0]!r}] == 1, or record what "
+                        "moves it")

@@ -18,8 +18,11 @@ from optid.models.model import Model, frequency_response, impulse_response, stat
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.state_simulation import allowed_range
 
-CHUNK = 1024  # samples run at a time
-NEWTON = {"abstol": 1e-13, "abstolStep": 1e-13, "max_iter": 50, "error_on_fail": False, "show_eval_warnings": False}
+CHUNK = 64  # samples run at a time, after which a run that has left the numbers ends
+NEWTON = {"abstol": 1e-13, "abstolStep": 1e-13, "max_iter": 20, "error_on_fail": False, "show_eval_warnings": False}
+SOLVED = 1e-8  # error of an implicit step, relative to the state, beyond which it has no solution and the run ends
+EDGE = 1e-12  # distance from a lower bound, relative, at which roots and logarithms that end there have a slope
+LEAST = 1e-9  # size of a state, as a share of the largest, that its tolerance is relative to at least
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -232,9 +235,10 @@ class Runs:
             raise StructureError("the equations of the model file cannot be read by this version of CasADi") from error
         if not right.is_a("SXFunction"):
             raise StructureError("the equations of the model file are not plain expressions")
-        low, high = (ca.DM(end) for end in zip(*bounds))
+        low, high = np.array(bounds).T
+        low = low + EDGE * np.abs(np.nan_to_num(low, neginf=0.0)) + 1e-100
         x, u, p = (ca.SX.sym(name, right.size1_in(i)) for i, name in enumerate("xup"))
-        inside = right(ca.fmin(ca.fmax(x, low), high), u, p)
+        inside = right(ca.fmin(ca.fmax(x, ca.DM(low)), ca.DM(high)), u, p)
         return cls(ca.Function("right", [x, u, p], list(inside)), steps, hold, dt)
 
     @cached_property
@@ -258,7 +262,7 @@ class Runs:
             ends = [now + (self.hold == "first") * (i / self.steps) * (after - now) for i in range(self.steps + 1)]
             state = x
             for first, last in zip(ends, ends[1:]):
-                state = self._trapezoid(state, ca.vertcat(state, first, last, p))
+                state = self._trapezoid(ca.vertcat(state, first, last, p))
         return ca.Function("step", [x, both, p], [state, y])
 
     @cached_property
@@ -280,13 +284,20 @@ class Runs:
 
     @cached_property
     def _trapezoid(self) -> Any:
-        """One step of the trapezoidal rule, solved by Newton's method from Euler's step."""
+        """One step of the trapezoidal rule, solved by Newton's method; NaN where there is no solution."""
         n, m, q = (self.right.size1_in(i) for i in range(3))
-        z, given = ca.SX.sym("z", n), ca.SX.sym("g", n + 2 * m + q)
+        w, given = ca.SX.sym("w", n), ca.SX.sym("g", n + 2 * m + q)
         x, u, after, p = (given[a:b] for a, b in zip((0, n, n + m, n + 2 * m), (n, n + m, n + 2 * m, n + 2 * m + q)))
         half = self.dt / self.steps / 2
-        rest = z - x - half * (self.right(x, u, p)[0] + self.right(z, after, p)[0])
-        return ca.rootfinder("trapezoid", "newton", {"x": z, "p": given, "g": rest}, NEWTON)
+        now = half * self.right(x, u, p)[0]
+        size = ca.fabs(x) + ca.fabs(now) + ca.fabs(half * self.right(x + 2 * now, after, p)[0])
+        size = ca.fmax(size, LEAST * ca.mmax(size) + 1e-100)
+        z = x + size * w
+        rest = (z - x - now - half * self.right(z, after, p)[0]) / size
+        solved = ca.rootfinder("trapezoid", "newton", {"x": w, "p": given, "g": rest}, NEWTON)
+        found = ca.Function("found", [w, given], [ca.if_else(ca.mmax(ca.fabs(rest)) < SOLVED, z, ca.SX.nan(n))])
+        known = ca.MX.sym("g", given.numel())
+        return ca.Function("trapezoid", [known], [found(solved(ca.DM.zeros(n), known), known)])
 
     def over(self, u: Array, x0: Array, p: Array) -> Iterator[tuple[Array, Array]]:
         """Yield (states, outputs) of a run, some samples at a time."""
@@ -306,12 +317,9 @@ class Runs:
         for first in range(0, len(u), CHUNK):
             part = both[first : first + CHUNK]
             used = run if len(part) == CHUNK else step.mapaccum(len(part))
-            try:
-                states, found = (np.array(one).T for one in used(start, part.T, p))
-            except RuntimeError:  # a step without a solution, far from any record: no number from here on
-                rest = len(u) - first
-                yield (np.vstack([start[None], np.full((rest - 1, start.size), np.nan)]),
-                       np.full((rest, step.size1_out(1)), np.nan))
-                return
+            states, found = (np.array(one).T for one in used(start, part.T, p))
             yield np.vstack([start[None], states[:-1]]), found
-            start = states[-1]
+            start, rest = states[-1], len(u) - first - len(part)
+            if rest and not np.isfinite(start).all():
+                yield np.full((rest, start.size), np.nan), np.full((rest, step.size1_out(1)), np.nan)
+                return

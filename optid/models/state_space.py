@@ -28,7 +28,7 @@ MATRICES = {
 COVARIANCES = {"Q": "nn", "R": "ll", "S": "nl", "innovation": "ll"}
 
 NEWTON_STEPS = 100
-RESTS = 1e-12  # a state that moves by less than this share of its size rests
+RESTS = 1e-12  # a state that moves by less than this share of the largest term of its equation rests
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -195,9 +195,9 @@ class StateSpace(Model):
             h = self.latent_values(self.latent_signals(x[None], points[None]))[0]
             y = self.C @ x + self.D @ f + self.Fz @ h + self.offset_y
             g = np.array([function(y[o]) for function, o in zip(self.feedback, self.output_of)])
-            change = self.A @ x + self.B @ f + self.E @ g + self.L @ y + self.Ez @ h + self.offset_x - x
-            size = np.abs(x).max(initial=0.0) + np.abs(self.B @ f + self.offset_x).max(initial=0.0)
-            if np.abs(change).max(initial=0.0) <= RESTS * size:
+            terms = np.array([self.A @ x, self.B @ f, self.E @ g, self.L @ y, self.Ez @ h, self.offset_x, -x])
+            change = terms.sum(axis=0)
+            if np.abs(change).max(initial=0.0) <= RESTS * np.abs(terms).max(initial=0.0):
                 return x, y
             x = x - np.linalg.lstsq(self._tangent(x, y, points)[0] - np.eye(self.nx), change)[0]
             if not np.all(np.isfinite(x)):

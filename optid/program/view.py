@@ -27,7 +27,9 @@ class View(Mapping[str, cp.Expression]):
         inner: the expressions in the units of the programme.
         channels: names of the inputs; with one input the plain names ``b``, ``mu``, ``Theta`` stand for it,
             with several they carry the input, as in ``mu[valve]``.
-        bases: the fitted basis of every channel.
+        bases: the fitted basis of every channel, and of the latent signals "z1", "z2", ...
+        spans: coordinates (P, r) of the functions of latent signals, orthonormal; those without z itself leave what is
+            linear in z to the matrices.
         gauge: how the scale between ``mu`` and ``b`` is fixed ("norm", "gain", "b0"), "" where nothing needs fixing.
         reference: values of the unconstrained least-squares estimate, for constraints that need a centre; matrices
             ``A`` and ``C`` of a state-space model, held where they are no variables.
@@ -42,6 +44,7 @@ class View(Mapping[str, cp.Expression]):
     _: KW_ONLY
     channels: tuple[str, ...] = ()
     bases: Mapping[str, Any] = field(default_factory=dict)
+    spans: Mapping[str, np.ndarray] = field(default_factory=dict)
     gauge: str = ""
     reference: Values = field(default_factory=dict)
     outputs: tuple[str, ...] = ()
@@ -87,7 +90,9 @@ class View(Mapping[str, cp.Expression]):
         return variable.id in self._auxiliaries
 
     def key(self, name: str, channel: str | None = None) -> str:
-        """Return the key of a per-channel quantity: ``mu`` with one input, ``mu[channel]`` with several."""
+        """Return the key of a per-channel quantity: ``mu`` with one input, ``mu[channel]``, ``mu latent[z1]``."""
+        if channel in self.bases and channel not in self.channels:
+            return f"{name} latent[{channel}]"
         if len(self.channels) <= 1:
             return name
         if channel is None:
@@ -121,7 +126,8 @@ class View(Mapping[str, cp.Expression]):
                 raise StructureError(f"this constraint needs channel=, one of {', '.join(self.channels)}")
             return self.channels[0]
         if channel not in self.bases:
-            raise StructureError(f"there is no input {channel!r}; the inputs are {', '.join(self.channels)}")
+            raise StructureError(f"there is no input {channel!r}; the inputs are {', '.join(self.channels)}"
+                                 + "".join(f", a latent signal is {one}" for one in [*self.bases][len(self.channels):]))
         return channel
 
     def output(self, output: str | None) -> int:
@@ -176,6 +182,9 @@ class View(Mapping[str, cp.Expression]):
             StructureError: there is no static curve, or it is not linear in the variables.
         """
         channel = self.channel(channel)
+        if channel not in self.channels:
+            raise StructureError(f"{channel} is a latent signal, which has no static characteristic: constrain the "
+                                 "shape of its function")
         if self.holds_matrices:
             a, c = self.reference["A"], self.reference["C"]
             try:

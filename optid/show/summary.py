@@ -186,7 +186,8 @@ def channel_table(fit: "Fit") -> Table | None:
 def solver_facts(fit: "Fit") -> Facts:
     """Which solver, why, and how long each part took."""
     s = fit.solution
-    facts = [("Solver", s.solver)]
+    descended = fit.figures.get("programmes") == 1 and not fit.program.user_constraints
+    facts = [("Solver", f"descent, {s.solver}" if descended else s.solver)]
     if s.chosen:
         facts.append(("Chosen because", s.chosen.partition(": ")[2] or s.chosen))
     if s.iterations >= 0:

@@ -36,6 +36,9 @@ INSIDE = 1e-6  # relative violation up to which a point satisfies the constraint
 NOWHERE = 1e-9  # relative violation that is rounding; a step to more than that pays for it
 ROUNDING = 1e-14  # share of the energy of the record below which differences of sums of squares are rounding
 PATIENCE = 5  # undamped programmes in all that may promise no more than `STALLED` before it counts as nothing
+# a step onto the constraints is taken where the sum of squares is up to so many times what its linear model said, and
+# from this damping on, with which it is nearly the shortest one, in any case
+TRUSTED, NEAR = 10.0, 1e-2
 PARTS = 10  # halvings of an undamped step that are tried where no damped one descends
 NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
@@ -111,11 +114,12 @@ class TangentFit(ABC):
         x, at = self.criterion.normalised(x), self.criterion.unknowns.slices
         errors = self.criterion.linearise(x) if self.constraints else None
         for mu, b in self.criterion.unknowns.products if self.criterion.gauge == "norm" else ():
-            if not mu.startswith("mu"):  # the signs of feedback functions stay
+            if mu.startswith("nu"):  # the signs of feedback functions stay
                 continue
             best, chosen = np.inf, x
             first = leading_sign(x[at[b]])
-            for mu_sign, b_sign in ((first, first), (-first, -first), (-first, first), (first, -first)):
+            signs = (first, first), (-first, -first), (-first, first), (first, -first)
+            for mu_sign, b_sign in signs if mu.startswith("mu") else signs[:2]:
                 turned = np.array(x)
                 turned[at[mu]] *= mu_sign
                 turned[at[b]] *= b_sign
@@ -179,9 +183,10 @@ class _Iterate:
         return cls(fit, x, at, program, outside, amount if outside > NOWHERE else 0.0)
 
     def moved(self, x: Array) -> "_Iterate | None":
-        """Return the iterate at x, None where it is inadmissible or its gauge cannot be reached."""
+        """Return the iterate at x, None where it is inadmissible, its run explodes or its gauge cannot be reached."""
+        criterion = self.fit.criterion
         try:
-            return _Iterate.of(self.fit, x) if self.fit.criterion.admissible(x) else None
+            return _Iterate.of(self.fit, x) if criterion.admissible(x) and np.isfinite(criterion.value(x)) else None
         except StructureError:
             return None
 
@@ -240,7 +245,9 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:
             return best.evidence(*here.judged(solution, share), {**figures, "programmes": count + more})
         expected = gain + weight * here.amount
         fall = here.merit(weight) - new.merit(weight) if new is not None else -np.inf
-        if new is not None and (not entered or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
+        entering = new is not None and not entered and (
+            damping > NEAR or new.at.value <= TRUSTED * here.at.after(step))
+        if new is not None and (entering or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
             previous, here, growth = here, new, 4.0
             entered = entered or new.outside <= INSIDE
             damping *= 0.1 if fall > 0.5 * expected else 1.0
