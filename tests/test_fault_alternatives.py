@@ -176,7 +176,7 @@ def test_without_an_actuator_that_moves_it_is_said_what_is_out_of_reach():
 
 @pytest.mark.parametrize(("direct", "room"), [(0.0, 0.048), (1.0, 0.048), (200.0, None)])
 def test_the_margin_of_a_range_is_what_the_noise_hides(direct, room):
-    """A static plant y = direct f(u) + x, whose noise and slope are known: room = a tenth of the noise over the slope."""
+    """A static plant y = direct f(u) + x of known slope: the room is a tenth of the noise over the slope."""
     from fault_plants import noisy
 
     from optid.bases import Polynomial
@@ -208,5 +208,6 @@ def test_a_direct_effect_just_outside_the_range_raises_no_alarm():
 
     u = levels(600, 3)
     u[300:310, 1], u[400:410, 0] = 1.24, -1.24
-    events = Monitor(plant("clamp"), window=30, thresholds=np.full(9, 30.0)).run(u, inject(plant("extrapolate"), u, (), seed=4))
+    y = inject(plant("extrapolate"), u, (), seed=4)
+    events = Monitor(plant("clamp"), window=30, thresholds=np.full(9, 30.0)).run(u, y)
     assert [(e.kind, e.sample) for e in events if e.kind != "inside"] == [("outside", 300), ("outside", 400)]
