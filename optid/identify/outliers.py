@@ -53,9 +53,10 @@ def find_outliers(records: Sequence[Array]) -> list[np.ndarray]:
     Args:
         records: (N,) samples of every experiment; NaN = missing. What is missing parts no neighbours.
     """
-    present = [np.flatnonzero(~np.isnan(x)) for x in records]
-    wild = _wild([np.asarray(x, dtype=float)[kept] for x, kept in zip(records, present)])
-    return [kept[mask] for kept, mask in zip(present, wild)]
+    arrays = [np.asarray(x, dtype=float) for x in records]
+    present = [~np.isnan(x) for x in arrays]
+    wild = _wild([x if kept.all() else x[kept] for x, kept in zip(arrays, present)])
+    return [np.flatnonzero(kept)[mask] if mask.any() else np.flatnonzero(mask) for kept, mask in zip(present, wild)]
 
 
 def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Array) -> list[np.ndarray]:

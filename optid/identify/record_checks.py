@@ -110,15 +110,17 @@ def _warned(found: list[str]) -> list[str]:
 def _present(role: str, name: str, records: Sequence[np.ndarray]) -> np.ndarray:
     """Return the samples of a channel that are present; there must be two different ones."""
     x = np.concatenate(records)
-    x = x[~np.isnan(x)]
+    missing = np.isnan(x)
+    x = x[~missing] if missing.any() else x
     if x.size == 0:
         raise DataError(f"{role} {name!r} has no sample at all; choose another column or drop the {role}")
-    if np.ptp(x) == 0:
+    width = np.ptp(x)
+    if width == 0:
         remedy = ("nothing can be identified from it; excite the input or drop the channel" if role == "input" else
                   "there is nothing to explain; check the column")
         raise DataError(f"{role} {name!r} is constant ({x[0]:g}): {remedy}")
-    if np.ptp(x) < 1 / LARGEST:
-        raise DataError(f"{role} {name!r} varies by {np.ptp(x):.1e}, whose square is zero in floating point: give it "
+    if width < 1 / LARGEST:
+        raise DataError(f"{role} {name!r} varies by {width:.1e}, whose square is zero in floating point: give it "
                         "in another unit")
     return x
 
