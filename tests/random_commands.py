@@ -60,9 +60,11 @@ SLOW = {"--workers": ["1"], "--budget": ["1", "0.5", "0", "-1", "nan", "x"], "--
 
 ALWAYS = {"identify": ["--budget", "1", "--workers", "1"], "study run": ["--workers", "1"],
           "compare": ["--workers", "1", "--repetitions", "1", "--time-limit", "5", "--solvers", "clarabel"],
-          "isolability": ["--draws", "30"], "monitor": ["--arl0", "300", "--window", "20"], "design": ["--candidates", "1"]}
+          "isolability": ["--draws", "30"], "monitor": ["--arl0", "300", "--window", "20"],
+          "design": ["--candidates", "1"]}
 OFTEN = {"fit": 8, "validate": 4, "identify": 1, "compare": 1, "design": 3, "diagnose": 5, "isolability": 3,
-         "monitor": 4, "reformulate": 3, "order": 4, "study run": 2, "study report": 2, "study export": 2, "study problems": 1,
+         "monitor": 4, "reformulate": 3, "order": 4, "study run": 2, "study report": 2, "study export": 2,
+         "study problems": 1,
          "solvers": 0.2, "formulations": 0.2, "constraints": 0.2, "examples": 0.2, "study systems": 0.2,
          "study schema": 0.2}
 WRITTEN = {"--report": ".html", "--model": ".json", "--picture": ".png", "--out": ".json", "--export": ".csv",
