@@ -163,31 +163,26 @@ def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) 
     everywhere = choice.decided and overall.standing(choice.first).solved >= 0.99 * n and not beaten
     if count < 2 or not overall.standings or everywhere or not decided:
         return choice_of_solver(overall)
-    at, used = overall.found.accuracy, _used(overall, decided)
+    at, used, all_told = overall.found.accuracy, _used(overall, decided), len(decided) == count
     main, *others = used
-    counted, all_told = f"an accuracy of {at:.0e} ({counting(at)})", len(decided) == count
-    if not others and all_told:
-        lead = overall.standing(main)
-        text = f"{main} comes first, or ties for it, in {of(count, count, 'formulation')}, and "
-        text += f"reached {counted} on {of(lead.solved, n)}."
-        return Statement(_tone(lead, n), f"Use {main}", text, "solver")
-    if all_told and len(used[main]) > 1:
-        best = "; ".join([f"Use {main}", *(f"for {listed([s.name for s in used[name]])} {name}" for name in others)])
-    else:
-        best = "; ".join(f"{name} for {listed([s.name for s in theirs])}" for name, theirs in used.items())
+    where = {name: listed([section.name for section in theirs]) for name, theirs in used.items()}
+    best = "; ".join(f"{name} for {where[name]}" for name in used)
+    if all_told and (not others or len(used[main]) > 1):
+        best = "; ".join([f"Use {main}", *(f"for {where[name]} {name}" for name in others)])
     most = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
-    text = f"{most.solver} solved most, {of(most.solved, n)} at {counted}."
+    text = f"{most.solver} solved most, {of(most.solved, n)} at an accuracy of {at:.0e} ({counting(at)})."
     if most.solved < 0.99 * n:
         text = f"No solver does everything: {text}"
     if len(used[main]) > 1:
-        text += f" {main} comes first, or ties for it, in {len(used[main]):,} of {count:,} formulations."
+        text += f" {main} comes first, or ties for it, in {of(len(used[main]), count, 'formulation')}."
     if not all_told:
         text += f" For {count - len(decided)} of {count} formulations it cannot be told."
     tones = [_tone(one.standing(name), len(one.found.data)) for name, theirs in used.items() for one in theirs]
     tone = max(tones if all_told else [*tones, FAIR], key=(GOOD, FAIR, BAD).index)
-    if len(best) <= LONGEST:
-        return Statement(tone, best, f"It depends on the formulation. {text}", "solver")
-    return Statement(tone, "It depends on the formulation", f"{best}. {text}", "solver")
+    depends = "It depends on the formulation"
+    if len(best) > LONGEST:
+        return Statement(tone, depends, f"{best}. {text}", "solver")
+    return Statement(tone, best, f"{depends}. {text}" if others or not all_told else text, "solver")
 
 
 def _used(overall: Section, decided: list[Section]) -> dict[str, list[Section]]:
