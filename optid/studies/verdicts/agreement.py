@@ -30,8 +30,8 @@ def agreement_matrix(found: Results, table: Table) -> Agreement:
     gaps = np.abs(found.objective[:, :, None] - found.objective[:, None, :]) / found.size[:, None, None]
     gaps[:, np.eye(len(found.solvers), dtype=bool)] = np.nan
     apart, read = np.full(gaps.shape, np.nan), {}
-    for p, i, j in np.argwhere(np.triu(gaps <= same)):
-        apart[p, i, j] = apart[p, j, i] = model_distance(table, found.row[p, i], found.row[p, j], read)
+    for p, i, j in np.argwhere(np.triu(gaps <= same)).tolist():
+        apart[p, i, j] = apart[p, j, i] = model_distance(table, int(found.row[p, i]), int(found.row[p, j]), read)
     return Agreement(found.solvers, np.isfinite(gaps).sum(axis=0), (gaps <= same).sum(axis=0),
                      (~np.isnan(apart)).sum(axis=0), (apart <= MODEL).sum(axis=0),
                      np.fmax.reduce(gaps, axis=0, initial=np.nan), np.fmax.reduce(apart, axis=0, initial=np.nan))
