@@ -57,8 +57,11 @@ class Description:
 
 
 def describe(point: EntryPoint) -> Description:
-    """Describe the function of an entry point; a module that cannot be found raises `ImportError`."""
-    return _in_source(point.module, point.attr) or describe_function(point.load())
+    """Describe the function of an entry point; a module or function that cannot be found raises `ImportError`."""
+    try:
+        return _in_source(point.module, point.attr) or describe_function(point.load())
+    except AttributeError as error:
+        raise ImportError(str(error)) from error
 
 
 def describe_function(function: Callable[..., Any]) -> Description:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import warnings
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from optid.cli.app import app
 from optid.cli.terminal import spread
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
-from optid.registry import FORMULATIONS, registered
+from optid.registry import CONSTRAINTS, FORMULATIONS, registered
 from optid.solving.solve import solve
 
 
@@ -46,6 +47,14 @@ def csv(tmp_path_factory) -> Path:
 
 
 ORDERS = ["--na", 1, "--nb", 2, "--basis", "polynomial:3"]
+
+
+@pytest.mark.parametrize("place", ["no_such_package:mine", "formulations.constraints.shape:no_such_function"])
+def test_a_broken_plug_in_takes_nothing_away(monkeypatch, place):
+    known = {**registered(CONSTRAINTS), "mine": EntryPoint("mine", place, CONSTRAINTS)}
+    monkeypatch.setattr("optid.cli.listings.registered", lambda group: known)
+    result = run("constraints")
+    assert result.exit_code == 0 and "cannot be loaded" in result.output and "monotone" in result.output
 
 
 # -- words -------------------------------------------------------------------------------------------------------------

@@ -333,7 +333,7 @@ def test_what_does_not_fit_is_refused_by_name(healthy, faults):
         reformulate(healthy, good, data.y)
     with pytest.raises(DataError, match="beyond the record"):
         reformulate(healthy, good, Data(data.u[:50], data.y[:50]))
-    for wrong in ({"stage": "everything"}, {"nodes": 2}, {"if_ambiguous": "maybe"}):
+    for wrong in ({"stage": "everything"}, {"nodes": 2}, {"if_ambiguous": "maybe"}, {"low": [-1.0, -1.0, -1.0]}):
         with pytest.raises(StructureError, match=next(iter(wrong))):
             reformulate(healthy, good, data, **wrong)
     u = np.array(data.u)

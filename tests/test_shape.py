@@ -229,6 +229,8 @@ def test_two_channels_share_their_dynamics():
     (lambda: shape.slope(2, 1), "low <= high; got 2, 1"),
     (lambda: shape.slope(), "low= and/or high="),
     (lambda: shape.gain(), "needs a value"),
+    (lambda: shape.gain(float("inf")), "finite numbers; got inf"),
+    (lambda: shape.slope(low=float("nan")), "finite numbers; got nan"),
     (lambda: shape.dead_zone(1, 1), "low < high"),
     (lambda: shape.saturation(), "needs a level"),
     (lambda: shape.through([0, 1], [1]), "as many outputs as inputs"),

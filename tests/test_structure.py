@@ -207,6 +207,18 @@ def test_missing_samples_and_experiments():
             != wiener
 
 
+@pytest.mark.parametrize("short", [1, 4, 8, 30])
+def test_experiments_shorter_than_the_responses_are_left_out(short):
+    data = hammerstein(1500, 5)
+    u, y = data.u, data.y
+    whole, more = structure_test(data), structure_test(Data([u, u[:short]], [y, y[:short]]))
+    assert more.passed and more.p_values["y"].keys() == whole.p_values["y"].keys()
+    runs = [np.zeros_like(y), np.zeros_like(y[:short])]
+    assert not structure_test(Data([u, u[:short]], [y, y[:short]]), runs).passed
+    with pytest.raises(RankError, match="No experiment has 129 samples"):
+        structure_test(Data(np.split(u[:1480], 40), np.split(y[:1480], 40)))
+
+
 def test_several_inputs_and_outputs():
     model = mimo()
     u = inputs(model, 3000)

@@ -307,7 +307,7 @@ def test_compare_tells_an_error_of_the_record_once(folder):
     (("study", "run"), "give a study file, or --example"),
     (("study", "run", "rigs.toml", "--example"), "not both"),
     (("study", "run", "rags.toml"), "study file rags.toml cannot be read: No such file"),
-    (("study", "run", "rig.csv"), "line 1, column"),
+    (("study", "run", "rig.csv"), "at line 1, column"),
     (("study", "run", "rigs.toml", "--db", "no/rows.sqlite"), "there is no folder"),
     (("study", "run", "rigs.toml", "--db", "rig.csv"), "rig.csv"),
     (("study", "run", "rigs.toml", "--export", "rows.xlsx"), ".parquet or .csv"),

@@ -166,29 +166,12 @@ def test_what_is_missing_altogether():
 
 
 @pytest.mark.parametrize("text, place", [
-    ("name = \n", "line 1, column 8"), ("a = 1\nb = 'x\n", "line 2, column 7"), ("[[data]\n", "line 1, column 7"),
-    ("a = [1, 2", "line 1, column 10"), ("a = 1\na = 2\n", "line 2"),
+    ("name = \n", "line 1, column 8"), ("a = 1\nb = 'x\n", "end of document"), ("[[data]\n", "line 1, column 7"),
+    ("a = 1\na = 2\n", "line 2"), ("solvers = auto\n", "line 1, column 11"), ('file = "C:\\data"\n', "Unescaped"),
 ])
-def test_what_is_not_toml_has_its_place(text, place):
-    assert problems(text)[0].startswith(place)
-
-
-@pytest.mark.parametrize("text, told", [
-    ('name = "x\nseeds = 2\n', "line 1, column 10: the quotation mark that ends this text is missing"),
-    ("seeds = # two\n", "line 1, column 9: the value is missing"),
-    ("solvers = auto\n", "line 1, column 11: 'auto' is no value: a text stands in quotation marks"),
-    ("warm = True\n", "line 1, column 8: 'True' is no value"),
-    ("noise = 0,1 # percent\n", "line 1, column 10: what stands here is too much: a line holds one key = value"),
-    ("time_limit = 60s\n", "line 1, column 16: 's' is too much"),
-    ("seeds = [1, 2\n", "line 1, column 14: the list does not end: a comma or ] is missing before this place, at the"),
-    ("seeds = 1\nseeds = 2\n", "this key has a value already"),
-    ('file = "C:\\users"\n', "a backslash is written twice"), ('file = "C:\\data"\n', "a backslash is written twice"),
-    ('name = """x\n', "the quotation marks that end a text are missing"),
-    ("[[data]\n", "expected ']]' at the end of an array declaration"),
-])
-def test_what_is_not_toml_is_told_in_words(text, told):
-    (found,) = problems(text)
-    assert told in found
+def test_what_is_not_toml_is_told_by_its_parser(text, place):
+    (told,) = problems(text)
+    assert place in told and "a text stands in quotation marks" in told
 
 
 def test_a_number_that_python_does_not_read_is_told():
@@ -202,7 +185,7 @@ def test_files_that_are_not_there_or_not_text(tmp_path):
     with pytest.raises(StudyError, match="cannot be read"):
         Study.from_toml(tmp_path)
     (tmp_path / "latin.toml").write_bytes("name = 'a'\n# f\xfcr".encode("latin-1"))
-    with pytest.raises(StudyError, match="line 2: this is not UTF-8"):
+    with pytest.raises(StudyError, match="not UTF-8.*position 14"):
         Study.from_toml(tmp_path / "latin.toml")
     (tmp_path / "windows.toml").write_bytes(b"\xef\xbb\xbf" + SMALL.replace("\n", "\r\n").encode())
     assert Study.from_toml(tmp_path / "windows.toml") == Study.from_text(SMALL)

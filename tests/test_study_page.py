@@ -617,7 +617,7 @@ def test_bad_input_is_told_in_words():
     assert words["empty"] == "Nothing to compare" and words["all refused"] == "Nothing was run"
     assert words["all failed"] == words["not finite"] == "No solver can be recommended"
     assert words["one row"] == "Only one solver" and words["one solver"] == "Models: cannot tell yet"
-    assert "at least 6 data sets; there is 1" in str(verdicts["one data set"])
+    assert "data sets; there is 1" in str(verdicts["one data set"])
     assert "Truth unknown" in str(verdicts["unknown truth"])
     for name in ("empty", "all failed", "all refused", "not finite", "one solver", "one row"):
         assert verdicts[name].recommended == ()

@@ -27,7 +27,7 @@ def test_reliability_goes_before_speed_and_the_quick_one_is_named():
     verdict = conclude(table_of(times))
     assert verdict.recommended == ("a",)
     value = verdict.overall.choice.against["b"].value
-    assert f"The next, b, solved only 15, in {value:.3g} × the time" in verdict.headline.text
+    assert f"The next, b, solved only 15, and where both work takes {value:.3g} times the time" in verdict.headline.text
     third = np.column_stack([times, 9 * times[:, 0]])
     assert "b is" in (text := conclude(table_of(third)).headline.text) and "solved only 15 of 20 problems" in text
 
@@ -236,7 +236,7 @@ def test_what_is_left_of_a_ratio_in_the_whole_fit_and_who_proves_is_said():
     text = verdict.headline.text
     assert "; for the whole fit 1.4" in text and "Proved globally optimal: a 24 of 26, b 26 of 26." in text
     two = conclude([{**row, "formulation": name} for row in rows for name in ("f", "g")])
-    assert "× for the whole fit. Proved globally optimal: a 24 of 26" in evidence(two.sections[0])
+    assert "times the time. Proved globally optimal: a 24 of 26" in evidence(two.sections[0])
     whole = conclude(rows, time="fit").headline.text
     assert "for the whole fit" not in whole and "takes 1.4" in whole
     assert "Proved" not in conclude([{**row, "proved": True} for row in rows]).headline.text

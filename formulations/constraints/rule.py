@@ -76,8 +76,15 @@ def sign_of(argument: str, word: str, positive: str, negative: str) -> float:
 
 
 def check_bounds(word: str, low: Any, high: Any, *, apart: bool = False) -> None:
-    """Refuse missing or crossing bounds, and equal ones where they must lie apart (`StructureError`)."""
+    """Refuse missing, infinite or crossing bounds, and equal ones where they must lie apart (`StructureError`)."""
     if low is None and high is None:
         raise StructureError(f"{word} needs low= and/or high=")
+    for bound in (low, high):
+        try:
+            finite = bound is None or np.isfinite(np.asarray(bound, dtype=float)).all()
+        except (TypeError, ValueError):
+            finite = False
+        if not finite:
+            raise StructureError(f"{word} needs finite numbers; got {bound!r}. Leave out a bound that does not hold")
     if low is not None and high is not None and (np.any(low > high) or apart and not low < high):
         raise StructureError(f"{word} needs low {'<' if apart else '<='} high; got {low!r}, {high!r}")

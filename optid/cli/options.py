@@ -149,4 +149,5 @@ def _option(parameter: inspect.Parameter, panel: str, words: str, text: str) -> 
         return typer.Argument(metavar=metavar, help=text, show_default=False)
     if not any(flag.startswith("--") for flag in flags):
         flags.insert(0, option_of(parameter.name))
-    return typer.Option(*flags, metavar=metavar, help=text, rich_help_panel=None if panel == "Options" else panel)
+    return typer.Option(*flags, metavar=metavar, help=text, rich_help_panel=None if panel == "Options" else panel,
+                        min=0 if parameter.name == "seed" else None)

@@ -149,6 +149,8 @@ def complain(error: BaseException) -> None:
         from optid.cli.options import in_options
 
         text = in_options(text)
+    elif isinstance(error, OSError) and error.strerror:
+        text = f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     if exit_code(error) == 1:
         text = f"{type(error).__name__}: {text}. This is a defect of optid; --debug shows where it happened"
     _tell("error", "bold red", text)

@@ -182,6 +182,7 @@ def study(
     """
     for word, value in (("draws", draws), ("calibration", calibration)):
         check_integer(value, word)
+    check_integer(seed, "seed", 0, 2**63)
     if window * found.model.l * draws > NUMBERS:
         raise StructureError(
             f"window={window}: {draws} simulated windows of so many samples do not fit in memory; "

@@ -66,9 +66,7 @@ def _section(section: Section) -> dict[str, Any]:
         "profiles": {name: _profile(p) for name, p in section.profiles.items()},
         "ranking": {
             "names": list(ranking.names), "ranks": _numbers(ranking.ranks), "n": ranking.n,
-            "p": _number(ranking.probability), "difference": _number(ranking.difference), "test": ranking.test,
-            "missing": ranking.missing, "left_out": list(ranking.left_out),
-            "apart": bool(ranking.told and ranking.probability < ranking.level),
+            "missing": ranking.missing, "left_out": list(ranking.left_out), "behind": list(ranking.behind),
         },
     }
 

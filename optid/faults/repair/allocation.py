@@ -354,12 +354,15 @@ def input_bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Ar
     """Return the least and largest inputs (m,), those of the bases where none are given.
 
     Raises:
-        StructureError: bounds that are missing, empty or not finite.
+        StructureError: bounds that are missing, empty or not finite, or other than one or one per input.
     """
     ends = []
     for word, given, side in (("low", low, 0), ("high", high, 1)):
         if given is not None:
-            ends.append(np.broadcast_to(np.asarray(given, dtype=float), (model.m,)).copy())
+            numbers = np.asarray(given, dtype=float)
+            if numbers.shape not in ((), (1,), (model.m,)):
+                raise StructureError(f"{word}={numbers.tolist()}: one number is needed, or one per input ({model.m}).")
+            ends.append(np.broadcast_to(numbers, (model.m,)).copy())
             continue
         found = np.full(model.m, np.nan)
         for f, c in zip(model.nonlinearities, model.input_of):

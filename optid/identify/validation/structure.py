@@ -135,7 +135,7 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None) -> Stru
     if simulated is None:
         found = {name: _test_output(design, o) for o, name in enumerate(data.outputs)}
     else:
-        runs = [y[: e.n_samples] for y, e in zip(simulated, data.experiments)]
+        runs = [simulated[i][: e.n_samples] for i, e in zip(design.kept, design.data.experiments)]
         found = {name: _test_residuals(design, o, runs) for o, name in enumerate(data.outputs)}
     tests = [(test, words) for each, _ in found.values() for words, test in each.items()]
     best, words = min(tests, key=lambda pair: (pair[0].p_value, -pair[0].saving))

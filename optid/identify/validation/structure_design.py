@@ -191,6 +191,7 @@ class Design:
         families, fine: functions of each input, and more of them.
         filters: (L, J) orthonormal impulse responses, of these poles, which begin after the delay.
         heavy: samples after a missing input until most of its effect has passed.
+        kept: experiments of the record given that are long enough, those of `data`.
     """
 
     data: Data
@@ -201,14 +202,19 @@ class Design:
     heavy: int
     poles: NDArray[np.complex128]
     delay: int
+    kept: tuple[int, ...]
 
     @classmethod
     def of(cls, data: Data) -> "Design":
-        """Estimate delay and poles, and place the functions."""
+        """Estimate delay and poles, and place the functions; a record without a long experiment is a `RankError`."""
         delay = delay_of(data)
         longest = int(np.clip(data.n_samples // 5, 20, LONGEST))
         poles = poles_of(data, delay)
         filters = orthonormal_filters(poles, EXTRA, delay, longest)
+        kept = tuple(i for i, e in enumerate(data.experiments) if e.n_samples >= len(filters))
+        if not kept:
+            raise RankError(f"No experiment has {len(filters)} samples, which the responses last: use longer ones.")
+        data = data.select(experiments=kept)
         energy = np.cumsum(np.sum(filters**2, axis=1))
         each = data.n_samples // data.m
         hats, fine = int(np.clip(each // SAMPLES, 0, HATS)), int(np.clip(each // FINE_SAMPLES, 2, FINE_HATS))
@@ -217,7 +223,7 @@ class Design:
             families=tuple(Family.of(data, c, DEGREE, hats) for c in range(data.m)),
             fine=tuple(Family.of(data, c, FINE_DEGREE, fine) for c in range(data.m)),
             filters=filters, heavy=int(np.searchsorted(energy, PRESENT * energy[-1])) + 1, poles=poles,
-            delay=delay)
+            delay=delay, kept=kept)
 
     @property
     def blocks(self) -> tuple[tuple[int, int], ...]:

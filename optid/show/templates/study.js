@@ -116,12 +116,11 @@ function accuracyFigure() {
 
 function ranksFigure() {
   const r = section.ranking;
-  const half = r.apart && r.difference !== null ? r.difference / 2 : 0;
   const names = [...r.names].reverse();
   const drawnHere = r.n > 0 && names.length > 1;
-  const series = drawnHere ? r.names.map((name, k) => ({ ...styled(name), kind: "interval", xs: [r.ranks[k]], ys: [names.indexOf(name)], halves: [half] })) : [];
+  const series = drawnHere ? r.names.map((name, k) => ({ ...styled(name), kind: "interval", xs: [r.ranks[k]], ys: [names.indexOf(name)], halves: [0] })) : [];
   const caption = r.missing ? `Whether a difference carries over to other data sets cannot be told: the test ${r.missing}.`
-    : `${r.test} over ${plural(r.n, "data set")}, probability ${r.p < 0.001 ? "below 0.001" : significant(r.p, 2)}. ` + (!r.apart ? "The ranks do not differ beyond chance." : half ? `Solvers whose bars overlap cannot be told apart (critical difference ${significant(r.difference)}).` : "The two differ.");
+    : `Sign tests over ${plural(r.n, "data set")}: ` + (r.behind.length ? `${r.behind.join(", ")} ${r.behind.length > 1 ? "are" : "is"} behind ${r.names[0]} beyond chance.` : `nobody is behind ${r.names[0]} beyond chance.`);
   figure("ranks", "Mean rank over the data sets", `${caption} A failure or a refusal ranks last.` + (r.left_out.length ? ` Left out, because they did not run or solve everywhere: ${r.left_out.slice(0, 4).join(", ")}${r.left_out.length > 4 ? ` and ${r.left_out.length - 4} more` : ""}.` : ""), drawnHere ? {
     x: { title: "mean rank (1 is best)", low: 0.85, high: names.length + 0.15, ticks: names.map((_, k) => k + 1) }, y: { categories: names }, series,
     tip: (one) => `${one.name}: mean rank ${significant(one.xs[0])}`,

@@ -4,12 +4,12 @@ from collections import Counter
 
 from optid.show.wording import seconds
 from optid.studies.verdicts.averages import Paired, paired
-from optid.studies.verdicts.choice import CANNOT_TELL, NOBODY, ONLY_ONE, TIE
+from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE
 from optid.studies.verdicts.model_advice import choice_of_formulation
 from optid.studies.verdicts.quality import Quality
 from optid.studies.verdicts.ranks import Ranking
 from optid.studies.verdicts.standings import Section, Standing
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, listed, of, plural
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, NO_DIFFERENCE, Statement, counting, listed, of, plural
 
 RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use
 LONGEST = 90  # characters of a headline
@@ -35,29 +35,61 @@ def choice_of_solver(section: Section) -> Statement:
         text = f"No solver reached the accuracy of {at:.0e} on {where} ({common}); {counting(at)}."
         return Statement(BAD, NO_SOLVER, text, "solver")
     if not choice.first:
-        return Statement(FAIR, "Cannot tell", f"It {choice.missing}.", "solver")
+        return Statement(FAIR, "Cannot tell", evidence(section), "solver")
     lead = section.standing(choice.first)
     average = f", in {seconds(lead.time)} on average" if lead.time == lead.time else ""
     solved = f"{lead.solver} reached the accuracy of {at:.0e} on {of(lead.solved, n)}{average} ({counting(at)})"
-    if choice.kind == ONLY_ONE:
-        return Statement(_tone(lead, n), "Only one solver", f"{solved}. There is nothing to compare it with.", "solver")
     if choice.kind == CANNOT_TELL:
-        return Statement(FAIR, "Cannot tell yet", f"The comparison {choice.missing}. So far {solved}.", "solver")
+        return Statement(FAIR, "Cannot tell yet", f"{evidence(section)} So far {solved}.", "solver")
+    word, text = f"Use {lead.solver}", f"{solved}. {evidence(section)}"
+    if choice.kind == ONLY_ONE:
+        return Statement(_tone(lead, n), "Only one solver", text, "solver")
     if choice.kind == TIE:
-        each = "; ".join(f"{name} {_count(section, name)}{_against(section, name)}" for name in choice.tied[:3])
-        text = f"{solved}. No difference in time beyond chance or 10 %: {each}."
         word = f"A tie: {listed(choice.leaders)}"
-    else:
-        refusals = f" (it does not take {lead.refused:,} of the others)" if lead.refused else ""
-        text = f"{solved}{refusals}. {_runner_up(section)}{_proofs(section)}{_quicker(section)}"
-        word = f"Use {lead.solver}"
-        if lead.refused > RARE * n:
-            most = lead.solved == max(choice.solved.values())
-            word = f"Solves most: {lead.solver}" if most else f"{word} where it runs"
+    elif lead.refused > RARE * n:
+        text += f" It does not take {lead.refused:,} of the others."
+        most = lead.solved == max(choice.solved.values())
+        word = f"Solves most: {lead.solver}" if most else f"{word} where it runs"
     for name in choice.leaders:
         if k := section.standing(name).false_claims:
             text += f" Mind that {k:,} claim{'s' if k > 1 else ''} of {name} {'were' if k > 1 else 'was'} false."
-    return Statement(_tone(lead, n), word if section.recommended else NO_SOLVER, text.rstrip(), "solver")
+    return Statement(_tone(lead, n), word if section.recommended else NO_SOLVER, text, "solver")
+
+
+def evidence(section: Section) -> str:
+    """Say what the choice rests on: how far the others are from the first, or what is missing."""
+    choice, first = section.choice, section.choice.first
+    if choice.kind != FIRST:
+        each = "; ".join(f"{name} {_count(section, name)}{_against(section, name)}" for name in choice.tied[:3])
+        return choice.shortfall or f"{NO_DIFFERENCE} 10 % of the time: {each}."
+    rivals = [name for name in choice.candidates if name != first]
+    others = [s.solver for s in section.standings if s.solver != first]
+    if rivals:
+        name = min(rivals, key=lambda rival: choice.against[rival].value)
+        text = f"The next, {name}, {_count(section, name)}{_against(section, name)}"
+        whole = _whole_fit(section, name)
+        text += f"; for the whole fit {_times_as(whole.value)}." if whole else "."
+        most = max(rivals, key=lambda rival: choice.solved[rival])
+        if choice.solved[most] > max(choice.solved[first], choice.solved[name]):
+            text += f" {most} {_count(section, most)}{_against(section, most)}."
+    elif not any(choice.solved[name] for name in others):
+        return f"Nobody else solved any: {listed(others)}."
+    else:
+        name = max(others, key=lambda other: choice.solved[other])
+        pair = choice.against[name]
+        speed = f", and where both work {_against(section, name)}" if pair.enough else ""
+        text = f"The next, {name}, solved only {choice.solved[name]:,}{speed}."
+    named = [section.standing(one) for one in (first, name)]
+    if any(one.proved for one in named) and any(one.proved < one.solved for one in named):
+        shown = ", ".join(f"{one.solver} {one.proved:,} of {one.solved:,}" for one in named)
+        text += f" Proved globally optimal: {shown}."
+    fast = [(pair.value, other) for other, pair in choice.against.items()
+            if pair.ahead and other not in (name, *choice.candidates)]
+    if fast:
+        value, other = min(fast)
+        text += (f" {other} is {1 / value:.3g} times faster where both work, but solved only "
+                 f"{of(choice.solved[other], len(section.found.data))}.")
+    return text
 
 
 def no_solution(section: Section) -> str:
@@ -65,39 +97,6 @@ def no_solution(section: Section) -> str:
     k, (said, asked) = section.infeasible, section.deniers
     return (f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no solution: {said} of {asked} solvers say so, and "
             "none found one. That counts neither for nor against them.")
-
-
-def evidence(section: Section) -> str:
-    """Say in a few words what the choice rests on: the distance to the next."""
-    choice = section.choice
-    if not choice.decided:
-        return choice.missing or ("nothing to compare with" if choice.kind == ONLY_ONE else "")
-    if choice.kind == TIE:
-        pairs = [f"{name} {_times(choice.against[name])}" for name in choice.tied[:2]]
-        return "no difference beyond chance or 10 %: " + ", ".join(pairs)
-    after = _next(section)
-    if after is None:
-        return "nobody else solved any"
-    fewer = "" if after.solved == section.standing(choice.first).solved else f" solved {after.solved:,},"
-    ratio, whole = choice.against.get(after.solver), _whole_fit(section, after.solver)
-    if ratio is None or not ratio.enough:
-        return f"next: {after.solver}{fewer}".rstrip(",")
-    rest = f", {whole.value:.3g} × for the whole fit" if whole else ""
-    return f"next: {after.solver}{fewer} {_times(ratio)}{rest}.{_proofs(section)}".rstrip(".")
-
-
-def _next(section: Section) -> Standing | None:
-    """The candidate closest to the first, or where there is none who solved most after it; None where nobody did."""
-    choice = section.choice
-    rivals = [name for name in choice.candidates if name != choice.first]
-    if rivals:
-        return section.standing(min(rivals, key=lambda rival: choice.against[rival].value))
-    others = [s for s in section.standings if s.solver != choice.first and s.solved]
-    return max(others, key=lambda s: s.solved, default=None)
-
-
-def _times(pair: Paired) -> str:
-    return f"{pair.value:.3g} × the time ({pair.low:.3g} to {pair.high:.3g})"
 
 
 def _tone(lead: Standing, n: int) -> str:
@@ -126,25 +125,6 @@ def _count(section: Section, name: str) -> str:
     return f"solved {solved[name]:,}, no difference beyond chance or 1 %, and "
 
 
-def _runner_up(section: Section) -> str:
-    """Compare with the next candidate, or with the one that solved most after the first."""
-    choice, after = section.choice, _next(section)
-    if after is None:
-        return f"Nobody else solved any: {listed([s.solver for s in section.standings if s.solver != choice.first])}."
-    name = after.solver
-    if name not in choice.candidates:
-        pair = choice.against.get(name)
-        speed = f", in {_times(pair)} where both work" if pair is not None and pair.enough else ""
-        return f"The next, {name}, solved only {after.solved:,}{speed}."
-    fewer, most = _count(section, name), max(choice.candidates, key=lambda one: choice.solved[one])
-    text = f"The next{'' if fewer else ' as reliable'}, {name}, {fewer}{_against(section, name)}"
-    whole = _whole_fit(section, name)
-    text += f"; for the whole fit {_times_as(whole.value)}." if whole else "."
-    if choice.solved[most] > max(choice.solved[choice.first], choice.solved[name]):
-        text += f" {most} {_count(section, most)}{_against(section, most)}."
-    return text
-
-
 def _whole_fit(section: Section, name: str) -> Paired | None:
     """What is left of the ratio of times in the whole fit, where the solver's share of it is compared."""
     found = section.found
@@ -152,45 +132,19 @@ def _whole_fit(section: Section, name: str) -> Paired | None:
     return pair if pair.enough and found.measure == "solve" else None
 
 
-def _proofs(section: Section) -> str:
-    """Say how many answers are proved, of the first and the next, where that is not all of one of them."""
-    after = _next(section)
-    named = [section.standing(section.choice.first), *([after] if after else [])]
-    if all(one.proved == one.solved for one in named) or not any(one.proved for one in named):
-        return ""
-    shown = ", ".join(f"{one.solver} {one.proved:,} of {one.solved:,}" for one in named)
-    return f" Proved globally optimal: {shown}."
-
-
-def _quicker(section: Section) -> str:
-    """Name a solver that is faster where it works but solves less."""
-    choice, n = section.choice, len(section.found.data)
-    fast = [(pair.value, name) for name, pair in choice.against.items() if name not in choice.candidates and pair.ahead]
-    if not fast:
-        return ""
-    value, name = min(fast)
-    others = [solved for solver, solved in choice.solved.items() if solver != choice.first]
-    if len(choice.candidates) == 1 and choice.solved[name] == max(others):
-        return ""  # named already
-    return f" {name} is {1 / value:.3g} times faster where both work, but solved only {of(choice.solved[name], n)}."
-
-
 def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
     """Say whether an order carries over to other data sets; the noun is what is ranked."""
-    if not ranking.told:
+    if ranking.missing:
         text = f"Whether the order holds on other data sets cannot be told: the test {ranking.missing}."
         return Statement(FAIR, "Other data: cannot tell", text, "data sets")
-    p = "below 0.001" if ranking.probability < 0.001 else f"{ranking.probability:.2g}"
-    shown = f"{ranking.test}, {ranking.n} data sets, probability {p}"
-    if ranking.probability >= ranking.level:
-        text = f"Over the data sets the ranks of the {noun}s do not differ beyond chance ({shown})."
+    best, *others = ranking.names
+    least = min(ranking.probabilities.values())
+    p = "below 0.001" if least < 0.001 else f"{least:.2g}"
+    text = f"{best} has the best mean rank, {ranking.ranks[0]:.2f} (sign tests, {ranking.n} data sets, probability {p})"
+    if not ranking.behind:
+        text += f"; no other {noun} is behind it beyond chance."
         return Statement(FAIR, "Other data: no difference", text, "data sets")
-    best = ranking.names[0]
-    same = [name for name in ranking.names[1:] if not ranking.differ(best, name)]
-    text = f"{best} has the best mean rank, {ranking.ranks[0]:.2f} ({shown})"
-    if len(same) == len(ranking.names) - 1:
-        text += f"; the ranks differ as a whole, but no other {noun} is behind it beyond chance."
-        return Statement(FAIR, "Other data: a tie", text, "data sets")
+    same = [name for name in others if name not in ranking.behind]
     text += f"; {listed(same)} cannot be told apart from it." if same else "; all others are behind beyond chance."
     word = f"Other data: {listed([best, *same])} {'lead' if same else 'leads'}"
     return Statement(GOOD, word, text, "data sets")
@@ -209,31 +163,26 @@ def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) 
     everywhere = choice.decided and overall.standing(choice.first).solved >= 0.99 * n and not beaten
     if count < 2 or not overall.standings or everywhere or not decided:
         return choice_of_solver(overall)
-    at, used = overall.found.accuracy, _used(overall, decided)
+    at, used, all_told = overall.found.accuracy, _used(overall, decided), len(decided) == count
     main, *others = used
-    counted, all_told = f"an accuracy of {at:.0e} ({counting(at)})", len(decided) == count
-    if not others and all_told:
-        lead = overall.standing(main)
-        text = f"{main} comes first, or ties for it, in {of(count, count, 'formulation')}, and "
-        text += f"reached {counted} on {of(lead.solved, n)}."
-        return Statement(_tone(lead, n), f"Use {main}", text, "solver")
-    if all_told and len(used[main]) > 1:
-        best = "; ".join([f"Use {main}", *(f"for {listed([s.name for s in used[name]])} {name}" for name in others)])
-    else:
-        best = "; ".join(f"{name} for {listed([s.name for s in theirs])}" for name, theirs in used.items())
+    where = {name: listed([section.name for section in theirs]) for name, theirs in used.items()}
+    best = "; ".join(f"{name} for {where[name]}" for name in used)
+    if all_told and (not others or len(used[main]) > 1):
+        best = "; ".join([f"Use {main}", *(f"for {where[name]} {name}" for name in others)])
     most = max(overall.standings, key=lambda s: (s.solved, -s.penalised))
-    text = f"{most.solver} solved most, {of(most.solved, n)} at {counted}."
+    text = f"{most.solver} solved most, {of(most.solved, n)} at an accuracy of {at:.0e} ({counting(at)})."
     if most.solved < 0.99 * n:
         text = f"No solver does everything: {text}"
     if len(used[main]) > 1:
-        text += f" {main} comes first, or ties for it, in {len(used[main]):,} of {count:,} formulations."
+        text += f" {main} comes first, or ties for it, in {of(len(used[main]), count, 'formulation')}."
     if not all_told:
         text += f" For {count - len(decided)} of {count} formulations it cannot be told."
     tones = [_tone(one.standing(name), len(one.found.data)) for name, theirs in used.items() for one in theirs]
     tone = max(tones if all_told else [*tones, FAIR], key=(GOOD, FAIR, BAD).index)
-    if len(best) <= LONGEST:
-        return Statement(tone, best, f"It depends on the formulation. {text}", "solver")
-    return Statement(tone, "It depends on the formulation", f"{best}. {text}", "solver")
+    depends = "It depends on the formulation"
+    if len(best) > LONGEST:
+        return Statement(tone, depends, f"{best}. {text}", "solver")
+    return Statement(tone, best, f"{depends}. {text}" if others or not all_told else text, "solver")
 
 
 def _used(overall: Section, decided: list[Section]) -> dict[str, list[Section]]:

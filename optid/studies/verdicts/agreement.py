@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -27,22 +26,15 @@ class Agreement:
 
 def agreement_matrix(found: Results, table: Table) -> Agreement:
     """Compare every pair of solvers, of results and their rows, where both reached the verified accuracy."""
-    s, read = len(found.solvers), {}
-    common, objective, compared, model = np.zeros((4, s, s), dtype=int)
-    worst_objective, worst_model = np.full((2, s, s), np.nan)
-    for objectives, rows, size in zip(found.objective, found.row, found.size):
-        for i, j in combinations(np.flatnonzero(np.isfinite(objectives)), 2):
-            pair = [i, j], [j, i]  # both halves
-            distance = abs(objectives[i] - objectives[j]) / size
-            common[pair] += 1
-            worst_objective[pair] = np.fmax(worst_objective[pair], distance)
-            if distance <= max(VALUE, found.tolerance):
-                objective[pair] += 1
-                if not np.isnan(apart := model_distance(table, rows[i], rows[j], read)):
-                    compared[pair] += 1
-                    model[pair] += apart <= MODEL
-                    worst_model[pair] = np.fmax(worst_model[pair], apart)
-    return Agreement(found.solvers, common, objective, compared, model, worst_objective, worst_model)
+    same = max(VALUE, found.tolerance)
+    gaps = np.abs(found.objective[:, :, None] - found.objective[:, None, :]) / found.size[:, None, None]
+    gaps[:, np.eye(len(found.solvers), dtype=bool)] = np.nan
+    apart, read = np.full(gaps.shape, np.nan), {}
+    for p, i, j in np.argwhere(np.triu(gaps <= same)).tolist():
+        apart[p, i, j] = apart[p, j, i] = model_distance(table, int(found.row[p, i]), int(found.row[p, j]), read)
+    return Agreement(found.solvers, np.isfinite(gaps).sum(axis=0), (gaps <= same).sum(axis=0),
+                     (~np.isnan(apart)).sum(axis=0), (apart <= MODEL).sum(axis=0),
+                     np.fmax.reduce(gaps, axis=0, initial=np.nan), np.fmax.reduce(apart, axis=0, initial=np.nan))
 
 
 def model_distance(table: Table, i: int, j: int, read: dict[int, np.ndarray | None] | None = None) -> float:

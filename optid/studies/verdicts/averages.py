@@ -171,14 +171,11 @@ def time_growth(times: np.ndarray, n: np.ndarray, groups: np.ndarray) -> Growth:
                  f"solved on the same data; there {'is' if most == 1 else 'are'} at most {most}")
         return Growth(float("nan"), float("nan"), float("nan"), lengths, shown, needs)
     means = np.bincount(place, logs) / np.bincount(place)
-    _, number = np.unique(group[several], return_inverse=True)
-    x, y = _centred(np.log(pairs[several, 1]), number), _centred(means[several], number)
-    slope = float(x @ y / (x @ x))
-    freedom = len(x) - int(number.max()) - 2  # one at least: a group has three lengths
-    error = np.sqrt(np.sum((y - slope * x) ** 2) / freedom / (x @ x))
-    half = float(student.ppf(0.975, freedom) * error)
-    return Growth(slope, slope - half, slope + half, lengths, shown)
-
-
-def _centred(values: np.ndarray, group: np.ndarray) -> np.ndarray:
-    return values - (np.bincount(group, values) / np.bincount(group))[group]
+    kinds, number = np.unique(group[several], return_inverse=True)
+    design = np.column_stack([np.eye(len(kinds))[number], np.log(pairs[several, 1])])
+    cost, slope = means[several], np.linalg.pinv(design)[-1]  # a row of the pseudo-inverse has the norm of the error
+    rest = cost - design @ np.linalg.lstsq(design, cost)[0]
+    freedom = len(cost) - len(kinds) - 1  # one at least: a group has three lengths
+    half = float(student.ppf(0.975, freedom) * np.sqrt(rest @ rest / freedom * (slope @ slope)))
+    value = float(slope @ cost)
+    return Growth(value, value - half, value + half, lengths, shown)

@@ -4,15 +4,14 @@ from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import binom
 
 from optid.studies.verdicts.averages import MINIMUM_PAIRS, Paired, paired
+from optid.studies.verdicts.ranks import LEVEL, sign_test
 from optid.studies.verdicts.statement import listed, there_are
 
 FIRST, TIE, CANNOT_TELL, ONLY_ONE, NOBODY = "first", "tie", "cannot tell", "only one", "nobody"
 DEPENDS = "depends"
 RELIABLE = 0.01  # share of the problems by which the number solved may stay behind the most reliable
-LEVEL = 0.05  # of the test whether it stays behind by more than chance
 
 
 @dataclass(frozen=True)
@@ -41,6 +40,13 @@ class Choice:
     def decided(self) -> bool:
         """Whether one is known to be ahead, or some to be equal."""
         return self.kind in (FIRST, TIE)
+
+    @property
+    def shortfall(self) -> str:
+        """A sentence on what is missing; empty where the choice is decided."""
+        if self.kind == ONLY_ONE:
+            return "There is nothing to compare it with."
+        return "" if self.decided else f"The comparison {self.missing}."
 
 
 def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack: float = RELIABLE,
@@ -113,6 +119,6 @@ def _reliable(known: np.ndarray, allowed: int) -> list[int]:
 
     def behind(one: np.ndarray) -> bool:
         lost, won = int((best & ~one).sum()), int((one & ~best).sum())
-        return lost - won > allowed and float(binom.sf(lost - 1, lost + won, 0.5)) < LEVEL
+        return lost - won > allowed and sign_test(lost, won, "greater") < LEVEL
 
     return [int(s) for s in np.flatnonzero(counts) if not behind(known[:, s])]

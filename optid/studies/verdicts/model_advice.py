@@ -3,7 +3,7 @@
 from optid.studies.verdicts.averages import Paired
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, TIE, Choice
 from optid.studies.verdicts.quality import FEW, DataSet, Quality
-from optid.studies.verdicts.statement import FAIR, GOOD, Statement, listed, of, plural
+from optid.studies.verdicts.statement import FAIR, GOOD, NO_DIFFERENCE, Statement, listed, of, plural
 
 UNDECIDED = "Models: cannot tell"
 LISTED = 4  # data sets in a sentence
@@ -14,34 +14,34 @@ def choice_of_formulation(quality: Quality) -> Statement | None:
     choice, sets = quality.choice, len(quality.sets)
     if len(quality.formulations) < 2 or not any(quality.solved.values()):
         return None
-    rivals = [name for name in choice.candidates if name != choice.first]
-    tone, word = FAIR, UNDECIDED
     if choice.kind == NOBODY:
         text = "No model has a simulation fit on samples it has not seen (keep a hold-out share) or a known truth."
-    elif choice.kind == DEPENDS:
-        word, text = "Models depend on the data", f"No formulation is the best on all of them: {_each(quality)}."
-    elif not choice.first:
-        text = f"The comparison {choice.missing}."
-    elif choice.kind == CANNOT_TELL:
+        return Statement(FAIR, UNDECIDED, text, "formulation")
+    if choice.kind == DEPENDS:
+        text = f"No formulation is the best on all of them: {_each(quality)}."
+        return Statement(FAIR, "Models depend on the data", text, "formulation")
+    if not choice.first:
+        return Statement(FAIR, UNDECIDED, choice.shortfall, "formulation")
+    if choice.kind == CANNOT_TELL:
         so_far = _each(quality) if sets > 1 else f"{choice.first} has {_figure(quality)}"
-        word, text = f"{UNDECIDED} yet", f"The comparison {choice.missing}. So far {so_far}."
+        return Statement(FAIR, f"{UNDECIDED} yet", f"{choice.shortfall} So far {so_far}.", "formulation")
+    text, tone = f"{choice.first} has {_figure(quality)}", GOOD
+    word = f"{'Equal' if choice.kind == TIE else 'Best'} models: {listed(choice.leaders)}"
+    rivals = [name for name in choice.candidates if name != choice.first]
+    if not rivals:
+        tone, word = FAIR, UNDECIDED
+        text += f"; no other has a {quality.measure.replace('_', ' ')} on half as many records."
+    elif 1 < sets < FEW:
+        text += f". The best, or tied for it, on each of {plural(sets, 'data set')}: {_each(quality)}."
     elif choice.kind == TIE:
         each = "; ".join(f"{name} {_behind(quality, choice.against[name])}" for name in choice.tied[:3])
-        trifle = f"No difference beyond chance or {'10 %' if quality.errors else '0.1 points'}"
-        text = f"{choice.first} has {_figure(quality)}. {trifle}: {_each(quality) if 1 < sets < FEW else each}."
-        tone, word = GOOD, f"Equal models: {listed(choice.leaders)}"
-    elif not rivals:
-        text = f"{choice.first} has {_figure(quality)}; no other has a {quality.measure.replace('_', ' ')} on half as "
-        text += "many records."
+        text += f". {NO_DIFFERENCE} {'10 %' if quality.errors else '0.1 points'}: {each}."
     else:
-        tone, word = GOOD, f"Best models: {choice.first}"
         name = min(rivals, key=lambda rival: choice.against[rival].value)
-        text = f"It has {_figure(quality)}; the next, {name}, {_behind(quality, choice.against[name])}."
-        if 1 < sets < FEW:
-            text = f"The best, or tied for it, on each of {plural(sets, 'data set')}: {_each(quality)}."
-        others = [one.name for one in quality.sets if one.decided and choice.first not in one.choice.leaders]
-        if sets >= FEW and others:
-            text += f" On {listed(others)} another one is ahead."
+        text += f". The next, {name}, {_behind(quality, choice.against[name])}."
+    others = [one.name for one in quality.sets if one.decided and choice.first not in one.choice.leaders]
+    if sets >= FEW and others:
+        text += f" On {listed(others)} another one is ahead."
     return Statement(tone, word, text, "formulation")
 
 
@@ -59,19 +59,7 @@ def _place(quality: Quality, choice: Choice, name: str, unit: str) -> str:
     pair = choice.against.get(name)
     if pair is None or not pair.n:
         return f"no {unit} in common with the best" if choice.first else choice.missing
-    tied = "tied: " if name in choice.tied and choice.kind == TIE else ""
-    if quality.errors:
-        span = f" ({pair.low:.3g} to {pair.high:.3g})" if pair.n > 1 else ""
-        return f"{tied}{pair.value:.3g} × the error{span}"
-    ahead = pair.value <= -0.005
-    value, low, high = (-pair.value, -pair.high, -pair.low) if ahead else (pair.value, pair.low, pair.high)
-    interval = f" ({_points(low)} to {_points(high)})" if pair.n > 1 else ""
-    return f"{tied}{_points(value)} points{interval} {'ahead where both were solved' if ahead else 'behind'}"
-
-
-def _points(value: float) -> str:
-    """Write points of fit with two decimals, zero without a sign."""
-    return f"{round(value, 2) + 0.0:.2f}"
+    return ("tied: " if name in choice.tied and choice.kind == TIE else "") + _behind(quality, pair, unit)
 
 
 def _figure(quality: Quality) -> str:
@@ -84,11 +72,16 @@ def _figure(quality: Quality) -> str:
     return f"a mean simulation fit of {mean:.2f} % on unseen samples of {where}"
 
 
-def _behind(quality: Quality, pair: Paired) -> str:
-    n = plural(pair.n, quality.unit)
+def _behind(quality: Quality, pair: Paired, unit: str = "") -> str:
+    """How far a formulation is behind the best, with the interval where there is one."""
+    low, high, n = pair.low, pair.high, plural(pair.n, unit or quality.unit)
     if quality.errors:
-        return f"has {pair.value:.3g} times the error (95 %: {pair.low:.3g} to {pair.high:.3g}, {n})"
-    return f"stays {_points(pair.value)} points behind (95 %: {_points(pair.low)} to {_points(pair.high)}, {n})"
+        interval = f" (95 %: {low:.3g} to {high:.3g}, {n})" if pair.n > 1 else ""
+        return f"has {pair.value:.3g} times the error{interval}"
+    word, sign = ("stays", 1) if pair.value > -0.005 else ("is, where both were solved,", -1)
+    low, high = sorted((sign * low, sign * high))
+    interval = f" (95 %: {low:.2f} to {high:.2f}, {n})" if pair.n > 1 else ""
+    return f"{word} {abs(pair.value):.2f} points {'behind' if sign > 0 else 'ahead'}{interval}"
 
 
 def _each(quality: Quality) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from optid.program.solution import tolerance
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
+NO_DIFFERENCE = "No difference beyond chance or"
 FINEST = tolerance(0.0) / 100  # requested accuracies below are judged as this one
 
 

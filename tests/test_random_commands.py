@@ -1,0 +1,22 @@
+"""Whatever is asked of the command, it ends in a result or in one message with a documented exit code."""
+
+import pytest
+from random_commands import OFTEN, commands, make_files, trouble
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("commands") / "files"
+    folder.mkdir()
+    return make_files(folder), folder
+
+
+def test_every_command_is_drawn():
+    assert {*commands()} == {*OFTEN}
+
+
+@pytest.mark.sampled(3)
+@pytest.mark.parametrize("block", range(13))
+def test_random_commands_end_in_a_result_or_one_message(block, files):
+    calls = range(100 * block, 100 * block + (10 if block < 3 else 100))
+    assert [found for found in (trouble(seed, *files) for seed in calls) if found] == []
