@@ -12,7 +12,7 @@ def files(tmp_path_factory):
 
 
 def test_every_command_is_drawn():
-    assert {*commands()} == {*OFTEN}
+    assert {*commands()} - {"workbench"} == {*OFTEN}  # a page stays open until it is interrupted
 
 
 @pytest.mark.sampled(3)
