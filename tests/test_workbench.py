@@ -20,11 +20,11 @@ import optid
 from formulations.constraints.poles import disc
 from formulations.constraints.responses import step_band
 from formulations.constraints.shape import value_range
-from optid.errors import StructureError
+from optid.errors import DataError, StructureError
 from optid.examples import example
 from optid.workbench.bench import Bench, Source
 from optid.workbench.request import Constraint, Request, suggested
-from optid.workbench.server import PAGES, Server
+from optid.workbench.server import PAGES, Server, serve
 
 ARGUMENTS = {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10"}
 
@@ -336,3 +336,11 @@ def test_everything_can_be_read(bench_page, width, dark):
     assert not browser.run(OVERLAPS)
     assert not browser.run(CONTRAST)
     assert not browser.complaints()
+
+
+def test_ports_that_cannot_be_used_are_named():
+    of = source()
+    with pytest.raises(DataError, match="port 70000 of 127.0.0.1 cannot be used: it must be 0 to 65535"):
+        serve(of, 70000, print)
+    with served(of) as server, pytest.raises(DataError, match=f"port {server.server_port} .* in use"):
+        serve(of, server.server_port, print)

@@ -163,12 +163,13 @@ def serve(source: Source, port: int = 0, ready: Callable[[str], None] = print) -
         ready: hears the address.
 
     Raises:
-        DataError: the port is taken.
+        DataError: the port is taken, or is none.
     """
     try:
         server = Server(source, port)
-    except OSError as error:
-        raise DataError(f"port {port} of 127.0.0.1 cannot be used: {error.strerror}") from None
+    except (OSError, OverflowError) as error:
+        raise DataError(f"port {port} of 127.0.0.1 cannot be used: "
+                        f"{getattr(error, 'strerror', 'it must be 0 to 65535')}") from None
     with server, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         ready(server.address)
