@@ -149,7 +149,8 @@ def test_a_procedure_has_its_steps_and_their_times():
     row = run_cell(one("auto", "subspace.nuclear", options={"nx": 2}, warm=True))
     assert row["outcome"] == "done" and row["n_programs"] > 1 and row["warm_s"] is None
     assert row["build_s"] > 0.0
-    assert row["build_s"] + row["compile_s"] + row["solve_s"] + row["judge_s"] + row["prove_s"] <= row["fit_s"] * 1.01
+    assert row["compile_s"] is None  # no step goes through CVXPY
+    assert row["build_s"] + row["solve_s"] + row["judge_s"] + row["prove_s"] <= row["fit_s"] * 1.01
 
 
 def test_a_file_without_truth(tmp_path):
