@@ -143,12 +143,13 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
         states, simulated = march(job, first, stretch, x)
         error = (y[first : first + length] - simulated) / unit
         present = ~np.isnan(error)
-        cost += float(np.sum(error[present] ** 2))
+        with np.errstate(over="ignore"):
+            cost += float(np.sum(error[present] ** 2))
         if informs:
             jacobian = np.empty((len(states), outputs, n))
             sensitivities(job.model.parts, nothing, signals(job, stretch, states, simulated), turn, jacobian)
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
-            if not np.all(np.isfinite(rows)):
+            if not (np.all(np.isfinite(rows)) and np.isfinite(cost)):
                 raise DataError(
                     f"{job.label}The effect of the initial state leaves the range of numbers: the largest pole has "
                     f"radius {job.model.radius:.6g}.")
