@@ -65,7 +65,7 @@ def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
         x = u[:, model.input_of[column]]
         samples = np.flatnonzero((x < low) | (x > high))
         if samples.size:
-            interval = model.nonlinearities[column].basis.interval
+            interval = model.nonlinearities[column].basis.interval or (low, high)
             found.append(Outside(model.inputs[model.input_of[column]], column, interval, samples))
     return found
 
