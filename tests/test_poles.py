@@ -110,3 +110,22 @@ def test_verification_names_the_pole_outside():
 
     assert strip(high=0.9).verify(Model()) and "0.95" in strip(high=0.9).verify(Model())
     assert strip(high=0.96).verify(Model()) == ""
+
+
+@pytest.mark.parametrize(("na", "proved"), [(2, True), (3, False)])
+def test_an_inner_region_of_poles_claims_no_proof(na, proved):
+    """Two poles have an exact region; with three, models outside the convex part may be better, as one here is."""
+    from scipy.signal import lfilter
+
+    import optid
+    from optid.program.solution import Status
+
+    rng = np.random.default_rng(0)
+    a = np.poly([0.97 * np.exp(0.6j), 0.97 * np.exp(-0.6j), 0.95]).real
+    u = rng.uniform(-1, 1, 400)
+    y = lfilter([0, 1, 0.5], a, u)
+    data = optid.Data(u, y + 0.02 * np.std(y) * rng.standard_normal(400))
+    solution = optid.fit(data, "arx", na=na, nb=2, nk=0, constraints=["stable:0.8"]).solution
+    assert (solution.status is Status.OPTIMAL) == proved and solution.bound.proved == proved
+    if not proved:
+        assert "'stable:0.8' is imposed by an inner region" in solution.reason

@@ -265,3 +265,11 @@ def test_a_verdict_is_frozen_and_prints():
     with pytest.raises(dataclasses.FrozenInstanceError):
         verdict.headline = "fit"
     assert str(verdict).startswith(verdict.headline.word)
+
+
+def test_who_beats_the_first_more_often_is_not_behind_it():
+    from optid.studies.verdicts.ranks import rank
+
+    ranks = np.array([[2, 1, 3, 4, 5, 6]] * 60 + [[1, 6, 2, 3, 4, 5]] * 20, dtype=float)
+    found = rank(ranks, np.ones(ranks.shape, bool), tuple("ABCDEF"), np.arange(80))
+    assert found.names[0] == "A" and "B" not in found.behind and "F" in found.behind

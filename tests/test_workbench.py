@@ -158,7 +158,7 @@ def test_the_command_serves_until_it_is_interrupted(tmp_path):
 def test_a_corridor_a_disc_and_a_band_hold():
     record = example("thruster").data
     free = optid.fit(record, **ARGUMENTS)
-    corridor = optid.fit(record, constraints=[value_range(-0.05, 0.05, -0.4, 0.4)], **ARGUMENTS)
+    corridor = optid.fit(record, constraints=[value_range(-0.05, 0.05, first=-0.4, last=0.4)], **ARGUMENTS)
     assert corridor.solution.proof and corridor.prices[0].binding
     inside = np.linspace(-0.4, 0.4, 101)
     f = corridor.model.nonlinearities[0](inside) * corridor.model.b[0].sum() + corridor.model.offset[0]
@@ -179,7 +179,7 @@ def test_a_corridor_a_disc_and_a_band_hold():
     with pytest.raises(StructureError, match="around="):
         optid.fit(record, constraints=[step_band(high=3.3)], **ARGUMENTS)
     with pytest.raises(StructureError, match="outside the interval"):
-        optid.fit(record, constraints=[value_range(0, 1, 5, 6)], **ARGUMENTS)
+        optid.fit(record, constraints=[value_range(0, 1, first=5, last=6)], **ARGUMENTS)
 
 
 def test_a_band_is_exact_without_past_outputs():

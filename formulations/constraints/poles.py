@@ -15,7 +15,7 @@ the current iterate, pulled inwards only as far as the iterate stays inside the 
 and every iterate is stable by construction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -233,7 +233,11 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
             return ""
         return f"constraint {name!r}: the largest pole has modulus {largest:.6g}; ask for a smaller radius"
 
-    return Rule(name, build, verify, frozenset({"poles"}))
+    def stand_in(arguments: Mapping[str, Any]) -> str:
+        na = arguments.get("na", 0)
+        return "an inner region" if points is not None or isinstance(na, int) and na > 2 else ""
+
+    return Rule(name, build, verify, frozenset({"poles"}), stand_in)
 
 
 def _triangle(first: Any, second: Any, radius: float) -> list[Limit]:

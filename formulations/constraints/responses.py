@@ -6,6 +6,7 @@ when it is stated on the transposed system. The step response of a polynomial mo
 tangent. ``channel`` and ``output`` are names, needed where there are several.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import cvxpy as cp
@@ -20,6 +21,7 @@ from optid.program.view import View
 
 __all__ = ["impulse_response", "no_effect", "positive_real", "step_band", "step_response"]
 
+LATEST = 10_000  # last sample of a band: its rows are held
 HORIZON = 50  # samples over which the sign of a response is imposed
 REAL = 1e-9  # least eigenvalue in the inequality of positive realness, relative to the size of C
 
@@ -73,8 +75,10 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
         StructureError: no bound, crossing bounds, no sample, or no model where one is needed.
     """
     check_bounds("step_band", low, high)
-    if not 0 <= first <= last:
-        raise StructureError(f"the samples of step_band are 0 <= first <= last; got {first!r}, {last!r}")
+    if not 0 <= first <= last <= LATEST:
+        raise StructureError(f"the samples of step_band are 0 <= first <= last <= {LATEST}; got {first!r}, {last!r}")
+    if around is not None and not (hasattr(around, "a") and hasattr(around, "inputs")):
+        raise StructureError(f"step_band: around= takes a model with past outputs, such as fit.model; got {around!r}")
     name, count = label("step_band", channel, output), int(last) + 1
 
     def build(view: View) -> Any:
@@ -92,7 +96,10 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
                 if around is None:
                     raise StructureError("step_band needs around=, the model of a fit without it, where there are "
                                          "past outputs")
-                a, c = np.asarray(around.a, dtype=float), around.inputs.index(one)
+                a = np.asarray(around.a, dtype=float)
+                if a.shape != view["a"].shape or one not in around.inputs:
+                    raise StructureError("step_band: the model around= has other orders or inputs than this fit")
+                c = around.inputs.index(one)
                 before = _stepped(around, c, count)
                 moved = toeplitz(np.append(0.0, before[:-1]), np.zeros(a.size)) @ (view["a"] - a)
                 response = np.linalg.inv(toeplitz(np.eye(count)[0] + np.pad(a, (1, count))[:count],
@@ -109,7 +116,10 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
         return "" if obeys else (f"constraint {name!r}: the step response goes from {np.min(found):.4g} to "
                                  f"{np.max(found):.4g}; fit again around this model")
 
-    return Rule(name, build, verify, tangent=around is not None)
+    def stand_in(arguments: Mapping[str, Any]) -> str:
+        return "its tangent" if around is not None and arguments.get("na") else ""
+
+    return Rule(name, build, verify, stand_in=stand_in)
 
 
 @recorded

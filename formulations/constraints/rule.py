@@ -25,7 +25,8 @@ class Rule:
             approximates.
         about: what it restricts, "poles" or "coefficients": a procedure of several steps hands it to the steps that
             choose these.
-        tangent: whether it stands for a condition that is not convex by its tangent: a proof would be one for that.
+        stand_in: {argument: value} of a formulation -> by what it replaces a condition that is not convex, such as "its
+            tangent": a proof would be one for that; "" where it is the condition itself.
         call: module, name and arguments of the function that returned it, from which a pickled rule is built again.
     """
 
@@ -33,7 +34,7 @@ class Rule:
     build: Callable[[View], Any]
     verify: Callable[[Any], str] | None = None
     about: frozenset[str] = frozenset({"coefficients"})
-    tangent: bool = False
+    stand_in: Callable[[Mapping[str, Any]], str] | None = None
     call: tuple[str, str, tuple[Any, ...], Mapping[str, Any]] | None = field(default=None, repr=False, compare=False)
 
     def __reduce__(self) -> Any:

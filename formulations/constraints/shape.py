@@ -122,8 +122,8 @@ def slope(low: float | None = None, high: float | None = None, channel: str | No
 
 
 @recorded
-def value_range(low: float | None = None, high: float | None = None, first: float | None = None,
-                last: float | None = None, channel: str | None = None, output: str | None = None) -> Rule:
+def value_range(low: float | None = None, high: float | None = None, channel: str | None = None,
+                output: str | None = None, first: float | None = None, last: float | None = None) -> Rule:
     """The static characteristic lies in [low, high] (units of the output) where the input lies in [first, last].
 
     Exact for `Triangular`, on a dense grid for the other bases.
@@ -140,7 +140,7 @@ def value_range(low: float | None = None, high: float | None = None, first: floa
     def rows(basis: Any) -> np.ndarray:
         ends = [end if given is None else float(given) for given, end in zip((first, last), basis.interval)]
         inside = np.clip(ends, *basis.interval)
-        if ends[0] > ends[1] or not np.any(inside == ends):
+        if ends[0] > ends[1] or ends[1] < basis.interval[0] or ends[0] > basis.interval[1]:
             raise StructureError(f"the corridor [{ends[0]:g}, {ends[1]:g}] lies outside the interval "
                                  f"[{basis.interval[0]:g}, {basis.interval[1]:g}] of the input")
         points = basis.nodes if isinstance(basis, Triangular) else basis.grid()

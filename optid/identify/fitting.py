@@ -66,10 +66,9 @@ class Fit(Rendered):
         solution, evidence = self.outcome.solution, self.outcome.evidence
         if evidence and callable(evidence.bound):
             solution = replace(solution, bound=evidence.bound())
-        tangents = _tangents(self.arguments)
-        if not tangents or solution.status not in (Status.OPTIMAL, Status.LOCAL):
+        reason, unbounded = _stand_in(self.arguments), solution.bound is not None and solution.bound.value == -np.inf
+        if not reason or unbounded or solution.status not in (Status.OPTIMAL, Status.LOCAL):
             return solution
-        reason = f"constraint {tangents[0]!r} is imposed by its tangent"
         return replace(solution, status=Status.LOCAL, bound=Bound.none(reason), reason=reason)
 
     @cached_property
@@ -288,7 +287,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
         findings = examine(data, fitted_bases(data, words.get("basis", Linear())), words)
     problem = pose(data, **arguments)
     settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate,
-                "prove": prove and not _tangents(arguments),
+                "prove": prove and not _stand_in(arguments),
                 **(solver_options or {})}
     return _finished(data, name, arguments, findings, problem, solver, settings, raises, started)
 
@@ -341,9 +340,12 @@ def _in_raw_units(model: Any, data: Data | Stream) -> Any:
     return model if model is None or transform is None or transform.is_identity else model.with_transform(transform)
 
 
-def _tangents(arguments: Mapping[str, Any]) -> list[str]:
-    """Names of the constraints that stand for what is not convex by its tangent."""
-    return [rule.name for rule in arguments.get("constraints", ()) if getattr(rule, "tangent", False)]
+def _stand_in(arguments: Mapping[str, Any]) -> str:
+    """Say which constraint is replaced by another condition, and by which; "" where none is."""
+    for rule in arguments.get("constraints", ()):
+        if (stand_in := getattr(rule, "stand_in", None)) and (how := stand_in(arguments)):
+            return f"constraint {rule.name!r} is imposed by {how}"
+    return ""
 
 
 def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:

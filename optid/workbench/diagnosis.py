@@ -32,7 +32,10 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
     if model.structure != "ss" or model.noise is None:
         raise StructureError("faults are judged with a state-space model that has noise covariances: choose the "
                              "formulation hammerstein_ss.asivid, or start with optid workbench --model model.json")
-    whole = dictionary(model, kinds=list(asked.get("kinds") or ["bias", "loss", "spike"]))
+    kinds = list(asked.get("kinds", ["bias", "loss", "spike"]))
+    if not kinds:
+        raise StructureError("no kind of fault is chosen: tick one")
+    whole = dictionary(model, kinds=kinds)
     without = set(asked.get("without") or ())
     kept = [i for i, label in enumerate(whole.labels) if label not in without]
     if not kept:

@@ -61,6 +61,9 @@ class Request:
             constraints = tuple(Constraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
                                 for c in state["constraints"])
             first, last = map(int, state["window"])
+            for key in [*state["arguments"], *(key for c in constraints for key in c.arguments)]:
+                if not key.isidentifier():
+                    raise ValueError(f"{key!r} is the name of no argument")
             arguments = {str(key): value for key, value in state["arguments"].items() if value not in (None, "", [])}
             found = cls(tuple(map(str, state["inputs"])), tuple(map(str, state["outputs"])), (first, last),
                         str(state["formulation"]), arguments, constraints, draft)

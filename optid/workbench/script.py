@@ -44,7 +44,8 @@ def script(request: Request, source: str, whole: bool = False) -> str:
 
 def reading(files: list[str], how: Mapping[str, Any]) -> str:
     """Write how files were read; what was left out is left out."""
-    given = {key: value for key, value in how.items() if value not in (None, ",", ".")}
+    usual = {"delimiter": ",", "decimal": "."}
+    given = {key: value for key, value in how.items() if value is not None and value != usual.get(key)}
     options = "".join(f", {key}={value!r}" for key, value in given.items())
     return f"optid.read({files if len(files) > 1 else files[0]!r}{options})"
 

@@ -217,6 +217,8 @@ function grab(event, x, y, f, kept) {
   };
   const end = (e) => {
     svg.removeEventListener("pointermove", follow);
+    svg.removeEventListener("pointerup", end);
+    svg.removeEventListener("pointercancel", end);
     dragged = false;
     if (range !== null) {
       const ends = [range, fixed.unx(plot.place(e)[0])].sort((p, q) => p - q).map((v) => Math.round((v - BEGIN.origin) / BEGIN.dt));
@@ -228,7 +230,8 @@ function grab(event, x, y, f, kept) {
     settle();
   };
   svg.addEventListener("pointermove", follow);
-  svg.addEventListener("pointerup", end, { once: true });
+  svg.addEventListener("pointerup", end);
+  svg.addEventListener("pointercancel", end);
   return true;
 }
 

@@ -80,7 +80,7 @@ def _behind(quality: Quality, pair: Paired, unit: str = "") -> str:
         return f"has {pair.value:.3g} times the error{interval}"
     word, sign = ("stays", 1) if pair.value > -0.005 else ("is, where both were solved,", -1)
     low, high = sorted((sign * low, sign * high))
-    interval = f" (95 %: {low:.2f} to {high:.2f}, {n})" if pair.n > 1 else ""
+    interval = f" (95 %: {round(low, 2) + 0.0:.2f} to {round(high, 2) + 0.0:.2f}, {n})" if pair.n > 1 else ""
     return f"{word} {abs(pair.value):.2f} points {'behind' if sign > 0 else 'ahead'}{interval}"
 
 

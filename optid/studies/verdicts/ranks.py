@@ -67,7 +67,8 @@ def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.
     found = {}
     for s in order[1:]:
         gaps = scores[:, s] - scores[:, order[0]]
-        found[kept[s]] = min(1.0, pairs * sign_test(int((gaps > 0).sum()), int((gaps < 0).sum())))
+        lost, won = int((gaps > 0).sum()), int((gaps < 0).sum())
+        found[kept[s]] = min(1.0, pairs * sign_test(lost, won)) if lost > won else 1.0
     missing = [f"at least 2 {noun}s that ran on every data set; {there_are(k)}"] if k < 2 else []
     if n < needed:
         missing.append(f"at least {needed} data sets; {there_are(n)}")
