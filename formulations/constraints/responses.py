@@ -93,6 +93,8 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
             reached = np.subtract.outer(np.arange(count) - view.delays[one], np.arange(theta.shape[1])) >= 0
             response = reached.astype(float) @ theta.T @ step
             if "a" in view:
+                from scipy.signal import lfilter
+
                 if around is None:
                     raise StructureError("step_band needs around=, the model of a fit without it, where there are "
                                          "past outputs")
@@ -102,8 +104,8 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
                 c = around.inputs.index(one)
                 before = _stepped(around, c, count)
                 moved = toeplitz(np.append(0.0, before[:-1]), np.zeros(a.size)) @ (view["a"] - a)
-                response = np.linalg.inv(toeplitz(np.eye(count)[0] + np.pad(a, (1, count))[:count],
-                                                  np.zeros(count))) @ (response - moved)
+                pulse = lfilter([1.0], [1.0, *a], np.eye(1, count)[0])  # of 1 / A
+                response = toeplitz(pulse, np.zeros(count)) @ (response - moved)
         inside = response[int(first):]
         return [*([Limit(inside >= low, bound="low")] if low is not None else []),
                 *([Limit(inside <= high, bound="high")] if high is not None else [])]

@@ -68,7 +68,8 @@ class Bench:
             return found
 
         if request.key not in self.fits:
-            self.moving = self.moving if request.draft else ("", None)
+            if not request.draft:
+                self.moving = "", None
             fit = request.fit(self.source.data, begun)
             self.moving = self.moving[0], fit
             self.fits[request.key] = fit, free_run(fit.model, fit.data.raw())
