@@ -1,4 +1,8 @@
-"""Levenberg-Marquardt descents on a sum of squared errors, in the scaling of Moré (1978), and comparison of starts."""
+"""Levenberg-Marquardt descents on a sum of squared errors, and comparison of starts.
+
+The scaling is that of Moré (1978); the damping follows the ratio of the gain reached to the gain expected as in Nielsen
+(Damping parameter in Marquardt's method, IMM-REP-1999-05, 1999): steady where steps are refused in turn.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
@@ -132,7 +136,7 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
     free = np.ones(p, dtype=bool) if held is None else np.logical_not(held)
     moving = np.concatenate([free, np.ones(x.size - p, dtype=bool)]) if criterion.bends else free
     scale, least = np.zeros(int(moving.sum())), EXACT * criterion.energy
-    damping, rejected, blocked, values = 1e-3, 0, False, [at.value]
+    damping, growth, rejected, blocked, values = 1e-3, 2.0, 0, False, [at.value]
     for count in range(1, iterations + 1):
         gain = _gain(at.root[:, free], at)
         if gain <= tolerance * at.value and not at.exact:
@@ -154,14 +158,14 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         ratio = (at.value - new.value) / max(expected, 1e-300) if new is not None else -1.0
         if new is not None and ratio > 1e-3 and np.isfinite(new.value):
             x, at, rejected, blocked = moved, new, 0, False
-            damping = 0.1 * damping if ratio > 0.5 else damping * (1.0 if ratio > 0.25 else 4.0)
+            damping, growth = damping * max(0.1, 1 - (2 * ratio - 1) ** 3) if ratio < 1.5 else 0.3 * damping, 2.0
             damping = damping if damping > 1e-14 else GRAM if criterion.bends else 0.0
             values.append(at.value)
             if values[-1] > (1 - progress) * values[-1 - CREEPING :][0] and len(values) > CREEPING:
                 return Descent(x, at, count, False, f"{CREEPING} steps gain less than {progress:g}", start)
             continue
         rejected, blocked = rejected + 1, blocked or not allowed
-        damping = max(8.0 * damping, 1e-6)
+        damping, growth = max(growth * damping, 1e-8), 2 * growth
         if rejected > 20 or damping > 1e12:
             # at this size of the gain rounding decides whether a step descends
             settled = gain <= 1e3 * tolerance * at.value or at.value <= 1e4 * least
