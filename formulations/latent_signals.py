@@ -51,7 +51,8 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         criterion: "simulation" (the free run) or "prediction" (K estimated).
         initial: models to start from besides, without latent signals.
         seed: of the directions of z that are tried.
-        tries: searches for every latent signal, those after the first beside the others; 1 is quick.
+        tries: searches for every latent signal, those after the first beside the others; with 1, which is quick,
+            a search that seems to have gone astray is not repeated either.
 
     Raises:
         StructureError: words, orders or starts that do not fit, a basis of affine functions alone.

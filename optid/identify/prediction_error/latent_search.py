@@ -36,6 +36,8 @@ SAME = 0.999  # ratio of the gains of two directions above which they count as t
 SHORT = 12
 # number of descents that the best directions start, or that go on, and their steps
 HEATS = ((10, SHORT), (5, 30), (2, 60))
+# where one more function promises a larger share of the errors, a search has likely gone astray
+LEFT = 0.1
 # relative fall over a few steps below which descents stop: in the search, on the whole of a long or short record
 PACE = {"search": 1e-2, "long": 3e-3, "short": 0.0}
 SIZES = (1.0, 0.3, 0.05)  # shares of the Gauss-Newton step from which a descent may start
@@ -53,7 +55,8 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         channels: the functions, each on the interval [-1, 1] of its argument.
         seed: of the random directions.
         iterations: of a descent at most.
-        tries: searches for every function; those after the first know the other functions.
+        tries: searches for every function; those after the first know the other functions. Where one more function
+            promises much, all of them are searched again from other directions, ``2 tries - 1`` times at most.
 
     Returns:
         The criterion with the functions, its optimum, and figures of the search.
@@ -61,7 +64,28 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
     Raises:
         RankError: no direction of z leads to a model whose run stays finite.
     """
-    rng, figures = np.random.default_rng(seed), {}
+    rng, searches, refusal = np.random.default_rng(seed), [], None
+    for _ in range(2 * tries - 1):
+        try:
+            searches.append(_search(errors, best, channels, rng, iterations, tries))
+        except RankError as error:
+            refusal = error
+            continue
+        if _promised(searches[-1][0], searches[-1][1].x, channels[0], rng) <= LEFT:
+            break
+    if not searches:
+        assert refusal is not None
+        raise refusal
+    part, end, figures = min(searches, key=lambda one: one[1].value)
+    if iterations:  # without a descent nothing can be said of what the functions are worth
+        figures |= _idle(errors, best.x, part, end)
+    return part, end, figures
+
+
+def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rng: np.random.Generator,
+            iterations: int, tries: int) -> tuple[StateErrors, Descent, dict[str, Any]]:
+    """Search once; arguments and errors as `add_channels`."""
+    figures: dict[str, Any] = {}
     part = replace(errors, data=first_samples(errors.data, RANKED // errors.unknowns.l))
     x, steps = best.x, best.steps
     for number, latent in enumerate(channels, start=1):
@@ -84,9 +108,15 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         pace = PACE["search" if size < total else "long" if size > STAGES[0] else "short"]
         end = descend(part, _finite(part, x), iterations=iterations, progress=pace, start=best.start)
         x, steps = end.x, steps + end.steps
-    if iterations:  # without a descent nothing can be said of what the functions are worth
-        figures |= _idle(errors, best.x, part, end)
     return part, replace(end, steps=steps), figures
+
+
+def _promised(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator) -> float:
+    """Return the gain that one more function promises beyond twice what it would take of white errors."""
+    part = replace(errors, data=first_samples(errors.data, RANKED // errors.unknowns.l))
+    more = _coarse(latent)
+    by_chance = (errors.unknowns.n + errors.unknowns.l) * more.size / outputs_present(part.data)
+    return max((gain for gain, *_ in _ranked(part, x, more, rng)), default=0.0) - 2 * by_chance
 
 
 def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator, iterations: int
