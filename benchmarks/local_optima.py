@@ -55,7 +55,7 @@ def excess_of_collinear(seed: int) -> tuple[float, str]:
 def excess_of_signed(seed: int) -> tuple[float, str]:
     import cvxpy as cp
 
-    rules = [shape.monotone(), shape.sign("b", ("positive", "negative")[seed // 2 % 2])]
+    rules = [shape.monotone(("increasing", "decreasing")[seed // 2 % 2]), shape.sign("b")]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         fit = optid.fit(signed(seed), na=2, nb=2, basis=optid.Triangular(6, interval=(-1.0, 1.0)), constraints=rules)

@@ -21,7 +21,7 @@ def cases(folder: Path):
     actuator = optid.read(folder / "lab_hydraulic_actuator.csv", inputs="u_valve", outputs="y_pressure", dt=1.0)
     heating = optid.read(folder / "daisy_heating.csv", dt=2.0)
     yield "stretch reflex", reflex, 5000, {"na": 4, "nb": 4, "basis": "triangular:8"}, ["monotone:increasing"]
-    yield "hydraulic actuator", actuator, 512, {"na": 4, "nb": 4, "basis": "triangular:6"}, ["monotone:increasing"]
+    yield "hydraulic actuator", actuator, 512, {"na": 4, "nb": 4, "basis": "triangular:6"}, ["monotone:decreasing"]
     yield "lamp heating", heating, 561, {"na": 2, "nb": 2, "basis": "triangular:3"}, ["monotone:increasing"]
 
 

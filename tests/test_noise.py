@@ -7,7 +7,7 @@ from scipy.optimize import approx_fprime
 from scipy.signal import csd
 
 from optid.data.record import Data
-from optid.errors import StructureError
+from optid.errors import DataError, StructureError
 from optid.identify.noise import _most_likely, _part, colour, noise_spectrum, residuals, whitening_gain, with_noise
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import (
@@ -20,6 +20,7 @@ from optid.models.innovation_gain import (
     innovations_covariance,
     log_determinant,
     refined,
+    whitened,
 )
 from optid.models.kalman import NoiseCovariances, kalman_gain
 
@@ -278,3 +279,9 @@ def test_the_autoregression_of_the_errors_of_an_observer_shows_the_gain():
     assert whitening_gain(A, C, gain, [errors]) == pytest.approx(k, abs=0.05)
     refuses(StructureError, "too few", whitening_gain, A, C, gain, [errors[:50]])
     refuses(StructureError, "predicted exactly", whitening_gain, A, C, gain, [errors[:15000] * [1.0, 0.0]])
+
+
+def test_a_stable_gain_whose_run_leaves_the_range_of_numbers_is_refused():
+    A, C, rest = np.array([[0.0, 1e200], [0.0, 0.0]]), np.array([[1.0, 1.0]]), [np.ones((20, 1))]
+    with pytest.raises(DataError, match="range of numbers"):
+        whitened(A, C, np.zeros((2, 1)), rest)

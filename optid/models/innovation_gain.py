@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from optid.arrays import Array, compact
-from optid.errors import StructureError
+from optid.errors import DataError, StructureError
 from optid.models.feedback_tables import tabulated
 from optid.models.kalman import kalman_gain
 from optid.models.roots import spectral_radius
@@ -55,9 +55,12 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequen
             step = _solved(normal + damping * np.diag(np.diag(normal)), right)
             promised = 0.5 * float(right @ step)
             trial = _stable(A, C, gain + step.reshape(gain.shape), best)
-            errors = whitened(A, C, trial, rest, best)
-            covariance = covariance_of(errors)
-            gained = half * (log_determinant(best) - log_determinant(covariance))
+            try:
+                errors = whitened(A, C, trial, rest, best)
+                covariance = covariance_of(errors)
+                gained = half * (log_determinant(best) - log_determinant(covariance))
+            except DataError:  # stable, but not before its run has left the range of numbers
+                gained = -np.inf
             if gained > 0.75 * promised:
                 damping *= 0.1
             elif not gained > 0.25 * promised:
@@ -169,7 +172,10 @@ def _initial(parts: Parts, rest: Sequence[Array], covariance: Array | None = Non
         covariance = np.diag(np.maximum(np.diag(covariance_of(rest)), np.finfo(float).tiny))
     n, radius, root = len(parts.A), spectral_radius(parts.A - parts.K @ parts.C), _whitening(covariance)
     settled = None if radius >= 1 else n + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
-    found = [_moments(parts, r[:settled], np.zeros(n), root, 0) for r in rest]
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = [_moments(parts, r[:settled], np.zeros(n), root, 0) for r in rest]
+    if not np.all(np.isfinite(found)):
+        raise DataError("the innovations of this gain leave the range of numbers")
     return [-_solved(moments[:n, :n], moments[:n, n]) for moments in found]
 
 
