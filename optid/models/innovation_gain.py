@@ -7,6 +7,7 @@ likelihood (Fisher scoring).
 """
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
@@ -215,8 +216,7 @@ def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array
     from optid.models.state_kernels import sensitivities
 
     (n, l), x, turn = parts.K.shape, x0.copy(), np.eye(parts.K.shape[0], parts.K.shape[0] + size)  # noqa: E741
-    columns = np.arange(n, n + size).reshape(-1, l)  # of the entries of K
-    direct = Direct.of(states=[(np.arange(len(columns))[:, None], columns, np.arange(l), 1.0)])
+    direct = _entries_of_gain(n, l, size)
     total, length = np.zeros((n + size + 1, n + size + 1)), max(64, NUMBERS // ((n + size + 1) * l))
     for first in range(0, len(r), length):
         y = r[first : first + length]
@@ -228,6 +228,13 @@ def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array
         rows = (root @ block).reshape(-1, n + size + 1)
         total += rows.T @ rows
     return total
+
+
+@cache
+def _entries_of_gain(n: int, l: int, size: int) -> Direct:  # noqa: E741
+    """Where the entries of K act on the states, counted from n on; of none with size 0."""
+    columns = np.arange(n, n + size).reshape(-1, l)
+    return Direct.of(states=[(np.arange(len(columns))[:, None], columns, np.arange(l), 1.0)])
 
 
 def _solved(matrix: Array, right: Array) -> Array:
