@@ -163,17 +163,6 @@ def one_or_all(values: list[Any] | None) -> Any:
     return values[0] if values is not None and len(values) == 1 else values
 
 
-def whole_numbers(words: Sequence[str] | None, option: str) -> Any:
-    """Read one whole number or several; None stays None; a `StructureError` names the option and the word."""
-    found = []
-    for word in listed(words) or []:
-        try:
-            found.append(int(word))
-        except ValueError:
-            raise StructureError(f"{option} {word}: a whole number is needed, or one per input") from None
-    return one_or_all(found) if words is not None else None
-
-
 def numbers(words: Sequence[str] | None, option: str) -> list[float] | None:
     """Read numbers, one per channel; None stays None; a `StructureError` names the option and the words."""
     found = listed(words)

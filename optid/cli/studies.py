@@ -10,9 +10,10 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
+from optid.cli.listings import systems
 from optid.cli.options import File, Words, register
 from optid.cli.results import check_folders, command_line
-from optid.cli.terminal import Command, SafeConsole, output, say
+from optid.cli.terminal import Command, SafeConsole, say
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
                     help="Compare formulations and solvers on your data: run a study, report it, export its rows.")
@@ -132,14 +133,6 @@ def problems(db: Path, out: Path, title: str | None = None) -> None:
     kinds = Counter(line["kind"] for line in lines)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "none is convex"
     say(f"{len(lines)} problems written to {out} ({listed}); solve_problems.py there solves them without optid")
-
-
-def systems() -> None:
-    """List the simulated systems that a study file may name."""
-    from optid.cli import listings
-
-    for part in listings.systems():
-        output().print(part)
 
 
 def schema() -> None:
