@@ -1,12 +1,10 @@
 """The commands that list what there is to choose from, generated from the registries and from nothing else."""
 
-from collections.abc import Sequence
 from importlib.metadata import EntryPoint
-from typing import Any
 
 from rich.text import Text
 
-from optid.cli.terminal import Waiting, new_table, output
+from optid.cli.terminal import Waiting, print_table
 from optid.descriptions import Description, describe, describe_function
 from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, registered
 
@@ -27,9 +25,9 @@ def solvers() -> None:
                          *(Text("yes", "green") if yes else Text("no", "dim")
                            for yes in (back_end.duals, back_end.warm, back_end.installed)),
                          back_end.about if back_end.installed else Text(missing, "dim")))
-    _list("Back ends", ("solver", "takes", "prices", "warm", "here", "about"), rows,
-          "Use one with --solver NAME. prices: returns multipliers, so that constraints have prices. "
-          "warm: can start from a given point. here: installed.", firm=2)
+    print_table("Back ends", ("solver", "takes", "prices", "warm", "here", "about"), rows,
+                "Use one with --solver NAME. prices: returns multipliers, so that constraints have prices. "
+                "warm: can start from a given point. here: installed.", firm=(0, 1))
 
 
 def formulations() -> None:
@@ -37,11 +35,11 @@ def formulations() -> None:
     with Waiting() as waiting:
         waiting.step("loading the formulations")
         fits, faults = _entries(FORMULATIONS), _entries(FAULTS)
-    _list("Formulations", ("formulation", "what it poses"), fits,
-          "Constraints speak about the variables; with several inputs they carry the input, as in mu[valve]. "
-          "Arguments in brackets may be left out.")
-    _list("Programmes about faults", ("programme", "what it poses"), faults,
-          "Posed and solved by optid diagnose, optid reformulate and the functions of optid.faults.")
+    print_table("Formulations", ("formulation", "what it poses"), fits,
+                "Constraints speak about the variables; with several inputs they carry the input, as in mu[valve]. "
+                "Arguments in brackets may be left out.")
+    print_table("Programmes about faults", ("programme", "what it poses"), faults,
+                "Posed and solved by optid diagnose, optid reformulate and the functions of optid.faults.")
 
 
 def constraints() -> None:
@@ -53,8 +51,8 @@ def constraints() -> None:
             rows.append((Text(name, "dim"), "", found))
         else:
             rows.append((Text(name, "bold"), _arguments(found), found.summary))
-    _list("Constraints", ("constraint", "arguments", "what it demands"), rows,
-          "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets may be left out.")
+    print_table("Constraints", ("constraint", "arguments", "what it demands"), rows,
+                "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets may be left out.")
 
 
 def examples() -> None:
@@ -62,7 +60,7 @@ def examples() -> None:
     from optid.examples import EXAMPLES
 
     rows = [(Text(name, "bold"), describe_function(function).summary) for name, function in sorted(EXAMPLES.items())]
-    _list("Built-in records", ("example", "what it is"), rows, "Use one with optid fit --example NAME.")
+    print_table("Built-in records", ("example", "what it is"), rows, "Use one with optid fit --example NAME.")
 
 
 def systems() -> None:
@@ -72,9 +70,10 @@ def systems() -> None:
     rows = [(Text(name, "bold"), str(system.samples), f"{system.noise:.3g}",
              *(str(system.suggestion.get(key, default)) for key, default in (("na", "-"), ("nb", "-"), ("nk", 0))),
              system.about) for name, system in SYSTEMS.items()]
-    _list("Simulated systems", ("system", "samples", "noise", "na", "nb", "nk", "what it is"), rows,
-          "samples and noise are those used where a study names none; noise is relative to the noise-free output. "
-          "na, nb and nk suit the system; with other ones a model may be far from the truth.", right=range(1, 6))
+    print_table("Simulated systems", ("system", "samples", "noise", "na", "nb", "nk", "what it is"), rows,
+                "samples and noise are those used where a study names none; noise is relative to the noise-free "
+                "output. na, nb and nk suit the system; with other ones a model may be far from the truth.",
+                right=range(1, 6))
 
 
 def _entries(group: str) -> list[tuple[Text, Text]]:
@@ -97,18 +96,6 @@ def _described(point: EntryPoint) -> Description | Text:
         return describe(point)
     except ImportError as error:  # a broken plug-in takes nothing away
         return Text(f"cannot be loaded: {error}", "dim")
-
-
-def _list(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], footer: str, firm: int = 1,
-          right: Sequence[int] = ()) -> None:
-    """Print a table and what is said below; the first `firm` columns are never broken."""
-    table = new_table(title)
-    for c, column in enumerate(columns):
-        table.add_column(column, overflow="fold", no_wrap=c < firm, justify="right" if c in right else "left")
-    for row in rows:
-        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
-    output().print(table)
-    output().print(Text(footer, "dim"))
 
 
 def _arguments(found: Description) -> Text:
