@@ -47,14 +47,13 @@ def run(
         dry_run: Say what would be run, and run nothing.
     """
     from optid.errors import StudyError
-    from optid.studies.definition.built_in import example_study
     from optid.studies.definition.description import Study
     from optid.studies.execution import running
     from optid.studies.storage import export as exporting
 
     if (file is None) != example:
         raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))
-    described = example_study() if file is None else Study.from_toml(file)
+    described = Study.example() if file is None else Study.from_toml(file)
     db = db or Path(f"{file.stem if file is not None else 'example'}.sqlite")
     check_folders(db, export)
     if export is not None:

@@ -1,8 +1,5 @@
 """The page of a study: one HTML file that opens offline, with its figures, its tables and every run."""
 
-import base64
-import hashlib
-import json
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -11,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from optid import __version__
-from optid.show.page import template, versions
+from optid.show.page import embedded, scripts, template, versions
 from optid.show.wording import Table, number, seconds
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import OUTCOMES
@@ -54,10 +51,8 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
 
 def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
     """Return the page that `write_page` writes."""
-    head, templates = verdict.headline, files("optid") / "show" / "templates"
+    head, style = verdict.headline, files("optid") / "show" / "templates" / "study.css"
     studies = [name for name in dict.fromkeys(verdict.table["study"]) if name]
-    script = "\n".join((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     content = {
         "version": __version__,
         "title": title or " · ".join(_short(name) for name in studies[:3]) or "Study",
@@ -80,9 +75,8 @@ def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
         "call": command or "optid study report STUDY.sqlite -o study.html",
         "versions": [*versions(), *_machines(verdict)],
         "text": str(verdict),
-        "style": Markup((templates / "study.css").read_text(encoding="utf-8")),
-        "script": Markup(script),
-        "digest": digest,
+        "style": Markup(style.read_text(encoding="utf-8")),
+        **scripts(*SCRIPTS),
         "payload": embedded(page_payload(verdict)),
         "single": len(verdict.overall.standings) < 2,
         "measure": verdict.quality.measure.replace("_", " "),
@@ -90,13 +84,6 @@ def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
                      ("agreement", "Agreement"), ("models", "Models"), ("runs", "Runs"), ("method", "Method")],
     }
     return template("study.html.j2").render(content)
-
-
-def embedded(payload: Any) -> Markup:
-    """Return a value as JSON that can stand inside a script element: no text in it can end the element."""
-    text = json.dumps(payload, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
-    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-                  .replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
 
 
 def _short(text: str, most: int = WIDEST) -> str:
