@@ -11,14 +11,12 @@ from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
 
-LOUD = 20
-"""Rows that cannot be read that are named for each block read; the others are counted."""
+LOUD = 20  # rows that cannot be read that are named for each block read; the others are counted
 
 ARL0 = 10_000
 """Mean samples between false alarms that are asked for where nothing is said."""
 
-KEPT = 10_000
-"""Samples after which the state is saved, events or not."""
+KEPT = 10_000  # samples after which the state is saved, events or not
 
 
 def monitor(

@@ -12,8 +12,7 @@ from optid.cli.terminal import print_table, say
 from optid.program.solution import Status
 from optid.studies.storage.rows import DONE, REFUSED
 
-LISTED = 12
-"""Reasons that are printed; the page has them all."""
+LISTED = 12  # reasons that are printed; the page has them all
 
 
 def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:

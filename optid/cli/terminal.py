@@ -17,11 +17,8 @@ from typer.core import TyperCommand, TyperGroup
 
 from optid.errors import DataWarning, InfeasibleError, OptidError, SolverFailed, SolverMissing, UnboundedError
 
-PATIENCE = 2.0
-"""Seconds of silence before progress is shown."""
-
-FILES = "FILE..."
-"""Metavar of options whose values are files."""
+PATIENCE = 2.0  # seconds of silence before progress is shown
+FILES = "FILE..."  # metavar of options whose values are files
 
 _FILE = re.compile(r".+\.(csv|tsv|txt|parquet|mat|npz|npy|json)", re.IGNORECASE)
 _NUMBER = re.compile(r"-[0-9.].*")

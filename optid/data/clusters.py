@@ -11,14 +11,9 @@ from urllib.parse import urlsplit
 
 from optid.errors import ClusterError
 
-REACH = 3.0
-"""Seconds to reach the machine of a scheduler."""
-
-ANSWER = 10.0
-"""Seconds a scheduler has to answer once its machine is reached; one with much to do takes some."""
-
-LOOKS = 3
-"""Times that versions are compared before a difference counts: source files may be edited while workers look."""
+REACH = 3.0  # seconds to reach the machine of a scheduler
+ANSWER = 10.0  # seconds a scheduler has to answer once its machine is reached; one with much to do takes some
+LOOKS = 3  # times that versions are compared before a difference counts: source files may be edited while workers look
 
 NO_SCHEDULER = (
     "what answers at {} is no Dask scheduler, or one of another version. Is this the port of the scheduler (8786 by "

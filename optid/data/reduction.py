@@ -18,8 +18,7 @@ from optid.data.reading.parts import Part
 One = TypeVar("One")
 Result = TypeVar("Result")
 
-FAN_IN = 8
-"""Results that one task merges."""
+FAN_IN = 8  # results that one task merges
 
 
 def available_threads(threads: int | None) -> int:

@@ -17,8 +17,7 @@ from optid.data.reading.sources import Source, open_source
 from optid.data.reduction import available_threads, fetched, reduced
 from optid.errors import DataError
 
-CHUNK = 131072
-"""Samples read at a time: two channels of float64 fit into the second-level cache of a common processor."""
+CHUNK = 131072  # samples read at a time: two channels of float64 fit into the second-level cache of a common processor
 
 Result = TypeVar("Result")
 

@@ -14,13 +14,11 @@ from optid.errors import DataError, nearest
 Wanted = str | int | Sequence[str | int] | Mapping[str, str | int] | None
 """Columns by name or position; a mapping {channel name: column} renames."""
 
-TIME_TOLERANCE = 0.01
-"""A time step may deviate from the median step by this share of it."""
+TIME_TOLERANCE = 0.01  # a time step may deviate from the median step by this share of it
 
 TIME_NAMES = ("t", "time")
 
-MOST_LISTED = 40
-"""Columns that a message lists."""
+MOST_LISTED = 40  # columns that a message lists
 
 
 def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dict[str, str]:

@@ -14,13 +14,11 @@ from optid.errors import DataError
 
 MAT = 'pip install "optid[mat]"'
 
-MEMORY = 4 << 30
-"""Bytes of address space that a MAT file may take, or `EXPANSION` times its size where that is more."""
+MEMORY = 4 << 30  # bytes of address space that a MAT file may take, or `EXPANSION` times its size where that is more
 
 EXPANSION = 32
 
-SECONDS = 60.0
-"""Time that a MAT file may take, and as much again for each `PACE` bytes."""
+SECONDS = 60.0  # time that a MAT file may take, and as much again for each `PACE` bytes
 
 PACE = 1 << 30
 

@@ -11,8 +11,7 @@ from optid.data.reading.frames import load_frame
 from optid.data.reading.parts import Part, file_parts
 from optid.errors import DataError
 
-SAMPLES = 1 << 20
-"""Row groups are taken together up to this many samples: smaller tasks do not pay."""
+SAMPLES = 1 << 20  # row groups are taken together up to this many samples: smaller tasks do not pay
 
 
 def parquet_schema(path: Path) -> dict[str, Any]:
