@@ -140,10 +140,10 @@ def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
 def _parts(A: Array, C: Array, gain: Array, injection: Array | None = None) -> Parts:
     """A model x+ = A x + L y + K e, y = C x + e as the compiled recursions read it."""
     n, l = gain.shape  # noqa: E741
-    injected = np.zeros((n, l)) if injection is None else injection
+    injected = np.zeros((n, l)) if injection is None else compact(injection)
     none = [np.zeros(shape) for shape in ((n, 0), (l, 0), (n, 0), (n, 0), (l, 0), (0, n))]
-    matrices = A, none[0], C, none[1], none[2], injected, gain, *none[3:]
-    return Parts._make([*map(compact, matrices), np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
+    matrices = compact(A), none[0], compact(C), none[1], none[2], injected, compact(gain), *none[3:]
+    return Parts._make([*matrices, np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
 
 
 def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
