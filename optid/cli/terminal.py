@@ -121,7 +121,7 @@ def say(text: str | Text) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str | Text]], footer: str = "", *,
-                firm: Collection[int] = (0,), right: Collection[int] = (), padding: tuple[int, ...] = (0, 1)) -> None:
+                firm: Collection[int] = (0,), right: Collection[int] = (), padding: Any = (0, 1)) -> None:
     """Print a table, and what is said below; columns by number: `firm` are never broken, `right` hold numbers."""
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False,
                   padding=padding)

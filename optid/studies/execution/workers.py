@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from optid.errors import StudyError
-from optid.solving.isolated import GRACE, death
+from optid.processes import death
+from optid.solving.isolated import GRACE
 from optid.studies.execution.cell import lost_row, prepare, run_cell, without_warm
 from optid.studies.execution.worker import RETIRED, kept, last_words, note, run, start, words
 from optid.studies.grid import Cell
