@@ -14,7 +14,7 @@ from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surv
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
 from optid.data.reading.parts import Part
 from optid.data.reading.sources import Source, open_source
-from optid.data.reduction import available_threads, fetched, reduced
+from optid.data.reduction import available_cores, fetched, reduced
 from optid.errors import DataError
 
 CHUNK = 131072  # samples read at a time: two channels of float64 fit into the second-level cache of a common processor
@@ -139,7 +139,7 @@ class Stream(Ports):
         channels = replace(self._channels, units=None)
         if self.parts:
             found = reduced(self.parts, partial(_of_part, surveyed, channels), partial(joined, channels),
-                            self.scheduler, available_threads(None))
+                            self.scheduler, available_cores(None))
         else:
             whole = next(self._sources())
             found = surveyed(whole, channels.read(whole))
