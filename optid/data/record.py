@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import as_samples, is_scalar_list
+from optid.arrays import as_records, frozen, one_or_all
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, listed, sampling_time
 from optid.data.description import Description
@@ -31,10 +31,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         if self.u.shape[0] != self.y.shape[0]:
-            raise DataError(
-                f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. "
-                "Cut both to the samples that were recorded together, or fill the lost ones with NaN."
-            )
+            raise DataError(f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. Cut both to the samples that "
+                            "were recorded together, or fill the lost ones with NaN.")
 
     @property
     def n_samples(self) -> int:
@@ -86,8 +84,8 @@ class Data(Ports):
         Warns:
             DataWarning: integer samples that look saturated or wrapped around.
         """
-        us = _as_records(u, "u", listed(inputs))
-        ys = _as_records(y, "y", listed(outputs))
+        us = as_records(u, "u", listed(inputs))
+        ys = as_records(y, "y", listed(outputs))
         if len(us) != len(ys):
             raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
         starts = np.atleast_1d(np.asarray(start, dtype=float))
@@ -245,9 +243,7 @@ class Data(Ports):
         for k, e in enumerate(self.experiments):
             cut = int(at) if whole else round(float(at) * e.n_samples)
             if not 0 < cut < e.n_samples:
-                raise DataError(
-                    f"split at {at} leaves an empty part of experiment {k + 1}, which has {e.n_samples} samples."
-                )
+                raise DataError(f"split at {at} leaves an empty part of experiment {k + 1} of {e.n_samples} samples.")
             first.append(self._cut(e, 0, cut))
             second.append(self._cut(e, cut, e.n_samples))
         return self._with(experiments=tuple(first)), self._with(experiments=tuple(second))
@@ -281,16 +277,15 @@ class Data(Ports):
         whole = all(isinstance(end, int | np.integer) and not isinstance(end, bool) for end in ends)
         if not whole and not all(isinstance(end, float | np.floating) and end == end for end in ends):
             raise DataError(f"data[{part.start!r}:{part.stop!r}]: two integers are samples, two floats are times.")
-        kept = []
-        for e in self.experiments:
-            limits = part
-            if not whole:  # the first sample not before each time; 1e-6 of a step for the rounding of the times
-                places = [None if end is None else min(max((end - e.start) / self.dt - 1e-6, 0.0), e.n_samples)
-                          for end in (part.start, part.stop)]
-                limits = slice(*(None if place is None else int(np.ceil(place)) for place in places))
-            first, last, _ = limits.indices(e.n_samples)
-            if first < last:
-                kept.append(self._cut(e, first, last))
+
+        def sample(end: Any, e: Experiment) -> int | None:
+            """The first sample not before a time, with 1e-6 of a step for the rounding of the times."""
+            if end is None or whole:
+                return end
+            return int(np.ceil(min(max((end - e.start) / self.dt - 1e-6, 0.0), e.n_samples)))
+
+        spans = [slice(sample(part.start, e), sample(part.stop, e)).indices(e.n_samples) for e in self.experiments]
+        kept = [self._cut(e, first, last) for e, (first, last, _) in zip(self.experiments, spans) if first < last]
         if not kept:
             raise DataError(f"data[{part.start}:{part.stop}] holds no samples; there are "
                             f"{', '.join(str(e.n_samples) for e in self.experiments)} "
@@ -320,7 +315,7 @@ class Data(Ports):
         kept = [self.experiments[k] for k in picked]
         t = self.transform
         return self._with(
-            experiments=tuple(Experiment(_frozen(e.u[:, i]), _frozen(e.y[:, o]), e.start) for e in kept),
+            experiments=tuple(Experiment(frozen(e.u[:, i]), frozen(e.y[:, o]), e.start) for e in kept),
             inputs=_take(self.inputs, i), outputs=_take(self.outputs, o), input_units=_take(self.input_units, i),
             output_units=_take(self.output_units, o),
             transform=Transform(_take(t.u_scale, i), _take(t.u_offset, i), _take(t.y_scale, o), _take(t.y_offset, o)),
@@ -339,10 +334,8 @@ class Data(Ports):
         for k, part in enumerate(parts[1:], start=2):
             for what in ("inputs", "outputs", "input_units", "output_units"):
                 if getattr(part, what) != getattr(head, what):
-                    raise DataError(
-                        f"data set {k} has {what} {getattr(part, what)}, the first has {getattr(head, what)}; "
-                        "give them the same names and units, or use select."
-                    )
+                    raise DataError(f"data set {k} has {what} {getattr(part, what)}, the first has "
+                                    f"{getattr(head, what)}; give them the same names and units, or use select.")
             if abs(part.dt - head.dt) > 1e-9 * head.dt:
                 raise DataError(f"data set {k} has dt {part.dt:g}, the first has {head.dt:g}; decimate the faster one.")
             if part.transform != head.transform:
@@ -355,9 +348,7 @@ class Data(Ports):
 
     def raw(self) -> "Data":
         """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""
-        return self.mapped(
-            self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l)
-        )
+        return self.mapped(self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l))
 
     def without_transform(self) -> "Data":
         """Return the same samples without the way back to raw units."""
@@ -368,7 +359,7 @@ class Data(Ports):
 
         The functions must not change their arguments.
         """
-        experiments = tuple(Experiment(_frozen(of_u(e.u)), _frozen(of_y(e.y)), e.start) for e in self.experiments)
+        experiments = tuple(Experiment(frozen(of_u(e.u)), frozen(of_y(e.y)), e.start) for e in self.experiments)
         return self._with(experiments=experiments, **changes)
 
     def _cut(self, e: Experiment, first: int, last: int) -> Experiment:
@@ -382,22 +373,6 @@ def _filled(data: Data, **values: Any) -> Data:
     for name, value in values.items():
         object.__setattr__(data, name, value)
     return data
-
-
-def _frozen(array: np.ndarray) -> np.ndarray:
-    array = np.ascontiguousarray(array)
-    array.flags.writeable = False
-    return array
-
-
-def _as_records(values: Any, what: str, names: Sequence[str] | None) -> list[np.ndarray]:
-    if is_scalar_list(values):
-        return [as_samples(values, what, names)]
-    records = [as_samples(item, f"{what} of experiment {k + 1}", names) for k, item in enumerate(values)]
-    widths = {r.shape[1] for r in records}
-    if len(widths) > 1:
-        raise DataError(f"{what}: the experiments have {sorted(widths)} channels; each needs the same channels.")
-    return records
 
 
 def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what: str) -> list[int]:
@@ -421,13 +396,3 @@ def not_a_record(data: Any, what: str) -> str:
         return (f"{what} takes optid.Data, not {kind}: {what}(optid.read(df, inputs=[...], outputs=[...], dt=...)) for "
                 "a frame, dictionary or array df with one column a channel.")
     return f"{what} takes optid.Data (or a stream), not {kind}; use optid.read(df, ...) or optid.Data(u=, y=, dt=)."
-
-
-def one_or_all(arrays: list[np.ndarray]) -> Any:
-    """Return the array of the only experiment, or a tuple with one array for each."""
-    return arrays[0] if len(arrays) == 1 else tuple(arrays)
-
-
-def as_list(arrays: Any) -> list[np.ndarray]:
-    """Return one array for each experiment, from what `one_or_all` made of them."""
-    return list(arrays) if isinstance(arrays, tuple) else [arrays]
