@@ -22,12 +22,11 @@ ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
 """What a formulation is given that needs it, where nobody says: which solver is the question, not which order."""
 
 
-def compare(
-    data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
-    constraint: Words = None, settings: Words = None, solvers: Words = None, accuracy: float = 1e-8,
-    time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3, seed: int = 0,
-    db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None,
-) -> None:
+def compare(data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
+            constraint: Words = None, settings: Words = None, solvers: Words = None, accuracy: float = 1e-8,
+            time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3,
+            seed: int = 0, db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None
+            ) -> None:
     """Compare solvers on one record at equal verified accuracy, and say which to use.
 
     Example: optid compare data.csv --inputs u --outputs y --formulation hammerstein_arx.exact --na 2 --nb 2

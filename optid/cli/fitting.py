@@ -12,13 +12,11 @@ from optid.lazy import import_cvxpy
 BUDGET = 60.0
 
 
-def fit(
-    data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
-    scheduler: str | None = None, split: float | None = None, test: Words = None, formulation: str = DEFAULT,
-    constraint: Words = None, holdout: str | None = None, settings: Words = None, solver: str = "auto",
-    accuracy: float = 1e-8, time_limit: float | None = None, prove: bool = True, option: Words = None, seed: int = 0,
-    report: File = None, saved: File = None,
-) -> None:
+def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
+        scheduler: str | None = None, split: float | None = None, test: Words = None, formulation: str = DEFAULT,
+        constraint: Words = None, holdout: str | None = None, settings: Words = None, solver: str = "auto",
+        accuracy: float = 1e-8, time_limit: float | None = None, prove: bool = True, option: Words = None,
+        seed: int = 0, report: File = None, saved: File = None) -> None:
     """Fit a model to a record, prove it optimal, and report it; without orders, search for them as optid identify does.
 
     Example: optid fit data.csv --inputs u --outputs y --dt 0.1 --na 2 --nb 2 --basis triangular:10
@@ -72,12 +70,10 @@ def fit(
         work.page(found, report, held_out)
 
 
-def identify(
-    data: Paths = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
-    horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
-    workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0, report: File = None,
-    saved: File = None,
-) -> None:
+def identify(data: Paths = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
+             horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
+             workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0,
+             report: File = None, saved: File = None) -> None:
     """Find the structure of a record by cross-validation, and fit it: formulation, delay, orders, functions.
 
     Example: optid identify data.csv --inputs u --outputs y --dt 0.1 --report report.html
@@ -97,10 +93,8 @@ def identify(
             workers=workers, **({"classes": classes} if classes else {}))
 
 
-def _search(
-    data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
-    constraint: Words, solver: str, saved: File, report: File, **settings: Any,
-) -> None:
+def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
+            constraint: Words, solver: str, saved: File, report: File, **settings: Any) -> None:
     check_names(constraint, solver)
     with working(model=saved, report=report) as work:
         from optid.cli import arguments as words
@@ -116,9 +110,8 @@ def _search(
         work.page(found, report, held_out)
 
 
-def _finish(
-    work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any], what: str = "fit"
-) -> None:
+def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
+            what: str = "fit") -> None:
     """Validate on what was held out, and write the model, with the place of a record that it is from as a whole."""
     from optid.cli.arguments import listed
 

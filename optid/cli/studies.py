@@ -27,11 +27,9 @@ Workers = Annotated[
 ]
 
 
-def run(
-    file: File = None, example: bool = False, db: File = None, workers: Workers = None,
-    scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
-    dry_run: bool = False,
-) -> None:
+def run(file: File = None, example: bool = False, db: File = None, workers: Workers = None,
+        scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
+        dry_run: bool = False) -> None:
     """Run a study, or what is left of it; stop it whenever you like, the same command goes on.
 
     Example: optid study run study.toml --db study.sqlite
@@ -72,9 +70,8 @@ def run(
         raise typer.Exit(NOTHING_SOLVED)
 
 
-def report(
-    db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve",
-) -> None:
+def report(db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve"
+           ) -> None:
     """Print the verdict of a study, and write its page.
 
     Example: optid study report study.sqlite -o study.html

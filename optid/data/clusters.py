@@ -185,11 +185,9 @@ def result_of(client: Any, task: Any) -> Any:
             future.release()
     except KilledWorker as error:
         count = error.allowed_failures + 1
-        raise ClusterError(
-            f"{count} worker{'s' * (count > 1)} died over the same task, the last at {error.last_worker.address}. Most "
-            "often memory ran out: give workers more, or open the record with a smaller chunk or smaller partitions."
-        ) from error
+        raise ClusterError(f"{count} worker{'s' * (count > 1)} died over the same task, the last at "
+                           f"{error.last_worker.address}. Most often memory ran out: give workers more, or open the "
+                           "record with a smaller chunk or smaller partitions.") from error
     except (CancelledError, CommClosedError) as error:
-        raise ClusterError(
-            f"the scheduler went away while it was waited for ({type(error).__name__}: {error})."
-        ) from error
+        raise ClusterError(f"the scheduler went away while it was waited for ({type(error).__name__}: "
+                           f"{error}).") from error

@@ -31,8 +31,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         if self.u.shape[0] != self.y.shape[0]:
-            raise DataError(f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. Cut both to the samples that "
-                            "were recorded together, or fill the lost ones with NaN.")
+            raise DataError(f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. Cut both to the samples "
+                            "that were recorded together, or fill the lost ones with NaN.")
 
     @property
     def n_samples(self) -> int:
@@ -59,11 +59,10 @@ class Data(Ports):
     name: str
     transform: Transform = field(repr=False)
 
-    def __init__(
-        self, u: Any, y: Any, dt: float = 1.0, inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
-        output_units: str | Sequence[str] | None = None, name: str = "", start: float | Sequence[float] = 0.0,
-    ) -> None:
+    def __init__(self, u: Any, y: Any, dt: float = 1.0, inputs: str | Sequence[str] | None = None,
+                 outputs: str | Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
+                 output_units: str | Sequence[str] | None = None, name: str = "", start: float | Sequence[float] = 0.0
+                 ) -> None:
         """Copy and check the record.
 
         Args:
@@ -100,10 +99,8 @@ class Data(Ports):
         self._complete(experiments, dt, inputs, outputs, input_units, output_units, name)
 
     @classmethod
-    def of_experiments(
-        cls, experiments: Sequence[Experiment], dt: float, inputs: Sequence[str], outputs: Sequence[str],
-        input_units: Any = None, output_units: Any = None, name: str = "",
-    ) -> "Data":
+    def of_experiments(cls, experiments: Sequence[Experiment], dt: float, inputs: Sequence[str], outputs: Sequence[str],
+                       input_units: Any = None, output_units: Any = None, name: str = "") -> "Data":
         """Return data of experiments with checked samples, without a copy; arguments as of the class."""
         data = object.__new__(cls)
         data._complete(experiments, dt, inputs, outputs, input_units, output_units, name)

@@ -213,9 +213,8 @@ def open_stream(  # noqa: D417 - the others stand with `read`
     )
 
 
-def _chosen(
-    opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
-) -> tuple[dict[str, str], dict[str, str], str | None]:
+def _chosen(opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
+            ) -> tuple[dict[str, str], dict[str, str], str | None]:
     """Return {channel: column} of inputs and outputs and the clock, the same for all sources."""
     found = []
     for one in opened:

@@ -182,10 +182,9 @@ class CsvFile:
         if not any(block[bad:]) and not any(reader):
             return block[:bad]
         found = f"has {len(block[bad])} cells" if block[bad] else "is blank"
-        raise DataError(
-            f"{self.path.name}: row {done + bad + 1} after the header {found}, the header has {len(self.names)}. "
-            "Repair the row; where samples are missing keep the row and leave its cells blank."
-        )
+        raise DataError(f"{self.path.name}: row {done + bad + 1} after the header {found}, the header has "
+                        f"{len(self.names)}. Repair the row; where samples are missing keep the row and leave its "
+                        "cells blank.")
 
 
 def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal: str) -> CsvFile:

@@ -48,11 +48,9 @@ class RowReader:
         line: lines read.
     """
 
-    def __init__(
-        self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
-        columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: int = 0,
-        label: str = "stream", tolerance: float = TIME_TOLERANCE,
-    ) -> None:
+    def __init__(self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
+                 columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: int = 0,
+                 label: str = "stream", tolerance: float = TIME_TOLERANCE) -> None:
         """Say what is read.
 
         Args:
@@ -130,9 +128,8 @@ class RowReader:
                 return Rows(np.empty((0, sum(map(len, self._wanted)))), len(self._wanted[0]), np.empty(0, int), [], [])
             first = self._cells(lines[0].removeprefix("\ufeff"))
             if all(map(is_number, first)):
-                raise DataError(
-                    f"{self._label} has no header row (it starts with {lines[0][:60]!r}): name the columns, --columns."
-                )
+                raise DataError(f"{self._label} has no header row (it starts with {lines[0][:60]!r}): name the "
+                                "columns, --columns.")
             self._known([cell.strip() for cell in first])
             del lines[0]
             self.line += 1
