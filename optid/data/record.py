@@ -181,18 +181,8 @@ class Data(Ports):
         return low, high
 
     def __repr__(self) -> str:
-        runs = f"{self.n_experiments} experiments, " if self.n_experiments > 1 else ""
-        title = f"Data {self.name!r}: " if self.name else "Data: "
-        lines = [f"{title}{runs}{self.n_samples} samples, dt = {self.dt:g}"]
-        labels = [f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.channels]
-        width = max(map(len, labels))
-        for c, label in zip(self.channels, labels):
-            levels = f", {c.levels} levels" if c.levels <= 20 else ""
-            missing = f", {c.missing:.2%} missing" if c.missing else ""
-            lines.append(f"  {c.role:<6} {label:<{width}}  {c.low:.4g} to {c.high:.4g}{levels}{missing}")
-        if not self.transform.is_identity:
-            lines.append("  detrended or scaled; reports are in raw units")
-        return "\n".join(lines)
+        units = "" if self.transform.is_identity else "\n  detrended or scaled; reports are in raw units"
+        return f"{self.describe()}{units}"
 
     def describe(self) -> Description:
         """Return range, mean, distinct levels and missing samples of each channel, and how it is sampled."""
