@@ -136,9 +136,6 @@ def _show(found: Any, posed: str, record: str) -> None:
 
     absent = {name for name, back_end in back_ends().items() if not back_end.installed}
 
-    def clock(value: float) -> str:
-        return "-" if value != value else seconds(value)
-
     def small(value: float) -> str:
         return "-" if value != value else f"{value:.0e}"
 
@@ -149,8 +146,8 @@ def _show(found: Any, posed: str, record: str) -> None:
         table.append((
             Text(line.solver, "bold" if good else "dim"),
             Text(word if good else line.state, "green" if line.proved else "yellow"),
-            "0" if abs(line.above) < 1e-12 else small(line.above), small(line.residual), clock(line.cold),
-            clock(line.warm), number(line.one_step, 4), number(line.simulation, 4)))
+            "0" if abs(line.above) < 1e-12 else small(line.above), small(line.residual), seconds(line.cold),
+            seconds(line.warm), number(line.one_step, 4), number(line.simulation, 4)))
     print_table(f"{posed} on {record}, accuracy {found.accuracy:.0e}",
                 ("solver", "verified", "excess", "residual", "cold", "warm", "1-step", "simul."), table,
                 firm=(0, *range(2, 8)), right=range(2, 8), padding=(0, 0, 0, 1))

@@ -191,8 +191,9 @@ def _now(row: dict[str, Any] | None) -> str:
         return "cells"
     from rich.markup import escape
 
-    formulation, solver = (escape(text if len(text) <= 28 else text[:27] + "…")
-                           for text in (row["formulation"], row["solver"]))
+    from optid.show.wording import short
+
+    formulation, solver = (escape(short(row[name], 28)) for name in ("formulation", "solver"))
     return f"[dim]{formulation} · {solver}: {row['status_verified'] or row['outcome']}[/]"
 
 
