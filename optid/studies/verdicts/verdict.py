@@ -176,10 +176,10 @@ def _refuted(found: Results, table: Table) -> Statement | None:
 
 
 def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
-    lies = [(i, table["reason"][i]) for i in np.flatnonzero(table["false_claim"])]
+    lies = [(int(i), str(table["reason"][i])) for i in np.flatnonzero(table["false_claim"])]
     for p, s in zip(*np.nonzero(found.state == CONTRADICTED)):
         winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
-        lies.append((found.row[p, s], f"{winner} has a verified point"))
+        lies.append((int(found.row[p, s]), f"{winner} has a verified point"))
     groups = grouped(((table["solver"][i], table["formulation"][i], table["status_claimed"][i]), reason)
                      for i, reason in lies)
     claims = [FalseClaim(key[0], key[1], len(reasons), key[2], min(reasons)) for key, reasons in groups.items()]
@@ -188,8 +188,8 @@ def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
 
 def _failures(found: Results) -> tuple[Failure, ...]:
     failed = zip(*np.nonzero(~np.isin(found.state, (SOLVED, NOT_RUN, UNTIMED))))
-    groups = grouped(((found.solvers[s], found.state[p, s], without_numbers(found.reason[p, s])), found.reason[p, s])
-                     for p, s in failed)
+    said = [(found.solvers[s], str(found.state[p, s]), str(found.reason[p, s])) for p, s in failed]
+    groups = grouped(((solver, state, without_numbers(reason)), reason) for solver, state, reason in said)
     failures = [Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
                 for (solver, state, shape), reasons in groups.items()]
     return tuple(sorted(failures, key=lambda f: (f.state == REFUSED, -f.count, f.solver, f.state, f.reason)))
