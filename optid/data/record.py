@@ -181,6 +181,11 @@ class Data(Ports):
         return low, high
 
     def __repr__(self) -> str:
+        runs = f"{self.n_experiments} experiments, " if self.n_experiments > 1 else ""
+        channels = f"{', '.join(self.inputs)} -> {', '.join(self.outputs)}"
+        return f"Data({self.name!r}: {runs}{self.n_samples} samples every {self.dt:g}, {channels})"
+
+    def __str__(self) -> str:
         units = "" if self.transform.is_identity else "\n  detrended or scaled; reports are in raw units"
         return f"{self.describe()}{units}"
 
