@@ -44,10 +44,10 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         data: the record (or a stream larger than memory).
         na: number of past outputs in A.
         nb: number of coefficients of B, one per input or one for all.
-        basis: basis of the nonlinearity, one per input or one for all.
+        basis: basis of the nonlinearity, one per input or one for all, such as triangular:10 or polynomial:4.
         nk: delay of the first coefficient of B in samples, one per input or one for all.
         constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
-        loss: "squares", "huber[:threshold in robust standard deviations]" or "l1" (reweighted passes; no proof).
+        loss: "squares", "huber[:threshold in robust standard deviations]" or "l1" (no proof: reweighted passes).
         ridge: weight of ``‖mu‖² ‖b‖²``.
         curvature: weight of ``‖b‖²`` times the integral of ``f''²``.
         prior: of A and of every row of Theta along the lags: "none", "tc" (decaying, rough), "dc" (with a correlation

@@ -64,6 +64,34 @@ def is_scalar_list(values: Any) -> bool:
                     "mixed. Wrap each record in numpy.asarray(...).")
 
 
+def as_records(values: Any, what: str, names: Sequence[str] | None = None) -> list[np.ndarray]:
+    """Return one array (N, channels) per experiment of a signal; arguments and errors as of `as_samples`."""
+    if is_scalar_list(values):
+        return [as_samples(values, what, names)]
+    records = [as_samples(item, f"{what} of experiment {k + 1}", names) for k, item in enumerate(values)]
+    widths = {r.shape[1] for r in records}
+    if len(widths) > 1:
+        raise DataError(f"{what}: the experiments have {sorted(widths)} channels; each needs the same channels.")
+    return records
+
+
+def one_or_all(arrays: list[np.ndarray]) -> Any:
+    """Return the array of the only experiment, or a tuple with one array for each."""
+    return arrays[0] if len(arrays) == 1 else tuple(arrays)
+
+
+def as_list(arrays: Any) -> list[np.ndarray]:
+    """Return one array for each experiment, from what `one_or_all` made of them."""
+    return list(arrays) if isinstance(arrays, tuple) else [arrays]
+
+
+def frozen(array: np.ndarray) -> np.ndarray:
+    """Return an array, or a copy of it in C order, that cannot be written."""
+    array = np.ascontiguousarray(array)
+    array.flags.writeable = False
+    return array
+
+
 def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> None:
     """Refuse infinite and absurdly large samples (N, channels); NaN passes, it means missing.
 

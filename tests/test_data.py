@@ -51,11 +51,15 @@ def test_one_record_may_be_a_plain_list_or_masked():
 
 
 def test_repr_says_what_a_person_wants_to_know(record):
-    text = repr(record)
-    for part in ("'tank'", "200 samples", "dt = 0.1", "valve [%]", "level [m]", "0.50% missing"):
-        assert part in text
-    assert "2 levels" in repr(Data([0.0, 1.0, 0.0], [1.0, 2.0, 3.0]))
-    assert "2 experiments" in repr(Data.join(*record.split(0.5)))
+    assert repr(record) == "Data('tank': 200 samples every 0.1, valve, pump -> level)"
+    assert "'tank': 2 experiments, 200 samples" in repr(Data.join(*record.split(0.5)))
+    text = str(record)
+    assert text.startswith("tank: 200 samples every 0.1") and text == str(record.describe())
+    rows = [line.split() for line in text.splitlines()]
+    assert ["valve", "input", "%"] in [row[:3] for row in rows] and rows[-1][:3] == ["level", "output", "m"]
+    assert rows[-1][-1] == "0.50%" and str(record.detrend()).endswith("reports are in raw units")
+    assert "experiment 2: " in str(Data.join(*record.split(0.5)))
+    assert "20 experiments of 10 to 10 samples" in str(Data([np.zeros(10)] * 20, [np.ones(10)] * 20))
 
 
 def test_summaries_ignore_missing_samples(record):

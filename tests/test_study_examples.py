@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from optid.studies import grid
-from optid.studies.definition.built_in import example_study
 from optid.studies.definition.description import Study
 
 FOLDER = Path(__file__).parent.parent / "examples" / "studies"
@@ -48,7 +47,7 @@ def test_scripts_are_short(script):
 
 
 def test_the_built_in_study_solves_everything():
-    rows = replace(example_study(), seeds=1, time_limit=300.0).run(workers=1)
+    rows = replace(Study.example(), seeds=1, time_limit=300.0).run(workers=1)
     assert len(rows) == 16 and rows[rows["solver"] == "auto"]["reached"].all()
     assert set(rows["outcome"]) == {"done", "refused"}
 

@@ -12,7 +12,8 @@ from study_rows import rows as synthetic
 
 from optid.errors import DataError
 from optid.program.solution import Status
-from optid.studies.page import embedded, render, write_page
+from optid.show.page import embedded
+from optid.studies.page import render, write_page
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import SUCCESS, columns
 from optid.studies.verdicts.outcomes import states_of_rows, tabulate

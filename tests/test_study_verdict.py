@@ -236,9 +236,9 @@ def test_the_standings_equal_those_of_a_data_frame():
         t = wide[s.solver].dropna()
         assert (s.solved, s.problems, s.fastest) == (len(t), ran[s.solver], fastest[s.solver])
         assert s.time == pytest.approx(scipy.stats.gmean(t + 0.01) - 0.01)
-        if s.against is not None and s.against.n:
+        if (against := section.choice.against.get(s.solver)) is not None and against.n:
             both = (wide[s.solver] / wide[section.choice.first]).dropna()
-            assert s.against.n == len(both) and s.against.value == pytest.approx(scipy.stats.gmean(both))
+            assert against.n == len(both) and against.value == pytest.approx(scipy.stats.gmean(both))
     for section in conclude(rows).sections:
         part = wide.xs(section.name, level="formulation")
         known, n = part.notna(), len(section.found.data)

@@ -265,7 +265,7 @@ def test_a_standing_counts_what_it_says():
     assert b.penalised == pytest.approx(expected) and b.failures == {"failed": 1}
     rows = [{**row, "time_limit": None} for row in table_of(times)]
     assert conclude(rows).overall.standing("b").penalised == np.inf  # a failure of unknown cost is not left out
-    assert a.share == 1.0 and b.against is not None and b.against.n == 5
+    assert a.share == 1.0 and verdict.overall.choice.against["b"].n == 5
 
 
 @pytest.mark.parametrize("problems", [6, 12, 60])

@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from optid.data.reduction import available_cores
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.execution import running, workers
 from optid.studies.execution.cell import run_cell
@@ -137,7 +138,7 @@ def main() -> None:
     """Print both parts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cells", type=int, default=200)
-    parser.add_argument("--workers", type=int, default=workers.cores())
+    parser.add_argument("--workers", type=int, default=available_cores(None))
     parser.add_argument("--seconds", type=float, default=0.2, help="length of a cell of the second part")
     parser.add_argument("--cpu", action="store_true", help="the first part in CPU time, for a machine that is busy")
     arguments = parser.parse_args()

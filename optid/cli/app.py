@@ -1,19 +1,20 @@
-"""The command line: all commands, and the lists of what there is to choose from."""
+"""The command line: all commands."""
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from optid.cli.bench import workbench
 from optid.cli.comparing import compare
-from optid.cli.derived import ComparingCommand, FittingCommand
+from optid.cli.derived import FittingCommand
 from optid.cli.designing import design, order
 from optid.cli.faults import diagnose, isolability, reformulate
 from optid.cli.fitting import fit, identify, validate
+from optid.cli.listings import constraints, examples, formulations, solvers
 from optid.cli.monitoring import monitor
 from optid.cli.options import register
 from optid.cli.studies import study
-from optid.cli.terminal import Command, Group, Waiting, output, say
+from optid.cli.terminal import Command, Group, say
 
 app = typer.Typer(
     cls=Group,
@@ -42,49 +43,7 @@ def main(
     """Identify Hammerstein systems by optimisation with constraints, with a proof of global optimality."""
 
 
-def solvers() -> None:
-    """List every back end: what it accepts and whether it is installed."""
-    from optid.cli import listings
-
-    with Waiting() as waiting:
-        waiting.step("asking the back ends")
-        found = listings.solvers()
-    _show(found)
-
-
-def formulations() -> None:
-    """List the formulations, their arguments and the variables that constraints may use."""
-    from optid.cli import listings
-
-    with Waiting() as waiting:
-        waiting.step("loading the formulations")
-        found = listings.formulations()
-    _show(found)
-
-
-def constraints() -> None:
-    """List the constraints by the words the command line takes."""
-    from optid.cli import listings
-
-    _show(listings.constraints())
-
-
-def examples() -> None:
-    """List the built-in records."""
-    from optid.cli import listings
-
-    _show(listings.examples())
-
-
-def _show(tables: list[Any]) -> None:
-    for part in tables:
-        output().print(part)
-
-
-register(app, fit, FittingCommand)
-for function in (validate, solvers, formulations, constraints, examples, identify):
-    register(app, function, Command)
-register(app, compare, ComparingCommand)
-for function in (design, diagnose, isolability, monitor, reformulate, order, workbench):
-    register(app, function, Command)
+for function in (fit, validate, solvers, formulations, constraints, examples, identify, compare, design, diagnose,
+                 isolability, monitor, reformulate, order, workbench):
+    register(app, function, FittingCommand if function in (fit, compare) else Command)
 app.add_typer(study, name="study")

@@ -11,9 +11,8 @@ from optid.data.streams import Stream
 from optid.errors import DataError, StructureError
 
 
-def read_record(
-    files: Sequence[Path | str], how: Mapping[str, Any], *, stream: bool = False, scheduler: str | None = None
-) -> Data | Stream:
+def read_record(files: Sequence[Path | str], how: Mapping[str, Any], *, stream: bool = False,
+                scheduler: str | None = None) -> Data | Stream:
     """Read the files of a record, one experiment each.
 
     Args:
@@ -46,10 +45,8 @@ def reading(how: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def record(
-    files: Sequence[Path | str] | None, how: Mapping[str, Any], example: str | None, seed: int,
-    *, asked: str = "a data file", **reading: Any,
-) -> tuple[Any, dict[str, Any]]:
+def record(files: Sequence[Path | str] | None, how: Mapping[str, Any], example: str | None, seed: int, *,
+           asked: str = "a data file", **reading: Any) -> tuple[Any, dict[str, Any]]:
     """Return the record of files, or a built-in one with the arguments of a fit that it suggests.
 
     Args:
@@ -111,10 +108,8 @@ def state_space_model(path: Path) -> Any:
 
     model = load(path)
     if model.kind != "HammersteinSS":
-        raise StructureError(
-            f"{path} is a {model.kind}: faults are judged with a state-space model that has noise covariances "
-            "(optid fit ... --formulation hammerstein_ss.asivid)."
-        )
+        raise StructureError(f"{path} is a {model.kind}: faults are judged with a state-space model that has noise "
+                             "covariances (optid fit ... --formulation hammerstein_ss.asivid).")
     return model
 
 
@@ -161,17 +156,6 @@ def listed(words: Sequence[str] | None) -> list[str] | None:
 def one_or_all(values: list[Any] | None) -> Any:
     """Return the single value of a list, the list itself when it has several, None for None."""
     return values[0] if values is not None and len(values) == 1 else values
-
-
-def whole_numbers(words: Sequence[str] | None, option: str) -> Any:
-    """Read one whole number or several; None stays None; a `StructureError` names the option and the word."""
-    found = []
-    for word in listed(words) or []:
-        try:
-            found.append(int(word))
-        except ValueError:
-            raise StructureError(f"{option} {word}: a whole number is needed, or one per input") from None
-    return one_or_all(found) if words is not None else None
 
 
 def numbers(words: Sequence[str] | None, option: str) -> list[float] | None:
@@ -237,8 +221,6 @@ def directions(words: Sequence[str] | None, option: str, model: Any = None) -> d
             found[name] = direction_of(model, change)
         elif len(change) != model.nx:
             word = next(word for word in words or () if word.partition("=")[0] == name)
-            raise StructureError(
-                f"{option} {word}: {len(change)} numbers for {model.nx} states. Give one per state, or say what it "
-                f"does to the outputs: {name}={model.outputs[0]}:-1"
-            )
+            raise StructureError(f"{option} {word}: {len(change)} numbers for {model.nx} states. Give one per state, "
+                                 f"or say what it does to the outputs: {name}={model.outputs[0]}:-1")
     return found

@@ -13,7 +13,7 @@ from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
 from optid.cli.results import check_folders, check_names, command_line
 from optid.cli.studies import NOTHING_SOLVED, Workers, follow_progress
-from optid.cli.terminal import new_table, note, output, say
+from optid.cli.terminal import note, print_table, say
 from optid.errors import LookupFailed
 from optid.lazy import import_cvxpy
 from optid.registry import formulation as look_up
@@ -22,12 +22,11 @@ ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
 """What a formulation is given that needs it, where nobody says: which solver is the question, not which order."""
 
 
-def compare(
-    data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
-    constraint: Words = None, settings: Words = None, solvers: Words = None, accuracy: float = 1e-8,
-    time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3, seed: int = 0,
-    db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None,
-) -> None:
+def compare(data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
+            constraint: Words = None, settings: Words = None, solvers: Words = None, accuracy: float = 1e-8,
+            time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3,
+            seed: int = 0, db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None
+            ) -> None:
     """Compare solvers on one record at equal verified accuracy, and say which to use.
 
     Example: optid compare data.csv --inputs u --outputs y --formulation hammerstein_arx.exact --na 2 --nb 2
@@ -137,26 +136,21 @@ def _show(found: Any, posed: str, record: str) -> None:
 
     absent = {name for name, back_end in back_ends().items() if not back_end.installed}
 
-    def clock(value: float) -> str:
-        return "-" if value != value else seconds(value)
-
     def small(value: float) -> str:
         return "-" if value != value else f"{value:.0e}"
 
-    table = new_table(f"{posed} on {record}, accuracy {found.accuracy:.0e}", padding=(0, 0, 0, 1))
-    table.add_column("solver", no_wrap=True)
-    table.add_column("verified", min_width=8, overflow="fold")
-    for column in ("excess", "residual", "cold", "warm", "1-step", "simul."):
-        table.add_column(column, justify="right", no_wrap=True)
+    table = []
     for line in found.lines:
         good = line.state == SOLVED
         word = "local" if line.status == "locally optimal" else line.status
-        table.add_row(
+        table.append((
             Text(line.solver, "bold" if good else "dim"),
             Text(word if good else line.state, "green" if line.proved else "yellow"),
-            "0" if abs(line.above) < 1e-12 else small(line.above), small(line.residual), clock(line.cold),
-            clock(line.warm), number(line.one_step, 4), number(line.simulation, 4))
-    output().print(table)
+            "0" if abs(line.above) < 1e-12 else small(line.above), small(line.residual), seconds(line.cold),
+            seconds(line.warm), number(line.one_step, 4), number(line.simulation, 4)))
+    print_table(f"{posed} on {record}, accuracy {found.accuracy:.0e}",
+                ("solver", "verified", "excess", "residual", "cold", "warm", "1-step", "simul."), table,
+                firm=(0, *range(2, 8)), right=range(2, 8), padding=(0, 0, 0, 1))
     for reason, solvers in found.reasons.items():
         say(Text(f"{listed(solvers, most=20)}: {reason}", "dim"))
     unfit = []

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 
 from optid.cli.options import descriptions, option_of
-from optid.cli.terminal import Command
+from optid.cli.terminal import Command, complain, exit_code
 from optid.descriptions import describe
 from optid.errors import LookupFailed
 from optid.registry import FORMULATIONS, entry_point
@@ -20,33 +20,34 @@ DEFAULT = "hammerstein_arx.exact"
 class FittingCommand(Command):
     """A command that takes the arguments of the formulation named by ``--formulation`` as options."""
 
-    spelled_out = DEFAULT
-
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse, after the options of the formulation have joined those of the command."""
         self.params = [p for p in self.params if not getattr(p, "derived", False)]
         name = chosen(args)
+        try:
+            entry_point(FORMULATIONS, name)
+        except LookupFailed as error:
+            raise _refused(error) from None
+        self.params += derived_options(name, {word for p in self.params for word in p.opts})
         if "--help" in args and not any(word.partition("=")[0] in ("--formulation", "-f") for word in args):
             self.params += options_of_others({word for p in self.params for word in p.opts})
-        if name != self.spelled_out:  # whose arguments all have options of their own: nothing need be loaded
-            self.params += derived_options(name, {word for p in self.params for word in p.opts})
         try:
             rest = super().parse_args(ctx, args)
         except Exception as error:
             option = getattr(error, "option_name", None)
             if type(error).__name__ != "NoSuchOption" or not option or not option.startswith("--"):
                 raise
-            raise typer.BadParameter(unknown(name, option)) from None
+            raise _refused(LookupFailed(unknown(name, option))) from None
         values = {p.name: ctx.params.pop(p.name) for p in self.params if getattr(p, "derived", False) and p.name}
         words = [f"{key}={_json(value)}" for key, value in values.items() if value not in (None, (), [])]
         ctx.params["settings"] = [*words, *(ctx.params.get("settings") or ())] or None
         return rest
 
 
-class ComparingCommand(FittingCommand):
-    """Every argument of the formulation is an option derived from it."""
-
-    spelled_out = ""
+def _refused(error: LookupFailed) -> typer.Exit:
+    """Print what is wrong before the command begins, and return what ends it."""
+    complain(error)
+    return typer.Exit(exit_code(error))
 
 
 def chosen(args: Sequence[str]) -> str:
@@ -64,13 +65,10 @@ def derived_options(name: str, taken: set[str]) -> list[Any]:
     """Return one option for every argument of a formulation that the command has no option for.
 
     Args:
-        name: of the formulation; an unknown one has no options, the fit will say so.
+        name: of the formulation.
         taken: option words of the command.
     """
-    try:
-        found = describe(entry_point(FORMULATIONS, name))
-    except LookupFailed:
-        return []
+    found = describe(entry_point(FORMULATIONS, name))
     about, parameters = found.arguments(), []
     for key, parameter in found.options.items():
         if option_of(key) in taken or key == "constraints":
@@ -127,10 +125,7 @@ def unknown(name: str, option: str) -> str:
     """Say that a formulation has no such option, what it has, and which formulations have it."""
     key = option.removeprefix("--").partition("=")[0].replace("-", "_")
     having = [other for other, found in descriptions() if key in found.options]
-    try:
-        takes = " ".join(option_of(k) for k in describe(entry_point(FORMULATIONS, name)).options if k != "constraints")
-    except LookupFailed as error:
-        return f"there is no option {option}, and {error}"
+    takes = " ".join(option_of(k) for k in describe(entry_point(FORMULATIONS, name)).options if k != "constraints")
     others = f" Formulations that do: {', '.join(having)}." if having else ""
     return f"formulation {name} takes no {option}; its own options are {takes}.{others}"
 

@@ -6,12 +6,11 @@ from optid.cli.options import File, Paths, Words
 from optid.cli.results import working
 
 
-def design(
-    like: Words = None, example: str | None = None, *, how: dict[str, Any], kind: str = "multisine",
-    samples: int | None = None, levels: int | None = None, band: list[float] | None = None,
-    amplitude: list[float] | None = None, shaped: bool = False, hold: int = 5, periods: int = 1, candidates: int = 8,
-    seed: int = 0, basis: Words = None, feedback_basis: Words = None, rows: int = 10, output: File = None,
-) -> None:
+def design(like: Words = None, example: str | None = None, *, how: dict[str, Any], kind: str = "multisine",
+           samples: int | None = None, levels: int | None = None, band: list[float] | None = None,
+           amplitude: list[float] | None = None, shaped: bool = False, hold: int = 5, periods: int = 1,
+           candidates: int = 8, seed: int = 0, basis: Words = None, feedback_basis: Words = None, rows: int = 10,
+           output: File = None) -> None:
     """Design an excitation for the plant of a record, with a promise about the expanded regressor.
 
     Example: optid design --like data.csv --inputs u --outputs y --kind multisine --levels 12 -o excitation.csv
@@ -59,11 +58,9 @@ def design(
         work.text = str(found)
 
 
-def order(
-    data: Paths = None, example: str | None = None, *, how: dict[str, Any], basis: Words = None,
-    feedback_basis: Words = None, block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6,
-    nk: int = 8, holdout: float = 0.3, level: float | None = None, seed: int = 0, picture: File = None,
-) -> None:
+def order(data: Paths = None, example: str | None = None, *, how: dict[str, Any], basis: Words = None,
+          feedback_basis: Words = None, block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6,
+          nk: int = 8, holdout: float = 0.3, level: float | None = None, seed: int = 0, picture: File = None) -> None:
     """Find the order of a record: singular values, thresholds, criteria, a recommendation with its reasons.
 
     Example: optid order data.csv --inputs u1 u2 --outputs y1 y2 --picture order.png

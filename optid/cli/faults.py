@@ -9,11 +9,9 @@ from optid.cli.results import command_line, working
 ZERO = "INPUT=VALUE, the input at which the actuator does nothing"
 
 
-def isolability(
-    model: Path, window: int = 100, onset: str = "unknown", prob: float = 0.95, false_alarm: float = 0.01,
-    kinds: Words = None, load: Words = None, disturbance: Words = None, state_jump: bool = True, draws: int = 1000,
-    seed: int = 0, picture: File = None,
-) -> None:
+def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: float = 0.95, false_alarm: float = 0.01,
+                kinds: Words = None, load: Words = None, disturbance: Words = None, state_jump: bool = True,
+                draws: int = 1000, seed: int = 0, picture: File = None) -> None:
     """Find how large every fault must be to be noticed, and to be told from the others; no data are needed.
 
     Example: optid isolability model.json --window 100 --load pump=0.5,-0.3,0.4,0.2 --picture isolability.png
@@ -47,13 +45,11 @@ def isolability(
         work.text = str(study)
 
 
-def diagnose(
-    model: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any], healthy: Paths = None,
-    identified: Paths = None, rescale: bool = False, kinds: Words = None, load: Words = None,
-    disturbance: Words = None, zero: Words = None, state_jump: bool = True, max_faults: int = 1,
-    false_alarm: float = 0.01, coverage: float = 0.95, robust: bool = False, method: str = "exact",
-    solver: str = "auto", seed: int = 0, out: File = None, report: File = None, picture: File = None,
-) -> None:
+def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any], healthy: Paths = None,
+             identified: Paths = None, rescale: bool = False, kinds: Words = None, load: Words = None,
+             disturbance: Words = None, zero: Words = None, state_jump: bool = True, max_faults: int = 1,
+             false_alarm: float = 0.01, coverage: float = 0.95, robust: bool = False, method: str = "exact",
+             solver: str = "auto", seed: int = 0, out: File = None, report: File = None, picture: File = None) -> None:
     """Find out whether a record is healthy, and if not, what broke, when, and how much of it.
 
     Example: optid diagnose model.json faulty.csv --max-faults 2 --out d.json --report d.html
@@ -89,10 +85,8 @@ def diagnose(
         how = words.as_modelled(how, plant)
         record: Any = words.record(data, how, example, seed)[0]
         if record.n_experiments > 1:
-            raise DataError(
-                f"{record.n_experiments} experiments: diagnose one record at a time (give one file, and cut it to the "
-                "experiment)."
-            )
+            raise DataError(f"{record.n_experiments} experiments: diagnose one record at a time (give one file, and "
+                            "cut it to the experiment).")
         sound: Any = words.read_record(healthy, how) if healthy else None
         origin = _origin(identified, how)
         work.step("signatures")
@@ -141,12 +135,10 @@ def _origin(identified: list[Path] | None, how: dict[str, Any]) -> Any:
     return words.read_record(identified, how)
 
 
-def reformulate(
-    model: Path, diagnosis: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any],
-    constraint: Words = None, stage: str = "auto", nodes: int = 7, low: Words = None, high: Words = None,
-    target: Words = None, if_ambiguous: str = "auto", solver: str = "auto", seed: int = 0, saved: File = None,
-    report: File = None, picture: File = None,
-) -> None:
+def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any],
+                constraint: Words = None, stage: str = "auto", nodes: int = 7, low: Words = None, high: Words = None,
+                target: Words = None, if_ambiguous: str = "auto", solver: str = "auto", seed: int = 0,
+                saved: File = None, report: File = None, picture: File = None) -> None:
     """Turn a healthy model and a diagnosis into the damaged system: its model, what observes it, what it can still do.
 
     Example: optid reformulate model.json d.json faulty.csv --model damaged.json --report r.html

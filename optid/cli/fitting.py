@@ -6,21 +6,17 @@ from typing import Any
 
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import Work, check_names, command_line, working
+from optid.cli.results import Work, check_names, working
 from optid.lazy import import_cvxpy
 
 BUDGET = 60.0
 
 
-def fit(
-    data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
-    scheduler: str | None = None, split: float | None = None, test: Words = None, formulation: str = DEFAULT,
-    na: int | None = None, nb: Words = None, nk: Words = None, basis: Words = None, constraint: Words = None,
-    loss: str | None = None, ridge: float | None = None, curvature: float | None = None, holdout: str | None = None,
-    gauge: str | None = None, settings: Words = None, solver: str = "auto", accuracy: float = 1e-8,
-    time_limit: float | None = None, prove: bool = True, option: Words = None, seed: int = 0, report: File = None,
-    saved: File = None,
-) -> None:
+def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
+        scheduler: str | None = None, split: float | None = None, test: Words = None, formulation: str = DEFAULT,
+        constraint: Words = None, holdout: str | None = None, settings: Words = None, solver: str = "auto",
+        accuracy: float = 1e-8, time_limit: float | None = None, prove: bool = True, option: Words = None,
+        seed: int = 0, report: File = None, saved: File = None) -> None:
     """Fit a model to a record, prove it optimal, and report it; without orders, search for them as optid identify does.
 
     Example: optid fit data.csv --inputs u --outputs y --dt 0.1 --na 2 --nb 2 --basis triangular:10
@@ -31,18 +27,9 @@ def fit(
         scheduler (ADDRESS): Let a Dask cluster (tcp://host:8786) read the row groups of Parquet files or folders.
         split (SHARE): Fit on this share, validate on the rest, e.g. 0.7.
     The model:
-        na: Number of past outputs in A.
-        nb (N...): Coefficients of B, one number or one per input.
-        nk (N...): Delay in samples, one number or one per input.
-        basis (NAME:SIZE...): Basis of the nonlinearity, one or one per input, e.g. triangular:10, polynomial:4,
-            trigonometric:5, bspline:8.
         constraint (-c NAME:VALUE...): e.g. monotone:increasing; see optid constraints. 'none' drops those an example
             suggests.
-        loss: squares, huber, huber:1.5 or l1.
-        ridge: Weight of the size of Theta.
-        curvature: Weight of the curvature of f.
         holdout (PENALTY): Choose the weight of ridge, curvature or weight (nuclear norm) by hold-out.
-        gauge: Scale between f and B: norm, gain or b0.
         settings (--set KEY=VALUE...): Any other argument of the formulation.
     The solver:
         accuracy: Relative, for any solver.
@@ -51,7 +38,7 @@ def fit(
         option (KEY=VALUE...): Native options of the solver.
     """
     check_names(constraint, solver, formulation)
-    asked = (na, nb, nk, basis, loss, ridge, curvature, holdout, gauge, settings, option, time_limit, scheduler)
+    asked = (holdout, settings, option, time_limit, scheduler)
     if data and formulation == DEFAULT and not stream and all(word is None for word in asked):
         _search(data, example, how, seed, split, test, constraint, solver, saved, report, accuracy=accuracy)
         return
@@ -65,12 +52,7 @@ def fit(
         from optid.show.printing import describe
 
         arguments = words.suited(suggestion, formulation) if suggestion else {}
-        given = {
-            "na": na, "nb": words.whole_numbers(nb, "--nb"), "nk": words.whole_numbers(nk, "--nk"),
-            "basis": words.one_or_all(words.listed(basis)), "constraints": constraint, "loss": loss, "ridge": ridge,
-            "curvature": curvature, "gauge": gauge,
-        }
-        arguments |= {key: value for key, value in given.items() if value is not None} | words.pairs(settings, "--set")
+        arguments |= words.pairs(settings, "--set") | ({"constraints": constraint} if constraint else {})
         if arguments.get("constraints") == ["none"]:
             del arguments["constraints"]
         record, held_out = words.held_out(record, split, test, how)
@@ -85,19 +67,13 @@ def fit(
             work.step("looking for what would help")
             work.text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
         _finish(work, found, held_out, saved, None if stream or scheduler else data, how)
-        if report is not None:
-            from optid.show.report import write
-
-            work.step("writing the report")
-            write(found, report, held_out, command=command_line())
+        work.page(found, report, held_out)
 
 
-def identify(
-    data: Paths = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
-    horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
-    workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0, report: File = None,
-    saved: File = None,
-) -> None:
+def identify(data: Paths = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
+             horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
+             workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0,
+             report: File = None, saved: File = None) -> None:
     """Find the structure of a record by cross-validation, and fit it: formulation, delay, orders, functions.
 
     Example: optid identify data.csv --inputs u --outputs y --dt 0.1 --report report.html
@@ -117,10 +93,8 @@ def identify(
             workers=workers, **({"classes": classes} if classes else {}))
 
 
-def _search(
-    data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
-    constraint: Words, solver: str, saved: File, report: File, **settings: Any,
-) -> None:
+def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
+            constraint: Words, solver: str, saved: File, report: File, **settings: Any) -> None:
     check_names(constraint, solver)
     with working(model=saved, report=report) as work:
         from optid.cli import arguments as words
@@ -133,16 +107,11 @@ def _search(
         found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
         work.text = str(found)
         _finish(work, found, held_out, saved, data, how, "search")
-        if report is not None:
-            from optid.show.report import write_search
-
-            work.step("writing the report")
-            write_search(found, report, held_out, command=command_line())
+        work.page(found, report, held_out)
 
 
-def _finish(
-    work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any], what: str = "fit"
-) -> None:
+def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
+            what: str = "fit") -> None:
     """Validate on what was held out, and write the model, with the place of a record that it is from as a whole."""
     from optid.cli.arguments import listed
 
@@ -186,8 +155,4 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
             work.text = str(found)
         else:
             work.text = f"{first}\n\n{found.validations[0] if compared else check(first, record, horizon=horizon)}"
-        if report is not None:
-            from optid.show.report import write_comparison
-
-            work.step("writing the report")
-            write_comparison(found, report, command=command_line())
+        work.page(found, report)

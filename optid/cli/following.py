@@ -10,14 +10,9 @@ from typing import Any
 
 from optid.cli.terminal import note
 
-POLL = 0.1
-"""Seconds between looks at a file that is followed."""
-
-BLOCK = 1 << 16
-"""Bytes read at a time."""
-
-MARK = 256
-"""Bytes before the place reached by which a file is known again."""
+POLL = 0.1  # seconds between looks at a file that is followed
+BLOCK = 1 << 16  # bytes read at a time
+MARK = 256  # bytes before the place reached by which a file is known again
 
 
 def standard_input() -> Iterator[tuple[list[bytes], str]]:

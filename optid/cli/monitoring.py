@@ -11,24 +11,20 @@ from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
 
-LOUD = 20
-"""Rows that cannot be read that are named for each block read; the others are counted."""
+LOUD = 20  # rows that cannot be read that are named for each block read; the others are counted
 
 ARL0 = 10_000
 """Mean samples between false alarms that are asked for where nothing is said."""
 
-KEPT = 10_000
-"""Samples after which the state is saved, events or not."""
+KEPT = 10_000  # samples after which the state is saved, events or not
 
 
-def monitor(
-    model: Path, follow: File = None, until_end: bool = False, inputs: Words = None, outputs: Words = None,
-    dt: float | None = None, time: str | None = None, columns: Words = None, delimiter: str = ",", decimal: str = ".",
-    fill_gaps: int | None = None, strict: bool = False, kinds: Words = None, load: Words = None,
-    state_jump: bool = True, arl0: float | None = None, window: int = 100, identified: Paths = None,
-    healthy: Paths = None, thresholds: File = None, extrapolate: bool = False, seed: int = 0, state: File = None,
-    lines: bool = False,
-) -> None:
+def monitor(model: Path, follow: File = None, until_end: bool = False, inputs: Words = None, outputs: Words = None,
+            dt: float | None = None, time: str | None = None, columns: Words = None, delimiter: str = ",",
+            decimal: str = ".", fill_gaps: int | None = None, strict: bool = False, kinds: Words = None,
+            load: Words = None, state_jump: bool = True, arl0: float | None = None, window: int = 100,
+            identified: Paths = None, healthy: Paths = None, thresholds: File = None, extrapolate: bool = False,
+            seed: int = 0, state: File = None, lines: bool = False) -> None:
     """Watch a stream: one line for every alarm, every fault that is named, and everything that is over.
 
     Rows that cannot be read are named on the error stream and count as missing samples. A file that is rotated, cut or
@@ -119,9 +115,8 @@ def _doubt(plant: Any, origin: Any) -> None:
              "later healthy record: --healthy FILE...")
 
 
-def _new(
-    plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | None, arl0: float | None, **how: Any
-) -> Any:
+def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | None, arl0: float | None, **how: Any
+         ) -> Any:
     from optid.errors import ModelFileError, StructureError
     from optid.faults import Calibration, Monitor, dictionary
     from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
@@ -133,10 +128,8 @@ def _new(
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ModelFileError(f"{path} does not hold thresholds ({error}): name another file") from None
         if arl0 is not None and arl0 != known.arl0:
-            raise StructureError(
-                f"{path} holds thresholds for a false alarm every {known.arl0:g} samples, --arl0 asks for {arl0:g}: "
-                "leave --arl0 out, or name another file"
-            )
+            raise StructureError(f"{path} holds thresholds for a false alarm every {known.arl0:g} samples, --arl0 asks "
+                                 f"for {arl0:g}: leave --arl0 out, or name another file")
         return Monitor(plant, found, thresholds=known, **how)
     made = Monitor(plant, found, ARL0 if arl0 is None else arl0, **how)
     if path is not None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from optid.cli.terminal import Waiting, coloured, hearing, note, say
 from optid.errors import DataError
-from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point
+from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, render
 
 
 def check_names(constraints: Iterable[str] | None, solver: str = "auto", formulation: str | None = None) -> None:
@@ -71,6 +71,12 @@ class Work(Waiting):
                 figure().savefig(path, dpi=150)
             except ValueError as error:
                 raise DataError(f"{path}: {error}") from None
+
+    def page(self, result: Any, path: Path | None, *more: Any) -> None:
+        """Write the page of a result where one was asked for; more arguments are those of its renderer."""
+        if path is not None:
+            self.step("writing the report")
+            render(result, "page", path, *more, command=command_line())
 
 
 @contextmanager

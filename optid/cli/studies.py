@@ -10,9 +10,10 @@ import typer
 from rich.text import Text
 from typer.core import TyperGroup
 
+from optid.cli.listings import systems
 from optid.cli.options import File, Words, register
 from optid.cli.results import check_folders, command_line
-from optid.cli.terminal import Command, SafeConsole, output, say
+from optid.cli.terminal import Command, SafeConsole, say
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
                     help="Compare formulations and solvers on your data: run a study, report it, export its rows.")
@@ -26,11 +27,9 @@ Workers = Annotated[
 ]
 
 
-def run(
-    file: File = None, example: bool = False, db: File = None, workers: Workers = None,
-    scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
-    dry_run: bool = False,
-) -> None:
+def run(file: File = None, example: bool = False, db: File = None, workers: Workers = None,
+        scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
+        dry_run: bool = False) -> None:
     """Run a study, or what is left of it; stop it whenever you like, the same command goes on.
 
     Example: optid study run study.toml --db study.sqlite
@@ -46,14 +45,13 @@ def run(
         dry_run: Say what would be run, and run nothing.
     """
     from optid.errors import StudyError
-    from optid.studies.definition.built_in import example_study
     from optid.studies.definition.description import Study
     from optid.studies.execution import running
     from optid.studies.storage import export as exporting
 
     if (file is None) != example:
         raise StudyError("give a study file, or --example for a built-in study" + (", not both" if example else ""))
-    described = example_study() if file is None else Study.from_toml(file)
+    described = Study.example() if file is None else Study.from_toml(file)
     db = db or Path(f"{file.stem if file is not None else 'example'}.sqlite")
     check_folders(db, export)
     if export is not None:
@@ -72,9 +70,8 @@ def run(
         raise typer.Exit(NOTHING_SOLVED)
 
 
-def report(
-    db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve",
-) -> None:
+def report(db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve"
+           ) -> None:
     """Print the verdict of a study, and write its page.
 
     Example: optid study report study.sqlite -o study.html
@@ -132,14 +129,6 @@ def problems(db: Path, out: Path, title: str | None = None) -> None:
     kinds = Counter(line["kind"] for line in lines)
     listed = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items())) or "none is convex"
     say(f"{len(lines)} problems written to {out} ({listed}); solve_problems.py there solves them without optid")
-
-
-def systems() -> None:
-    """List the simulated systems that a study file may name."""
-    from optid.cli import listings
-
-    for part in listings.systems():
-        output().print(part)
 
 
 def schema() -> None:
@@ -202,8 +191,9 @@ def _now(row: dict[str, Any] | None) -> str:
         return "cells"
     from rich.markup import escape
 
-    formulation, solver = (escape(text if len(text) <= 28 else text[:27] + "…")
-                           for text in (row["formulation"], row["solver"]))
+    from optid.show.wording import short
+
+    formulation, solver = (escape(short(row[name], 28)) for name in ("formulation", "solver"))
     return f"[dim]{formulation} · {solver}: {row['status_verified'] or row['outcome']}[/]"
 
 

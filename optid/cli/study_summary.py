@@ -8,33 +8,25 @@ from typing import Any
 import numpy as np
 from rich.text import Text
 
-from optid.cli.terminal import new_table, output, say
+from optid.cli.terminal import print_table, say
 from optid.program.solution import Status
 from optid.studies.storage.rows import DONE, REFUSED
 
-LISTED = 12
-"""Reasons that are printed; the page has them all."""
+LISTED = 12  # reasons that are printed; the page has them all
 
 
 def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
     """Print a table of how the cells ended, by solver; rows are {column: (rows,) array}."""
-    table = new_table(title)
-    table.add_column("solver", no_wrap=True)
-    for column in ("cells", "accuracy reached", "proved", "false claims", "refused"):
-        table.add_column(column, justify="right")
-    table.add_column("other outcomes", overflow="fold")
+    table = []
     for solver in sorted(set(rows["solver"])):
         mine = {key: values[rows["solver"] == solver] for key, values in rows.items()}
-        table.add_row(Text(solver, "bold"), *(f"{count:,}" if count else "-" for count in (
+        others = Counter(word for word in _failures(mine) if word and word != REFUSED)
+        table.append((Text(solver, "bold"), *(f"{count:,}" if count else "-" for count in (
             len(mine["key"]), int(mine["reached"].sum()), int(mine["proved"].sum()), int(mine["false_claim"].sum()),
-            int((mine["outcome"] == REFUSED).sum()))), _others(mine))
-    output().print(table)
-
-
-def _others(mine: Mapping[str, Any]) -> str:
-    """The outcomes, and the statuses of those that ended, that are neither a success nor a refusal."""
-    counts = Counter(word for word in _failures(mine) if word and word != REFUSED)
-    return ", ".join(f"{word} {count:,}" for word, count in counts.most_common()) or "-"
+            int((mine["outcome"] == REFUSED).sum()))),
+            ", ".join(f"{word} {count:,}" for word, count in others.most_common()) or "-"))
+    print_table(title, ("solver", "cells", "accuracy reached", "proved", "false claims", "refused", "other outcomes"),
+                table, right=range(1, 6))
 
 
 def _failures(rows: Mapping[str, Any]) -> list[str]:
@@ -72,13 +64,7 @@ def print_models(verdict: Any) -> None:
     from optid.studies.page import quality_table
 
     found = quality_table(verdict.quality)
-    table = new_table(found.title, padding=(0, 1, 0, 0))
-    for number, name in enumerate(found.head):
-        table.add_column(name, justify="left" if number < 2 else "right", overflow="fold",
-                         min_width=max(map(len, name.split())))
-    for row in found.rows:
-        table.add_row(*map(Text, row))
-    output().print(table)
+    print_table(found.title, found.head, found.rows, firm=(), right=range(2, len(found.head)), padding=(0, 1, 0, 0))
 
 
 def nothing_solved(rows: Mapping[str, Any]) -> bool:

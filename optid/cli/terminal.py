@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from threading import Timer
 from typing import Any, Self
@@ -17,11 +17,8 @@ from typer.core import TyperCommand, TyperGroup
 
 from optid.errors import DataWarning, InfeasibleError, OptidError, SolverFailed, SolverMissing, UnboundedError
 
-PATIENCE = 2.0
-"""Seconds of silence before progress is shown."""
-
-FILES = "FILE..."
-"""Metavar of options whose values are files."""
+PATIENCE = 2.0  # seconds of silence before progress is shown
+FILES = "FILE..."  # metavar of options whose values are files
 
 _FILE = re.compile(r".+\.(csv|tsv|txt|parquet|mat|npz|npy|json)", re.IGNORECASE)
 _NUMBER = re.compile(r"-[0-9.].*")
@@ -123,9 +120,19 @@ def say(text: str | Text) -> None:
     output().print(Text(text) if isinstance(text, str) else text, soft_wrap=True)
 
 
-def new_table(title: str, **settings: Any) -> Table:
-    """Return an empty table in the style of all commands."""
-    return Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False, **settings)
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str | Text]], footer: str = "", *,
+                firm: Collection[int] = (0,), right: Collection[int] = (), padding: Any = (0, 1)) -> None:
+    """Print a table, and what is said below; columns by number: `firm` are never broken, `right` hold numbers."""
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False,
+                  padding=padding)
+    for c, column in enumerate(columns):
+        table.add_column(column, overflow="fold", no_wrap=c in firm, justify="right" if c in right else "left",
+                         min_width=max(map(len, column.split())))
+    for row in rows:
+        table.add_row(*(Text(cell) if isinstance(cell, str) else cell for cell in row))
+    output().print(table)
+    if footer:
+        output().print(Text(footer, "dim"))
 
 
 def coloured(text: str) -> Text:

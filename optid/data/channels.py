@@ -9,8 +9,7 @@ import numpy as np
 
 from optid.errors import DataError
 
-MOST_LEVELS = 1000
-"""Counting of distinct values stops here: above it a channel counts as continuous."""
+MOST_LEVELS = 1000  # counting of distinct values stops here: above it a channel counts as continuous
 
 
 class Ports:

@@ -11,14 +11,9 @@ from urllib.parse import urlsplit
 
 from optid.errors import ClusterError
 
-REACH = 3.0
-"""Seconds to reach the machine of a scheduler."""
-
-ANSWER = 10.0
-"""Seconds a scheduler has to answer once its machine is reached; one with much to do takes some."""
-
-LOOKS = 3
-"""Times that versions are compared before a difference counts: source files may be edited while workers look."""
+REACH = 3.0  # seconds to reach the machine of a scheduler
+ANSWER = 10.0  # seconds a scheduler has to answer once its machine is reached; one with much to do takes some
+LOOKS = 3  # times that versions are compared before a difference counts: source files may be edited while workers look
 
 NO_SCHEDULER = (
     "what answers at {} is no Dask scheduler, or one of another version. Is this the port of the scheduler (8786 by "
@@ -190,11 +185,9 @@ def result_of(client: Any, task: Any) -> Any:
             future.release()
     except KilledWorker as error:
         count = error.allowed_failures + 1
-        raise ClusterError(
-            f"{count} worker{'s' * (count > 1)} died over the same task, the last at {error.last_worker.address}. Most "
-            "often memory ran out: give workers more, or open the record with a smaller chunk or smaller partitions."
-        ) from error
+        raise ClusterError(f"{count} worker{'s' * (count > 1)} died over the same task, the last at "
+                           f"{error.last_worker.address}. Most often memory ran out: give workers more, or open the "
+                           "record with a smaller chunk or smaller partitions.") from error
     except (CancelledError, CommClosedError) as error:
-        raise ClusterError(
-            f"the scheduler went away while it was waited for ({type(error).__name__}: {error})."
-        ) from error
+        raise ClusterError(f"the scheduler went away while it was waited for ({type(error).__name__}: "
+                           f"{error}).") from error

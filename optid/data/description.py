@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from optid.data.channels import MOST_LEVELS, Channel
 
+MOST_EXPERIMENTS = 10  # that are listed
+
 
 @dataclass(frozen=True, repr=False)
 class Description:
@@ -25,7 +27,9 @@ class Description:
 
     def __str__(self) -> str:
         lines = [f"{self.name or 'Record'}: {sum(self.lengths)} samples every {self.dt:g}"]
-        for k, (samples, start) in enumerate(zip(self.lengths, self.starts)):
+        if len(self.lengths) > MOST_EXPERIMENTS:
+            lines.append(f"  {len(self.lengths)} experiments of {min(self.lengths)} to {max(self.lengths)} samples")
+        for k, (samples, start) in enumerate(zip(self.lengths, self.starts) if len(lines) < 2 else ()):
             label = f"experiment {k + 1}: {samples} samples " if len(self.lengths) > 1 else ""
             lines.append(f"  {label}from {start:.10g} to {start + (samples - 1) * self.dt:.10g}")
         table = [("channel", "role", "unit", "low", "high", "mean", "std", "levels", "missing")]

@@ -73,16 +73,12 @@ def decimate(data: Changed, q: int) -> Changed:
         return data
     for channel, share in data.missing.items():
         if share:
-            raise DataError(
-                f"channel {channel!r}: {share:.2%} of the samples are missing, and a filter would spread the gaps. "
-                "Cut the record around them with window, or fit at the original sampling time."
-            )
+            raise DataError(f"channel {channel!r}: {share:.2%} of the samples are missing, and a filter would spread "
+                            "the gaps. Cut the record around them with window, or fit at the original sampling time.")
     for k, e in enumerate(data.experiments):
         if e.n_samples <= 20 * q:
-            raise DataError(
-                f"experiment {k + 1} has {e.n_samples} samples, the anti-alias filter for q = {q} has "
-                f"{20 * q + 1} taps; use a smaller q."
-            )
+            raise DataError(f"experiment {k + 1} has {e.n_samples} samples, the anti-alias filter for q = {q} has "
+                            f"{20 * q + 1} taps; use a smaller q.")
     from scipy.signal import firwin, resample_poly
 
     taps = firwin(20 * q + 1, 1.0 / q, window="hamming")

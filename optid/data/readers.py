@@ -19,13 +19,11 @@ from optid.errors import DataError
 __all__ = ["Stream", "open_stream", "read"]
 
 
-def read(
-    source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None,
-    time: str | int | bool | None = None, experiment: str | int | None = None, *,
-    columns: Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
-    output_units: str | Sequence[str] | None = None, name: str | None = None, delimiter: str = ",", decimal: str = ".",
-    time_tolerance: float = TIME_TOLERANCE,
-) -> Data:
+def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None,
+         time: str | int | bool | None = None, experiment: str | int | None = None, *,
+         columns: Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
+         output_units: str | Sequence[str] | None = None, name: str | None = None, delimiter: str = ",",
+         decimal: str = ".", time_tolerance: float = TIME_TOLERANCE) -> Data:
     """Read a record; blank, NaN and NA cells are missing samples.
 
     Args:
@@ -87,9 +85,8 @@ class _Run(NamedTuple):
     stamps: np.ndarray | None
 
 
-def _runs(
-    table: Table, inputs: Wanted, outputs: Wanted, time: str | int | bool | None, experiment: str | int | None
-) -> list[_Run]:
+def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: str | int | bool | None, experiment: str | int | None
+          ) -> list[_Run]:
     label = table.label
     ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
     signals = [*ins.values(), *outs.values()]
@@ -147,8 +144,6 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
     labels = [keys[k] for k in starts]
     for k, value in enumerate(labels):
         if value in labels[:k]:
-            raise DataError(
-                f"{label}: experiment {value!r} starts again at row {starts[k] + 1}. Sort the rows by experiment, or "
-                "give the second run a value of its own."
-            )
+            raise DataError(f"{label}: experiment {value!r} starts again at row {starts[k] + 1}. Sort the rows by "
+                            "experiment, or give the second run a value of its own.")
     return [(value, slice(a, b)) for value, a, b in zip(labels, starts, [*starts[1:], rows])]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import as_samples, is_scalar_list
+from optid.arrays import as_records, frozen, one_or_all
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, listed, sampling_time
 from optid.data.description import Description
@@ -31,10 +31,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         if self.u.shape[0] != self.y.shape[0]:
-            raise DataError(
-                f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. "
-                "Cut both to the samples that were recorded together, or fill the lost ones with NaN."
-            )
+            raise DataError(f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. Cut both to the samples "
+                            "that were recorded together, or fill the lost ones with NaN.")
 
     @property
     def n_samples(self) -> int:
@@ -61,11 +59,10 @@ class Data(Ports):
     name: str
     transform: Transform = field(repr=False)
 
-    def __init__(
-        self, u: Any, y: Any, dt: float = 1.0, inputs: str | Sequence[str] | None = None,
-        outputs: str | Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
-        output_units: str | Sequence[str] | None = None, name: str = "", start: float | Sequence[float] = 0.0,
-    ) -> None:
+    def __init__(self, u: Any, y: Any, dt: float = 1.0, inputs: str | Sequence[str] | None = None,
+                 outputs: str | Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
+                 output_units: str | Sequence[str] | None = None, name: str = "", start: float | Sequence[float] = 0.0
+                 ) -> None:
         """Copy and check the record.
 
         Args:
@@ -86,8 +83,8 @@ class Data(Ports):
         Warns:
             DataWarning: integer samples that look saturated or wrapped around.
         """
-        us = _as_records(u, "u", listed(inputs))
-        ys = _as_records(y, "y", listed(outputs))
+        us = as_records(u, "u", listed(inputs))
+        ys = as_records(y, "y", listed(outputs))
         if len(us) != len(ys):
             raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
         starts = np.atleast_1d(np.asarray(start, dtype=float))
@@ -102,10 +99,8 @@ class Data(Ports):
         self._complete(experiments, dt, inputs, outputs, input_units, output_units, name)
 
     @classmethod
-    def of_experiments(
-        cls, experiments: Sequence[Experiment], dt: float, inputs: Sequence[str], outputs: Sequence[str],
-        input_units: Any = None, output_units: Any = None, name: str = "",
-    ) -> "Data":
+    def of_experiments(cls, experiments: Sequence[Experiment], dt: float, inputs: Sequence[str], outputs: Sequence[str],
+                       input_units: Any = None, output_units: Any = None, name: str = "") -> "Data":
         """Return data of experiments with checked samples, without a copy; arguments as of the class."""
         data = object.__new__(cls)
         data._complete(experiments, dt, inputs, outputs, input_units, output_units, name)
@@ -187,17 +182,12 @@ class Data(Ports):
 
     def __repr__(self) -> str:
         runs = f"{self.n_experiments} experiments, " if self.n_experiments > 1 else ""
-        title = f"Data {self.name!r}: " if self.name else "Data: "
-        lines = [f"{title}{runs}{self.n_samples} samples, dt = {self.dt:g}"]
-        labels = [f"{c.name} [{c.unit}]" if c.unit else c.name for c in self.channels]
-        width = max(map(len, labels))
-        for c, label in zip(self.channels, labels):
-            levels = f", {c.levels} levels" if c.levels <= 20 else ""
-            missing = f", {c.missing:.2%} missing" if c.missing else ""
-            lines.append(f"  {c.role:<6} {label:<{width}}  {c.low:.4g} to {c.high:.4g}{levels}{missing}")
-        if not self.transform.is_identity:
-            lines.append("  detrended or scaled; reports are in raw units")
-        return "\n".join(lines)
+        channels = f"{', '.join(self.inputs)} -> {', '.join(self.outputs)}"
+        return f"Data({self.name!r}: {runs}{self.n_samples} samples every {self.dt:g}, {channels})"
+
+    def __str__(self) -> str:
+        units = "" if self.transform.is_identity else "\n  detrended or scaled; reports are in raw units"
+        return f"{self.describe()}{units}"
 
     def describe(self) -> Description:
         """Return range, mean, distinct levels and missing samples of each channel, and how it is sampled."""
@@ -245,9 +235,7 @@ class Data(Ports):
         for k, e in enumerate(self.experiments):
             cut = int(at) if whole else round(float(at) * e.n_samples)
             if not 0 < cut < e.n_samples:
-                raise DataError(
-                    f"split at {at} leaves an empty part of experiment {k + 1}, which has {e.n_samples} samples."
-                )
+                raise DataError(f"split at {at} leaves an empty part of experiment {k + 1} of {e.n_samples} samples.")
             first.append(self._cut(e, 0, cut))
             second.append(self._cut(e, cut, e.n_samples))
         return self._with(experiments=tuple(first)), self._with(experiments=tuple(second))
@@ -281,16 +269,15 @@ class Data(Ports):
         whole = all(isinstance(end, int | np.integer) and not isinstance(end, bool) for end in ends)
         if not whole and not all(isinstance(end, float | np.floating) and end == end for end in ends):
             raise DataError(f"data[{part.start!r}:{part.stop!r}]: two integers are samples, two floats are times.")
-        kept = []
-        for e in self.experiments:
-            limits = part
-            if not whole:  # the first sample not before each time; 1e-6 of a step for the rounding of the times
-                places = [None if end is None else min(max((end - e.start) / self.dt - 1e-6, 0.0), e.n_samples)
-                          for end in (part.start, part.stop)]
-                limits = slice(*(None if place is None else int(np.ceil(place)) for place in places))
-            first, last, _ = limits.indices(e.n_samples)
-            if first < last:
-                kept.append(self._cut(e, first, last))
+
+        def sample(end: Any, e: Experiment) -> int | None:
+            """The first sample not before a time, with 1e-6 of a step for the rounding of the times."""
+            if end is None or whole:
+                return end
+            return int(np.ceil(min(max((end - e.start) / self.dt - 1e-6, 0.0), e.n_samples)))
+
+        spans = [slice(sample(part.start, e), sample(part.stop, e)).indices(e.n_samples) for e in self.experiments]
+        kept = [self._cut(e, first, last) for e, (first, last, _) in zip(self.experiments, spans) if first < last]
         if not kept:
             raise DataError(f"data[{part.start}:{part.stop}] holds no samples; there are "
                             f"{', '.join(str(e.n_samples) for e in self.experiments)} "
@@ -320,7 +307,7 @@ class Data(Ports):
         kept = [self.experiments[k] for k in picked]
         t = self.transform
         return self._with(
-            experiments=tuple(Experiment(_frozen(e.u[:, i]), _frozen(e.y[:, o]), e.start) for e in kept),
+            experiments=tuple(Experiment(frozen(e.u[:, i]), frozen(e.y[:, o]), e.start) for e in kept),
             inputs=_take(self.inputs, i), outputs=_take(self.outputs, o), input_units=_take(self.input_units, i),
             output_units=_take(self.output_units, o),
             transform=Transform(_take(t.u_scale, i), _take(t.u_offset, i), _take(t.y_scale, o), _take(t.y_offset, o)),
@@ -339,10 +326,8 @@ class Data(Ports):
         for k, part in enumerate(parts[1:], start=2):
             for what in ("inputs", "outputs", "input_units", "output_units"):
                 if getattr(part, what) != getattr(head, what):
-                    raise DataError(
-                        f"data set {k} has {what} {getattr(part, what)}, the first has {getattr(head, what)}; "
-                        "give them the same names and units, or use select."
-                    )
+                    raise DataError(f"data set {k} has {what} {getattr(part, what)}, the first has "
+                                    f"{getattr(head, what)}; give them the same names and units, or use select.")
             if abs(part.dt - head.dt) > 1e-9 * head.dt:
                 raise DataError(f"data set {k} has dt {part.dt:g}, the first has {head.dt:g}; decimate the faster one.")
             if part.transform != head.transform:
@@ -355,9 +340,7 @@ class Data(Ports):
 
     def raw(self) -> "Data":
         """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""
-        return self.mapped(
-            self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l)
-        )
+        return self.mapped(self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l))
 
     def without_transform(self) -> "Data":
         """Return the same samples without the way back to raw units."""
@@ -368,7 +351,7 @@ class Data(Ports):
 
         The functions must not change their arguments.
         """
-        experiments = tuple(Experiment(_frozen(of_u(e.u)), _frozen(of_y(e.y)), e.start) for e in self.experiments)
+        experiments = tuple(Experiment(frozen(of_u(e.u)), frozen(of_y(e.y)), e.start) for e in self.experiments)
         return self._with(experiments=experiments, **changes)
 
     def _cut(self, e: Experiment, first: int, last: int) -> Experiment:
@@ -382,22 +365,6 @@ def _filled(data: Data, **values: Any) -> Data:
     for name, value in values.items():
         object.__setattr__(data, name, value)
     return data
-
-
-def _frozen(array: np.ndarray) -> np.ndarray:
-    array = np.ascontiguousarray(array)
-    array.flags.writeable = False
-    return array
-
-
-def _as_records(values: Any, what: str, names: Sequence[str] | None) -> list[np.ndarray]:
-    if is_scalar_list(values):
-        return [as_samples(values, what, names)]
-    records = [as_samples(item, f"{what} of experiment {k + 1}", names) for k, item in enumerate(values)]
-    widths = {r.shape[1] for r in records}
-    if len(widths) > 1:
-        raise DataError(f"{what}: the experiments have {sorted(widths)} channels; each needs the same channels.")
-    return records
 
 
 def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what: str) -> list[int]:
@@ -421,13 +388,3 @@ def not_a_record(data: Any, what: str) -> str:
         return (f"{what} takes optid.Data, not {kind}: {what}(optid.read(df, inputs=[...], outputs=[...], dt=...)) for "
                 "a frame, dictionary or array df with one column a channel.")
     return f"{what} takes optid.Data (or a stream), not {kind}; use optid.read(df, ...) or optid.Data(u=, y=, dt=)."
-
-
-def one_or_all(arrays: list[np.ndarray]) -> Any:
-    """Return the array of the only experiment, or a tuple with one array for each."""
-    return arrays[0] if len(arrays) == 1 else tuple(arrays)
-
-
-def as_list(arrays: Any) -> list[np.ndarray]:
-    """Return one array for each experiment, from what `one_or_all` made of them."""
-    return list(arrays) if isinstance(arrays, tuple) else [arrays]

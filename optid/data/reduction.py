@@ -14,18 +14,18 @@ from typing import Any, TypeVar
 
 from optid.arrays import check_integer
 from optid.data.reading.parts import Part
+from optid.errors import OptidError, StructureError
 
 One = TypeVar("One")
 Result = TypeVar("Result")
 
-FAN_IN = 8
-"""Results that one task merges."""
+FAN_IN = 8  # results that one task merges
 
 
-def available_threads(threads: int | None) -> int:
-    """Return the number of threads asked for, a positive integer; None asks for one per core of this process."""
-    if threads is not None:
-        return check_integer(threads, "threads")
+def available_cores(number: int | None, name: str = "threads", error: type[OptidError] = StructureError) -> int:
+    """Return the number of threads or processes asked for, a positive integer; None asks for one per core."""
+    if number is not None:
+        return check_integer(number, name, error=error)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -14,11 +14,10 @@ from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surv
 from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
 from optid.data.reading.parts import Part
 from optid.data.reading.sources import Source, open_source
-from optid.data.reduction import available_threads, fetched, reduced
+from optid.data.reduction import available_cores, fetched, reduced
 from optid.errors import DataError
 
-CHUNK = 131072
-"""Samples read at a time: two channels of float64 fit into the second-level cache of a common processor."""
+CHUNK = 131072  # samples read at a time: two channels of float64 fit into the second-level cache of a common processor
 
 Result = TypeVar("Result")
 
@@ -140,7 +139,7 @@ class Stream(Ports):
         channels = replace(self._channels, units=None)
         if self.parts:
             found = reduced(self.parts, partial(_of_part, surveyed, channels), partial(joined, channels),
-                            self.scheduler, available_threads(None))
+                            self.scheduler, available_cores(None))
         else:
             whole = next(self._sources())
             found = surveyed(whole, channels.read(whole))
@@ -214,9 +213,8 @@ def open_stream(  # noqa: D417 - the others stand with `read`
     )
 
 
-def _chosen(
-    opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
-) -> tuple[dict[str, str], dict[str, str], str | None]:
+def _chosen(opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
+            ) -> tuple[dict[str, str], dict[str, str], str | None]:
     """Return {channel: column} of inputs and outputs and the clock, the same for all sources."""
     found = []
     for one in opened:

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, compact
-from optid.data.record import one_or_all
+from optid.arrays import Array, compact, one_or_all
 from optid.errors import DataError, StructureError
 from optid.faults.faults import ADDITIVE, Fault, channel_of, functions_of, matrices_of, place_of
 from optid.models.experiments import check_inputs, records_of, state_like

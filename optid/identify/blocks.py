@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array, check_integer
-from optid.data.record import Data, as_list
+from optid.arrays import Array, as_list, check_integer
+from optid.data.record import Data
 from optid.data.stretches import between_gaps
 from optid.errors import DataError, OptidError, RankError
 

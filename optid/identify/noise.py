@@ -26,7 +26,7 @@ from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.lazy import public_names
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import covariance_of, innovations_covariance, log_determinant, refined, whitened
+from optid.models.innovation_gain import covariance_of, log_determinant, refined, whitened
 from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.models.state_space import StateSpace
 from optid.statistics.coloured import long_autoregression, response_of
@@ -172,18 +172,19 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
 
     The observers are those of equal noise in all states and equal noise at all outputs.
     """
-    def measured(gain: Array) -> tuple[float, Array]:
-        return log_determinant(innovations_covariance(A, C, gain, rest)), gain
+    def measured(gain: Array) -> tuple[float, Array, list[Array]]:
+        errors = whitened(A, C, gain, rest)
+        return log_determinant(covariance_of(errors)), gain, errors
 
     observers: list[Array] = [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
         with suppress(StructureError):
             observers.append(observer_gain(A, C, ratio))
     found = sorted(map(measured, observers), key=itemgetter(0))
-    for _, gain in found[:TRIED]:
+    for _, gain, errors in found[:TRIED]:
         with suppress(StructureError, ValueError):  # too few in a row, or a zero on the unit circle
-            found.append(measured(whitening_gain(A, C, gain, whitened(A, C, gain, rest))))
-    return [gain for _, gain in sorted(found, key=itemgetter(0))]
+            found.append(measured(whitening_gain(A, C, gain, errors)))
+    return [gain for _, gain, _ in sorted(found, key=itemgetter(0))]
 
 
 def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.data.record import Data, one_or_all
+from optid.arrays import Array, one_or_all
+from optid.data.record import Data
 from optid.errors import DataError
 from optid.models import state_simulation as simulation
 from optid.models import text

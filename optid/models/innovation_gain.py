@@ -7,6 +7,7 @@ likelihood (Fisher scoring).
 """
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
@@ -142,10 +143,10 @@ def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
 def _parts(A: Array, C: Array, gain: Array, injection: Array | None = None) -> Parts:
     """A model x+ = A x + L y + K e, y = C x + e as the compiled recursions read it."""
     n, l = gain.shape  # noqa: E741
-    injected = np.zeros((n, l)) if injection is None else injection
+    injected = np.zeros((n, l)) if injection is None else compact(injection)
     none = [np.zeros(shape) for shape in ((n, 0), (l, 0), (n, 0), (n, 0), (l, 0), (0, n))]
-    matrices = A, none[0], C, none[1], none[2], injected, gain, *none[3:]
-    return Parts._make([*map(compact, matrices), np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
+    matrices = compact(A), none[0], compact(C), none[1], none[2], injected, compact(gain), *none[3:]
+    return Parts._make([*matrices, np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
 
 
 def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
@@ -221,8 +222,7 @@ def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array
     from optid.models.state_kernels import sensitivities
 
     (n, l), x, turn = parts.K.shape, x0.copy(), np.eye(parts.K.shape[0], parts.K.shape[0] + size)  # noqa: E741
-    columns = np.arange(n, n + size).reshape(-1, l)  # of the entries of K
-    direct = Direct.of(states=[(np.arange(len(columns))[:, None], columns, np.arange(l), 1.0)])
+    direct = _entries_of_gain(n, l, size)
     total, length = np.zeros((n + size + 1, n + size + 1)), max(64, NUMBERS // ((n + size + 1) * l))
     for first in range(0, len(r), length):
         y = r[first : first + length]
@@ -234,6 +234,13 @@ def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array
         rows = (root @ block).reshape(-1, n + size + 1)
         total += rows.T @ rows
     return total
+
+
+@cache
+def _entries_of_gain(n: int, l: int, size: int) -> Direct:  # noqa: E741
+    """Where the entries of K act on the states, counted from n on; of none with size 0."""
+    columns = np.arange(n, n + size).reshape(-1, l)
+    return Direct.of(states=[(np.arange(len(columns))[:, None], columns, np.arange(l), 1.0)])
 
 
 def _solved(matrix: Array, right: Array) -> Array:

@@ -10,9 +10,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, check_integer, one_of
+from optid.arrays import Array, as_list, check_integer, one_of, one_or_all
 from optid.data.channels import Ports, Transform, numbered_names
-from optid.data.record import Data, as_list, one_or_all
+from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import export, files, roots

@@ -45,15 +45,12 @@ def render(document: Document) -> str:
         shown.append(coded(chart))
         return len(shown) - 1
 
-    script = "\n".join((files("optid") / "show" / "templates" / name).read_text(encoding="utf-8") for name in SCRIPTS)
     sections = [(s, list(s.parts() if callable(s.parts) else s.parts)) for s in document.sections]
     names = {"trust": "Verdict", "optimum": "Solution"}
-    body = template("document.html.j2").render(
+    return template("document.html.j2").render(
         version=__version__, title=document.title, lead=document.lead, parts=sections, place=place,
-        breakable=_breakable, charts=lambda: embedded(shown), script=Markup(script),
-        digest=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        breakable=_breakable, charts=lambda: embedded(shown), **scripts(*SCRIPTS),
         sections=[(s.id, s.title or names.get(s.id, s.id)) for s, _ in sections])
-    return body
 
 
 def _breakable(equation: str) -> str:
@@ -91,6 +88,12 @@ def _numbers(values: np.ndarray, kind: str) -> Any:
         data = base64.b64encode(values.astype(kind).tobytes()).decode()
         return {"bytes" if kind == "<f4" else "wide": data}
     return [float(f"{v:.9g}") if np.isfinite(v) else None for v in values]
+
+
+def scripts(*names: str) -> dict[str, Any]:
+    """Return scripts of the package, and the digest by which the policy of a page admits them, for its template."""
+    text = "\n".join((files("optid") / "show" / "templates" / name).read_text(encoding="utf-8") for name in names)
+    return {"script": Markup(text), "digest": base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
 def embedded(payload: Any) -> Markup:

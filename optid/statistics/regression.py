@@ -14,7 +14,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.bases.basis import Basis
-from optid.data.reduction import available_threads, mapped
+from optid.data.reduction import available_cores, mapped
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.models.layout import Layout
 from optid.statistics.blocks import CHUNK, Frame, blocks_of, check_channels, cut, records, stretches, used_rows
@@ -158,7 +158,7 @@ def accumulate(data: "Data | Stream", layout: Layout, weights: Sequence[Array] |
 
     This is for parts of a record that are to be added; arguments and errors as `collect`.
     """
-    threads = available_threads(threads)
+    threads = available_cores(threads)
     sums = _total(data, layout, weights, chunk, threads, partial(Sums, Frame.of(layout)))
     gram = layout.contrasted(layout.contrasted(sums.complete()).T)
     return Statistics(layout, (gram + gram.T) / 2, sums.rows, sums.candidates)

@@ -1,8 +1,5 @@
 """The page of a study: one HTML file that opens offline, with its figures, its tables and every run."""
 
-import base64
-import hashlib
-import json
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -11,8 +8,8 @@ import numpy as np
 from markupsafe import Markup
 
 from optid import __version__
-from optid.show.page import template, versions
-from optid.show.wording import Table, number, seconds
+from optid.show.page import embedded, scripts, template, versions
+from optid.show.wording import Table, number, seconds, short
 from optid.studies.payload import page_payload
 from optid.studies.storage.rows import OUTCOMES
 from optid.studies.verdicts.advice import choice_of_solver, evidence
@@ -28,7 +25,6 @@ TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm"
 FOLDED = 8  # formulations above which their list is folded away
 LISTED = 40  # false claims, and rows of the models, on the page; the database has them all
 FEW_REASONS = 12  # kinds of failure that are shown without being asked for
-WIDEST = 120  # characters of a text in a table
 REASON = 400  # characters of a reason, which is broken into lines
 
 
@@ -54,13 +50,11 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
 
 def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
     """Return the page that `write_page` writes."""
-    head, templates = verdict.headline, files("optid") / "show" / "templates"
+    head, style = verdict.headline, files("optid") / "show" / "templates" / "study.css"
     studies = [name for name in dict.fromkeys(verdict.table["study"]) if name]
-    script = "\n".join((templates / name).read_text(encoding="utf-8") for name in SCRIPTS)
-    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     content = {
         "version": __version__,
-        "title": title or " · ".join(_short(name) for name in studies[:3]) or "Study",
+        "title": title or " · ".join(short(name) for name in studies[:3]) or "Study",
         "lead": _lead(verdict),
         "tone": head.tone,
         "word": head.word,
@@ -80,9 +74,8 @@ def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
         "call": command or "optid study report STUDY.sqlite -o study.html",
         "versions": [*versions(), *_machines(verdict)],
         "text": str(verdict),
-        "style": Markup((templates / "study.css").read_text(encoding="utf-8")),
-        "script": Markup(script),
-        "digest": digest,
+        "style": Markup(style.read_text(encoding="utf-8")),
+        **scripts(*SCRIPTS),
         "payload": embedded(page_payload(verdict)),
         "single": len(verdict.overall.standings) < 2,
         "measure": verdict.quality.measure.replace("_", " "),
@@ -90,17 +83,6 @@ def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
                      ("agreement", "Agreement"), ("models", "Models"), ("runs", "Runs"), ("method", "Method")],
     }
     return template("study.html.j2").render(content)
-
-
-def embedded(payload: Any) -> Markup:
-    """Return a value as JSON that can stand inside a script element: no text in it can end the element."""
-    text = json.dumps(payload, allow_nan=False, separators=(",", ":"), ensure_ascii=False)
-    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
-                  .replace("\u2028", "\\u2028").replace("\u2029", "\\u2029"))
-
-
-def _short(text: str, most: int = WIDEST) -> str:
-    return text if len(text) <= most else text[: most - 1] + "…"
 
 
 def _lead(verdict: Verdict) -> str:
@@ -144,15 +126,15 @@ def _picks(verdict: Verdict) -> list[dict[str, Any]]:
         lines.append({
             "name": section.name, "tone": tone, "word": word, "evidence": why,
             "solved": f"{lead.solved:,} of {len(section.found.data):,}" if lead else "-",
-            "time": seconds(lead.time) if lead and np.isfinite(lead.time) else "-",
+            "time": seconds(lead.time) if lead else "-",
         })
     return lines
 
 
 def _claims(verdict: Verdict) -> Table | None:
     claims = verdict.false_claims
-    rows = [(_short(c.solver), _short(c.formulation), f"{c.count:,}", _short(c.claimed) or "-",
-             _short(c.reason, REASON) or "verified otherwise") for c in claims[:LISTED]]
+    rows = [(short(c.solver), short(c.formulation), f"{c.count:,}", short(c.claimed) or "-",
+             short(c.reason, REASON) or "verified otherwise") for c in claims[:LISTED]]
     note = f"The {LISTED} most frequent kinds of {len(claims)}." if len(claims) > LISTED else ""
     head = ("solver", "formulation", "runs", "claimed", "but")
     return Table("Claims that were false", head, rows, note) if claims else None
@@ -164,10 +146,10 @@ def quality_table(quality: Quality) -> Table:
     apart = len(quality.sets) > 1 and (len(quality.sets) + 1) * len(quality.formulations) <= LISTED
     rows = []
     for name in quality.formulations:
-        whole = f"all {len(quality.sets)}" if len(quality.sets) > 1 else _short("".join(s.name for s in quality.sets))
-        rows.append((_short(name), whole, *_models(quality, name)))
+        whole = f"all {len(quality.sets)}" if len(quality.sets) > 1 else short("".join(s.name for s in quality.sets))
+        rows.append((short(name), whole, *_models(quality, name)))
         if apart:
-            rows += [(_short(name), _short(one.name), *_models(one, name)) for one in quality.sets]
+            rows += [(short(name), short(one.name), *_models(one, name)) for one in quality.sets]
     note = ("Means over the records that the formulation solved, and of those over the data sets, of the model with "
             "the best verified objective; fits on samples the fit did not see. Means over different records do not "
             "compare: the verdict pairs them.")
@@ -184,7 +166,7 @@ def _models(quality: Quality | DataSet, name: str) -> tuple[str, ...]:
 
 def _machines(verdict: Verdict) -> list[tuple[str, str]]:
     names = [name for name in dict.fromkeys(verdict.table["machine"]) if name]
-    shown = [_short(name) for name in names[:5]] + ([f"{len(names) - 5} more"] if len(names) > 5 else [])
+    shown = [short(name) for name in names[:5]] + ([f"{len(names) - 5} more"] if len(names) > 5 else [])
     runs = sorted(str(v)[:16].replace("T", " ") for v in verdict.table["started"] if v and v != "NaT")
     spans = [("Runs", f"{runs[0]} to {runs[-1]} UTC")] if runs else []
     return [("Machine" if len(names) == 1 else "Machines", "; ".join(shown)), *spans] if names else spans

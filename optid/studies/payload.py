@@ -72,7 +72,7 @@ def _section(section: Section) -> dict[str, Any]:
 
 
 def _standing(s: Standing, section: Section) -> dict[str, Any]:
-    ranking, pair, growth = section.ranking, s.against, s.growth
+    ranking, pair, growth = section.ranking, section.choice.against.get(s.solver), s.growth
     rank = ranking.ranks[ranking.names.index(s.solver)] if s.solver in ranking.names else np.nan
     return {
         "solver": s.solver, "problems": s.problems, "solved": s.solved, "share": _number(s.share), "refused": s.refused,

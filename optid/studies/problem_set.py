@@ -126,19 +126,10 @@ def standard_form(program: Program) -> StandardForm | None:
     if dims.exp or dims.p3d or getattr(dims, "pnd", None):
         return None
     n = len(data["c"])
-    matrix, right, zero, nonneg = sp.csc_array(data["A"]), np.asarray(data["b"]), int(dims.zero), int(dims.nonneg)
-    for name, sign in (("lower_bounds", -1.0), ("upper_bounds", 1.0)):
-        bounds = data.get(name)
-        if bounds is not None and len(kept := np.flatnonzero(np.isfinite(bounds))):
-            rows = sp.csc_array((np.full(len(kept), sign), (range(len(kept)), kept)), shape=(len(kept), n))
-            cut = zero + nonneg
-            matrix = sp.csc_array(sp.vstack([matrix[:cut], rows, matrix[cut:]]))
-            right = np.concatenate([right[:cut], sign * np.asarray(bounds)[kept], right[cut:]])
-            nonneg += len(kept)
     weights = sp.csc_array(sp.triu(data["P"])) if data.get("P") is not None else sp.csc_array((n, n))
     weights.eliminate_zeros()
-    return StandardForm(weights, np.asarray(data["c"]), matrix, right,
-                        (zero, nonneg, tuple(map(int, dims.soc)), tuple(map(int, dims.psd))), offset)
+    cones = int(dims.zero), int(dims.nonneg), tuple(map(int, dims.soc)), tuple(map(int, dims.psd))
+    return StandardForm(weights, np.asarray(data["c"]), sp.csc_array(data["A"]), np.asarray(data["b"]), cones, offset)
 
 
 def _written(folder: Path, number: int, cell: Cell, program: Program, solution: Solution) -> dict[str, Any] | None:

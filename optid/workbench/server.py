@@ -6,17 +6,13 @@ rebinding), from another origin, without the secret or with that of no page is r
 of another origin, and the page itself may ask this server only.
 """
 
-import base64
-import hashlib
 import json
 import secrets
 import threading
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import cached_property
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.resources import files
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -73,19 +69,11 @@ class Server(ThreadingHTTPServer):
                 self.benches.popitem(last=False)
         return secret
 
-    @cached_property
-    def scripts(self) -> str:
-        """The scripts of the page."""
-        folder, names = files("optid") / "show" / "templates", ("plot.js", "parts.js", "workbench.js")
-        return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
-
     def page(self, secret: str) -> tuple[str, str]:
         """Return the page and its policy."""
-        from markupsafe import Markup
+        from optid.show.page import embedded, scripts, template
 
-        from optid.show.page import embedded, template
-
-        data = self.source.data
+        data, script = self.source.data, scripts("plot.js", "parts.js", "workbench.js")
         begin = {
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
             "samples": shortest(data), "origin": data.experiments[0].start,
@@ -94,10 +82,9 @@ class Server(ThreadingHTTPServer):
         lead = f"{data.n_samples} samples every {data.dt:g}"
         body = template("workbench.html.j2").render(
             version=__version__, title=data.name or "Record", lead=lead, sections=[], begin=embedded(begin),
-            script=Markup(self.scripts))
-        digest = base64.b64encode(hashlib.sha256(self.scripts.encode()).digest()).decode()
-        return body, (f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{digest}'; img-src data:; "
-                      "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
+            script=script["script"])
+        return body, (f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{script['digest']}'; "
+                      "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")
 
 
 class _Handler(BaseHTTPRequestHandler):

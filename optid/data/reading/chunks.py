@@ -29,22 +29,14 @@ class End(NamedTuple):
 
 @dataclass(frozen=True)
 class Channels:
-    """Which columns of a source are its channels and its clock.
+    """Which columns of a source are its channels and its clock."""
 
-    Attributes:
-        inputs: {channel: column}.
-        outputs: {channel: column}.
-        clock: column of time stamps, or None.
-        step: sampling time that the stamps are compared with.
-        tolerance: largest deviation of a time step, relative to the sampling time.
-        units: in which the samples are given, raw = value * scale + offset; None for those of the source.
-    """
-
-    inputs: Mapping[str, str]
-    outputs: Mapping[str, str]
-    clock: str | None
-    step: float
-    tolerance: float
+    inputs: Mapping[str, str]  # {channel: column}
+    outputs: Mapping[str, str]  # {channel: column}
+    clock: str | None  # column of time stamps, or None
+    step: float  # sampling time that the stamps are compared with
+    tolerance: float  # largest deviation of a time step, relative to the sampling time
+    # in which the samples are given, raw = value * scale + offset; None for those of the source
     units: Transform | None = None
 
     def read(self, part: Any) -> Iterator[Chunk]:
@@ -103,21 +95,13 @@ def _gathered(block: Block, pairs: Mapping[str, str], label: str, done: int) -> 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a pass over neighbouring parts found.
+    """What a pass over neighbouring parts found."""
 
-    Attributes:
-        lengths: samples by experiment.
-        lo: (m,) smallest sample of each input, NaN where every one is missing; without samples one NaN.
-        hi: (m,) largest sample of each input.
-        first: where the run begins; None without a clock, or without samples.
-        last: where it ends.
-    """
-
-    lengths: Mapping[int, int]
-    lo: np.ndarray
-    hi: np.ndarray
-    first: End | None = None
-    last: End | None = None
+    lengths: Mapping[int, int]  # samples by experiment
+    lo: np.ndarray  # (m,) smallest sample of each input, NaN where every one is missing; without samples one NaN
+    hi: np.ndarray  # (m,) largest sample of each input
+    first: End | None = None  # where the run begins; None without a clock, or without samples
+    last: End | None = None  # where it ends
 
 
 def surveyed(part: Any, chunks: Iterable[Chunk]) -> Survey:

@@ -14,13 +14,11 @@ from optid.errors import DataError, nearest
 Wanted = str | int | Sequence[str | int] | Mapping[str, str | int] | None
 """Columns by name or position; a mapping {channel name: column} renames."""
 
-TIME_TOLERANCE = 0.01
-"""A time step may deviate from the median step by this share of it."""
+TIME_TOLERANCE = 0.01  # a time step may deviate from the median step by this share of it
 
 TIME_NAMES = ("t", "time")
 
-MOST_LISTED = 40
-"""Columns that a message lists."""
+MOST_LISTED = 40  # columns that a message lists
 
 
 def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dict[str, str]:
@@ -112,9 +110,8 @@ def seconds(stamps: np.ndarray) -> np.ndarray:
     return stamps.astype(np.int64) / 1e9 if stamps.dtype.kind in "Mm" else stamps
 
 
-def uniform_step(
-    stamps: np.ndarray, tolerance: float, label: str, step: float | None = None, first: int = 0
-) -> float | None:
+def uniform_step(stamps: np.ndarray, tolerance: float, label: str, step: float | None = None, first: int = 0
+                 ) -> float | None:
     """Check that time stamps are uniform and return their mean step, None for a single stamp.
 
     Args:
@@ -141,12 +138,11 @@ def uniform_step(
     bad = np.abs(steps - median) > tolerance * median
     if bad.any():
         k = int(np.argmax(bad))
-        raise DataError(
-            f"{label}: time stamps are not uniform. Sample {first + k + 1} (t = {stamps[k + 1]}) comes {steps[k]:.6g} "
-            f"after the one before, the median step is {median:.6g} ({int(bad.sum())} step(s) deviate by more than "
-            f"{tolerance:.2%}). Insert rows with blank cells where samples were lost, interpolate onto a uniform grid, "
-            "raise time_tolerance, or pass time=False and dt= if the stamps are wrong."
-        )
+        raise DataError(f"{label}: time stamps are not uniform. Sample {first + k + 1} (t = {stamps[k + 1]}) comes "
+                        f"{steps[k]:.6g} after the one before, the median step is {median:.6g} ({int(bad.sum())} "
+                        f"step(s) deviate by more than {tolerance:.2%}). Insert rows with blank cells where samples "
+                        "were lost, interpolate onto a uniform grid, raise time_tolerance, or pass time=False and dt= "
+                        "if the stamps are wrong.")
     return float(steps.mean())
 
 
@@ -161,10 +157,8 @@ def agreed_step(found: float | None, dt: float | None, tolerance: float, label: 
     if dt is None:
         return float(f"{found:.12g}")
     if abs(found - dt) > tolerance * dt:
-        raise DataError(
-            f"{label}: dt = {dt:g}, but the time stamps step by {found:.6g}. Leave dt "
-            "out to use the stamps (mind their unit), pass time=False to ignore them, or resample for the model."
-        )
+        raise DataError(f"{label}: dt = {dt:g}, but the time stamps step by {found:.6g}. Leave dt out to use the "
+                        "stamps (mind their unit), pass time=False to ignore them, or resample for the model.")
     return dt
 
 
@@ -186,10 +180,8 @@ def _parsed(text: np.ndarray, label: str) -> np.ndarray:
             warnings.simplefilter("ignore", UserWarning)
             return np.where(missing, "NaT", text).astype("datetime64[ns]")
     except ValueError:
-        raise DataError(
-            f"{label}: the stamps (first: {str(text[0])!r}) are neither numbers nor ISO dates such as "
-            "2024-05-01T12:00:00. Convert them to seconds, or pass time=False and dt=."
-        ) from None
+        raise DataError(f"{label}: the stamps (first: {str(text[0])!r}) are neither numbers nor ISO dates such as "
+                        "2024-05-01T12:00:00. Convert them to seconds, or pass time=False and dt=.") from None
 
 
 def _unnamed(pairs: dict[str, str], known: Sequence[str], letter: str) -> dict[str, str]:

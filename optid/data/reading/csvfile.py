@@ -26,14 +26,9 @@ MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 NULLS = ["NA", "N/A", "null", "NULL", "None", "nan", "NaN", "NAN"]
 """Common spellings of `MISSING`, which polars takes at full speed."""
 
-SMALL = 1 << 18
-"""Bytes up to which the csv module reads a file in less time than polars needs to be imported."""
-
-BLOCK = 1 << 22
-"""Bytes read at a time."""
-
-ROWS = 65536
-"""Rows that the csv module converts at a time."""
+SMALL = 1 << 18  # bytes up to which the csv module reads a file in less time than polars needs to be imported
+BLOCK = 1 << 22  # bytes read at a time
+ROWS = 65536  # rows that the csv module converts at a time
 
 Columns = dict[str, np.ndarray]
 """{column: (n,) samples}, or its text."""
@@ -41,21 +36,13 @@ Columns = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class CsvFile:
-    """A CSV file whose columns have names.
+    """A CSV file whose columns have names."""
 
-    Attributes:
-        path: the file.
-        names: one name per column.
-        offset: bytes before the first row of samples.
-        delimiter: character between cells.
-        decimal: decimal mark, "." or ",".
-    """
-
-    path: Path
-    names: list[str]
-    offset: int
-    delimiter: str
-    decimal: str
+    path: Path  # the file
+    names: list[str]  # one name per column
+    offset: int  # bytes before the first row of samples
+    delimiter: str  # character between cells
+    decimal: str  # decimal mark, "." or ","
 
     def columns(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Columns:
         """Return the wanted columns whole as float64, NaN where a cell says missing.
@@ -195,10 +182,9 @@ class CsvFile:
         if not any(block[bad:]) and not any(reader):
             return block[:bad]
         found = f"has {len(block[bad])} cells" if block[bad] else "is blank"
-        raise DataError(
-            f"{self.path.name}: row {done + bad + 1} after the header {found}, the header has {len(self.names)}. "
-            "Repair the row; where samples are missing keep the row and leave its cells blank."
-        )
+        raise DataError(f"{self.path.name}: row {done + bad + 1} after the header {found}, the header has "
+                        f"{len(self.names)}. Repair the row; where samples are missing keep the row and leave its "
+                        "cells blank.")
 
 
 def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal: str) -> CsvFile:

@@ -22,10 +22,9 @@ def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
         table = nw.from_native(frame, eager_only=True)
         names = [str(name) for name in table.columns]
     except TypeError:
-        raise DataError(
-            f"cannot read data from a {type(frame).__name__}: pass a path, a list of paths, a pandas or polars frame "
-            "(a lazy one after .collect()), a dictionary of arrays, or use Data(u=, y=)."
-        ) from None
+        raise DataError(f"cannot read data from a {type(frame).__name__}: pass a path, a list of paths, a pandas or "
+                        "polars frame (a lazy one after .collect()), a dictionary of arrays, or use Data(u=, "
+                        "y=).") from None
     except (ValueError, nw.exceptions.NarwhalsError) as error:
         raise DataError(f"{label} cannot be read: {error}") from error
     if len(set(names)) < len(names):
@@ -77,10 +76,8 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None,
             # Through integers, because a time zone would make objects of the dates.
             loaded[name] = column.dt.timestamp("ns").to_numpy().astype("M8[ns]") if dates else column.to_numpy()
         elif not column.dtype.is_numeric():
-            raise DataError(
-                f"{label}: column {name!r} is of type {column.dtype}, numbers are needed. "
-                "Convert it first (pandas.to_numeric, polars cast)."
-            )
+            raise DataError(f"{label}: column {name!r} is of type {column.dtype}, numbers are needed. Convert it first "
+                            "(pandas.to_numeric, polars cast).")
         elif column.dtype.is_integer() and column.null_count() == 0:
             loaded[name] = column.to_numpy()
         else:
@@ -90,9 +87,8 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None,
     return loaded
 
 
-def partition_blocks(
-    label: str, names: Sequence[str], chunk: int, content: Any, wanted: Sequence[str], clock: str | None
-) -> Iterator[dict[str, np.ndarray]]:
+def partition_blocks(label: str, names: Sequence[str], chunk: int, content: Any, wanted: Sequence[str],
+                     clock: str | None) -> Iterator[dict[str, np.ndarray]]:
     """Yield columns of a computed partition of a Dask collection, `chunk` rows at a time; errors as of `load_frame`."""
     if isinstance(content, np.ndarray):
         if content.dtype.kind not in "iuf":

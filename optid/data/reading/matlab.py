@@ -1,28 +1,25 @@
-"""MAT files of version 5 and 7.3, read by a process of its own; see `optid.data.reading.matlab_process`."""
+"""MAT files of version 5 and 7.3, read in a process of its own.
 
-import json
-import subprocess
-import sys
-from collections.abc import Sequence
+A damaged file can crash the library that reads it, or ask for terabytes.
+"""
+
+import os
+import warnings
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
-from optid.data.reading.npyfile import load_npy
 from optid.errors import DataError
+from optid.processes import run_forked
 
 MAT = 'pip install "optid[mat]"'
-
-MEMORY = 4 << 30
-"""Bytes of address space that a MAT file may take, or `EXPANSION` times its size where that is more."""
-
-EXPANSION = 32
-
-SECONDS = 60.0
-"""Time that a MAT file may take, and as much again for each `PACE` bytes."""
-
-PACE = 1 << 30
+TEXT = (b"char", b"cell", b"function_handle")
+# bytes that a MAT file may take, or `EXPANSION` times its size where that is more
+MEMORY, EXPANSION = 4 << 30, 32
+# time that a MAT file may take, and as much again for each `PACE` bytes
+SECONDS, PACE = 60.0, 1 << 30
 
 
 def mat_names(path: Path) -> list[str]:
@@ -32,33 +29,89 @@ def mat_names(path: Path) -> list[str]:
         DataError: a damaged file, a link to another file, more time or memory than a file of its size may take, or
             h5py is missing.
     """
-    return _run(path, "", None)
+    return list(_isolated(path, None))
 
 
 def mat_variables(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
     """Return some variables by name; errors as of `mat_names`."""
-    with TemporaryDirectory(prefix="optid-mat-") as folder:
-        _run(path, folder, names)
-        return {name: load_npy(Path(folder, f"{number}.npy"), path.name) for number, name in enumerate(names)}
+    found = _isolated(path, names)
+    return {name: found[name] for name in names}
 
 
-def _run(path: Path, folder: str, names: Sequence[str] | None) -> list[str]:
-    size = path.stat().st_size
-    job = json.dumps([str(path.absolute()), folder, names, max(MEMORY, EXPANSION * size)])
-    script = Path(__file__).with_name("matlab_process.py")
-    damaged = f"{path.name} is damaged, or not a MAT file"
+def _isolated(path: Path, names: Sequence[str] | None) -> dict[str, Any]:
+    if not hasattr(os, "fork"):
+        return _variables(path, names)
+    size, damaged = path.stat().st_size, f"{path.name} is damaged, or not a MAT file"
     try:
-        # Without -P the script's folder would come before the installed packages.
-        done = subprocess.run([sys.executable, "-P", str(script), job], capture_output=True, stdin=subprocess.DEVNULL,
-                              timeout=SECONDS * (1 + size / PACE))
-    except subprocess.TimeoutExpired:
+        return run_forked(_variables, path, names, quiet=True, seconds=SECONDS * (1 + size / PACE),
+                          memory=max(MEMORY, EXPANSION * size))
+    except TimeoutError:
         raise DataError(f"{damaged}: reading it took more than {SECONDS:g} s.") from None
+    except ChildProcessError as death:
+        raise DataError(f"{damaged}: the process that read it crashed ({death}).") from None
+
+
+def _variables(path: Path, names: Sequence[str] | None) -> dict[str, Any]:
+    """Return {name: array} of these numeric variables; {name: None} of all where no names are given."""
     try:
-        answer = json.loads(done.stdout.splitlines()[-1])
-    except (ValueError, IndexError):
-        raise DataError(f"{damaged}: the process that read it crashed (exit code {done.returncode}).") from None
-    if "error" not in answer:
-        return answer["names"]
-    if answer["error"] in ("ImportError", "ModuleNotFoundError") and "h5py" in answer["text"]:
-        raise DataError(f"{path.name} is a MAT file of version 7.3, which needs h5py: {MAT}")
-    raise DataError(f"{damaged}: {answer['text'] or answer['error']}")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                found = _of_version_5(path, names)
+            except NotImplementedError:
+                found = _of_version_7(path, names)
+    except Exception as error:  # whatever a library raises on a damaged file
+        if isinstance(error, ImportError) and "h5py" in str(error):
+            raise DataError(f"{path.name} is a MAT file of version 7.3, which needs h5py: {MAT}") from None
+        text = str(error) or type(error).__name__
+        raise DataError(f"{path.name} is damaged, or not a MAT file: {text}") from None
+    return dict.fromkeys(found) if names is None else found
+
+
+def _of_version_5(path: Path, names: Sequence[str] | None) -> dict[str, Any]:
+    """Return the numeric variables, and the fields of structures as "structure.field"."""
+    from scipy.io import loadmat
+
+    wanted = None if names is None else sorted({name.split(".")[0] for name in names} | set(names))
+    # With mat_dtype a double that MATLAB packed into bytes comes back as a double.
+    content = loadmat(path, mat_dtype=True, variable_names=wanted)
+    found = {}
+    for name, value in content.items():
+        if not isinstance(value, np.ndarray) or name.startswith("__"):
+            continue
+        if value.dtype.names and value.size == 1:
+            found |= {f"{name}.{part}": value.flat[0][part] for part in value.dtype.names}
+        else:
+            found[name] = value
+    return {name: value for name, value in found.items() if getattr(value, "dtype", np.dtype(object)).kind in "biufc"}
+
+
+def _of_version_7(path: Path, names: Collection[str] | None) -> dict[str, Any]:
+    """Return the numeric data sets of an HDF5 file; a ValueError where one is in another file."""
+    import h5py
+
+    found: dict[str, Any] = {}
+
+    def visit(group: Any, prefix: str, above: list[Any]) -> None:
+        for key in group:
+            link = group.get(key, getlink=True)
+            if isinstance(link, h5py.ExternalLink):
+                raise ValueError(f"{prefix + key!r} is a link to another file, {link.filename!r}: optid follows none")
+            if isinstance(link, h5py.SoftLink) or key.startswith("#"):
+                continue
+            item, name = group[key], prefix + key
+            if isinstance(item, h5py.Group):
+                if item.id not in above:  # groups can hold each other
+                    visit(item, name + ".", [*above, item.id])
+            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and \
+                    item.attrs.get("MATLAB_class", b"") not in TEXT:
+                if item.external or item.is_virtual:
+                    raise ValueError(f"the samples of {name!r} are stored in another file: optid opens none")
+                if names is None:
+                    found[name] = None
+                elif name in names:
+                    found[name] = item[()].T  # HDF5 stores MATLAB's columns as rows
+
+    with h5py.File(path, "r") as file:
+        visit(file, "", [file.id])
+    return found

@@ -22,23 +22,14 @@ BROKEN = (ValueError, OSError, EOFError, TypeError, SyntaxError, KeyError, Index
 
 @dataclass(frozen=True)
 class NpyFile:
-    """An npy file of real numbers.
+    """An npy file of real numbers."""
 
-    Attributes:
-        path: the file.
-        names: one name per column.
-        rows: number of samples.
-        dtype: type of the samples as stored.
-        by_column: whether a column is contiguous in the file (Fortran order).
-        offset: bytes before the first sample.
-    """
-
-    path: Path
-    names: tuple[str, ...]
-    rows: int
-    dtype: np.dtype
-    by_column: bool
-    offset: int
+    path: Path  # the file
+    names: tuple[str, ...]  # one name per column
+    rows: int  # number of samples
+    dtype: np.dtype  # type of the samples as stored
+    by_column: bool  # whether a column is contiguous in the file (Fortran order)
+    offset: int  # bytes before the first sample
 
     def blocks(self, rows: int, wanted: Sequence[str], _: Any = None) -> Iterator[dict[str, np.ndarray]]:
         """Yield columns of the stored type, at most `rows` rows at a time."""

@@ -11,8 +11,7 @@ from optid.data.reading.frames import load_frame
 from optid.data.reading.parts import Part, file_parts
 from optid.errors import DataError
 
-SAMPLES = 1 << 20
-"""Row groups are taken together up to this many samples: smaller tasks do not pay."""
+SAMPLES = 1 << 20  # row groups are taken together up to this many samples: smaller tasks do not pay
 
 
 def parquet_schema(path: Path) -> dict[str, Any]:
@@ -43,9 +42,8 @@ def parquet_footer(path: Path) -> tuple[list[str], int]:
         return list(parquet.read_schema(path).names), parquet.read_metadata(path).num_rows
 
 
-def parquet_blocks(
-    path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], clock: str | None
-) -> Iterator[Block]:
+def parquet_blocks(path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], clock: str | None
+                   ) -> Iterator[Block]:
     """Yield some columns of some row groups, of all for None, `chunk` rows at a time; errors as of `load_parquet`."""
     parquet = _pyarrow_parquet(path)
     import pyarrow as pa

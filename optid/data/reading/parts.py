@@ -20,23 +20,17 @@ TAIL = 1 << 16
 
 @dataclass(frozen=True)
 class Part:
-    """Successive samples of one experiment, on every pass read anew.
+    """Successive samples of one experiment, on every pass read anew."""
 
-    Attributes:
-        label: which ones, for messages.
-        read: yields blocks of (columns, the one of them that is the clock); of a Dask partition of (its content,
-            columns, clock).
-        n_samples: number of samples, or None.
-        files: path, size and digest of the end of each file, as the one who opened the record saw them.
-        experiment: which experiment of the record they belong to.
-        content: what Dask is to compute, or its result: a frame, or an array (n, channels); None for files.
-    """
-
-    label: str
+    label: str  # which ones, for messages
+    # yields blocks of (columns, the one of them that is the clock); of a Dask partition of (its content, columns,
+    # clock)
     read: Callable[..., Iterator[Block]] = field(repr=False)
-    n_samples: int | None = None
+    n_samples: int | None = None  # number of samples, or None
+    # path, size and digest of the end of each file, as the one who opened the record saw them
     files: tuple[tuple[Path, int, str], ...] = field(default=(), repr=False)
-    experiment: int = 0
+    experiment: int = 0  # which experiment of the record they belong to
+    # what Dask is to compute, or its result: a frame, or an array (n, channels); None for files
     content: Any = field(default=None, repr=False)
 
     def blocks(self, wanted: Sequence[str], clock: str | None) -> Iterator[Block]:

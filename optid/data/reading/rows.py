@@ -11,30 +11,19 @@ from optid.data.reading.columns import TIME_TOLERANCE, as_stamps, choose, second
 from optid.data.reading.csvfile import check_marks, is_missing, is_number
 from optid.errors import DataError
 
-LARGEST = 1e100
-"""Larger numbers are no readings: what is computed from them a sample later must not overflow either."""
+LARGEST = 1e100  # larger numbers are no readings: what is computed from them a sample later must not overflow either
 
 
 class Rows(NamedTuple):
-    """What was read.
+    """What was read."""
 
-    Attributes:
-        values: (N, channels) samples, inputs first, NaN where missing.
-        m: number of inputs.
-        lines: (N,) line of the stream, from 1; 0 for a sample that was put into a gap.
-        stamps: (N,) text of the time stamps; empty without them.
-        bad: (line, what is wrong) of the rows that could not be read, and count as missing samples.
-        error: what ends the stream after these rows; empty where it goes on.
-        stop: the line that does.
-    """
-
-    values: Array
-    m: int
-    lines: np.ndarray
-    stamps: list[str]
-    bad: list[tuple[int, str]]
-    error: str = ""
-    stop: int = 0
+    values: Array  # (N, channels) samples, inputs first, NaN where missing
+    m: int  # number of inputs
+    lines: np.ndarray  # (N,) line of the stream, from 1; 0 for a sample that was put into a gap
+    stamps: list[str]  # (N,) text of the time stamps; empty without them
+    bad: list[tuple[int, str]]  # (line, what is wrong) of the rows that could not be read, and count as missing samples
+    error: str = ""  # what ends the stream after these rows; empty where it goes on
+    stop: int = 0  # the line that does
 
     @property
     def u(self) -> Array:
@@ -59,11 +48,9 @@ class RowReader:
         line: lines read.
     """
 
-    def __init__(
-        self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
-        columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: int = 0,
-        label: str = "stream", tolerance: float = TIME_TOLERANCE,
-    ) -> None:
+    def __init__(self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
+                 columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: int = 0,
+                 label: str = "stream", tolerance: float = TIME_TOLERANCE) -> None:
         """Say what is read.
 
         Args:
@@ -141,9 +128,8 @@ class RowReader:
                 return Rows(np.empty((0, sum(map(len, self._wanted)))), len(self._wanted[0]), np.empty(0, int), [], [])
             first = self._cells(lines[0].removeprefix("\ufeff"))
             if all(map(is_number, first)):
-                raise DataError(
-                    f"{self._label} has no header row (it starts with {lines[0][:60]!r}): name the columns, --columns."
-                )
+                raise DataError(f"{self._label} has no header row (it starts with {lines[0][:60]!r}): name the "
+                                "columns, --columns.")
             self._known([cell.strip() for cell in first])
             del lines[0]
             self.line += 1

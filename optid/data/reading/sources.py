@@ -22,40 +22,27 @@ TEXT = (".csv", ".txt", ".tsv")
 
 @dataclass(frozen=True)
 class Table:
-    """A source whose columns can be loaded by name.
+    """A source whose columns can be loaded by name."""
 
-    Attributes:
-        label: name of the source, for messages.
-        names: names of its columns or variables.
-        load: function of (columns wanted, the clock among them, the column of experiments among them) returning
-            {name: array}; numeric columns are (N,) or (N, channels) of a real type, clock and experiments may be text
-            or dates.
-        index: name of a time index besides the columns, or of the only column of dates; None without one.
-    """
-
-    label: str
-    names: list[str]
+    label: str  # name of the source, for messages
+    names: list[str]  # names of its columns or variables
+    # function of (columns wanted, the clock among them, the column of experiments among them) returning {name: array};
+    # numeric columns are (N,) or (N, channels) of a real type, clock and experiments may be text or dates
     load: Callable[[Sequence[str], str | None, str | None], dict[str, Any]]
+    # name of a time index besides the columns, or of the only column of dates; None without one
     index: str | None = None
 
 
 @dataclass(frozen=True)
 class Source:
-    """A source of one experiment that need not fit into memory.
+    """A source of one experiment that need not fit into memory."""
 
-    Attributes:
-        names: names of its columns.
-        n_samples: number of samples, None where only a pass can tell.
-        whole: all of it; None where it exists in parts only.
-        parts: function of the columns that will be read; returns what can be read apart, in the order of time.
-        label: name of the source, for messages.
-    """
-
-    names: Sequence[str]
-    n_samples: int | None
-    whole: Part | None
+    names: Sequence[str]  # names of its columns
+    n_samples: int | None  # number of samples, None where only a pass can tell
+    whole: Part | None  # all of it; None where it exists in parts only
+    # function of the columns that will be read; returns what can be read apart, in the order of time
     parts: Callable[[Sequence[str]], Iterable[Part]]
-    label: str
+    label: str  # name of the source, for messages
 
 
 def existing(path: Path) -> Path:

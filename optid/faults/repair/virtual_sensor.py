@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.data.record import Data, one_or_all
+from optid.arrays import Array, one_or_all
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.faults import channel_of
 from optid.models.experiments import in_units_of

@@ -1,6 +1,5 @@
 """From a record to a model: structures of every class on trial, the choice among them, and its reasons."""
 
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -12,6 +11,7 @@ import numpy as np
 
 from optid.arrays import check_integer, one_of
 from optid.data.record import Data, not_a_record
+from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
@@ -110,14 +110,12 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     cut = Blocks.of(data, blocks)
     ladder, stopped = Ladder.of(cut), ""
     end = clock + (1 - RESERVED) * budget
-    free = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = free if workers is None else check_integer(workers, "workers")
 
     def attempt(task: tuple[Candidate, Trial | None, float]) -> Trial:
         candidate, rival, deadline = task
         return tried(candidate, cut, rival, {"solver": solver, "accuracy": accuracy}, rules, horizon, deadline)
 
-    pool = Pool(attempt, count)
+    pool = Pool(attempt, available_cores(workers, "workers"))
     with Clock("search", budget) if progress is None else nullcontext(progress) as told:
         try:
             if not _climb(ladder, possible, pool, FIRST * budget, end, partial(_told, ladder, told, clock, budget)):

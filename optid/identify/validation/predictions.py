@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.data.record import Data, as_list
+from optid.arrays import Array, as_list
+from optid.data.record import Data
 from optid.errors import DataError
 from optid.models.functions import has_feedback
 from optid.registry import Rendered

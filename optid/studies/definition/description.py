@@ -1,11 +1,16 @@
 """What a study is made of: data, formulations and solvers with their labels, and what holds for every cell."""
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from optid.data.record import Data
+from optid.errors import StudyError
+
+HINT = "a text stands in quotation marks, a path in single ones, several values in [ ]; a line holds one key = value"
 
 
 @dataclass(frozen=True)
@@ -108,25 +113,51 @@ class Study:
         Raises:
             StudyError: every problem with its key; data that cannot be read count as such.
         """
-        from optid.studies.definition.study_file import read_study
-
-        return read_study(Path(path))
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except OSError as error:
+            raise StudyError(f"study file {path} cannot be read: {error.strerror or error}") from None
+        except UnicodeDecodeError as error:
+            raise StudyError(f"{path} has a problem:\n  not UTF-8, in which a study file is written: {error}") from None
+        return cls.from_text(text.removeprefix("\ufeff"), path.parent, str(path), path.stem)
 
     @classmethod
-    def from_text(cls, text: str, folder: str | Path = ".", label: str = "the study") -> "Study":
+    def from_text(cls, text: str, folder: str | Path = ".", label: str = "the study", title: str = "study") -> "Study":
         """Read a study from TOML text.
 
         Args:
             text: what a study file holds.
             folder: where relative data files are looked for.
             label: what the text is called in messages.
+            title: of a study that has none.
 
         Raises:
             StudyError: as for `from_toml`.
         """
-        from optid.studies.definition.study_file import parse_study
+        from optid.studies.definition.entries import read
+        from optid.studies.definition.problems import Problems
+        from optid.studies.definition.trial import note_all
 
-        return parse_study(text, Path(folder), label)
+        try:
+            raw = tomllib.loads(text.replace("\r\n", "\n"))
+        except RecursionError:
+            raise StudyError(f"{label} has a problem:\n  lists or tables are nested too deeply to be a study") from None
+        except ValueError as error:  # what is not TOML, and an integer of so many digits that Python does not read it
+            raise StudyError(f"{label} has a problem:\n  {error}; {HINT}") from None
+        problems, folder = Problems(), Path(folder)
+        found = {"name": title, **read(raw, problems)}
+        note_all(folder, found["data"], found["formulations"], found["solvers"], problems)
+        problems.told(label)
+        study = cls(**found, folder=folder)
+        object.__setattr__(study, "data_checked", True)
+        return study
+
+    @classmethod
+    def example(cls) -> "Study":
+        """Return the built-in study, so that the command runs on nothing."""
+        text = files("optid.studies.definition").joinpath("example.toml").read_text(encoding="utf-8")
+        return cls.from_text(text, label="the built-in study")
 
     def to_toml(self) -> str:
         """Return the study as the text of a study file, which `from_text` reads back.

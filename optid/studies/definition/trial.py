@@ -12,6 +12,7 @@ from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.program.solution import Status
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
+from optid.show.wording import short
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.problems import Label, Problems
@@ -165,8 +166,7 @@ def _failure(programme: Any, solver: str, options: Mapping[str, Any]) -> str:
     found = _solve(programme, solver, options)
     if found.status is not Status.FAILED or found.has_point:
         return ""
-    reason = " ".join(found.reason.split()) or "it does not say why"
-    return reason if len(reason) <= LONGEST else reason[: LONGEST - 1] + "…"
+    return short(" ".join(found.reason.split()) or "it does not say why", LONGEST)
 
 
 def _solve(programme: Any, solver: str, options: Mapping[str, Any]) -> Any:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from optid.data.reduction import available_cores
 from optid.errors import DatabaseError, StudyError, nearest
 from optid.studies.definition.description import Study
 from optid.studies.execution.cell import known, lost_row
@@ -140,7 +141,7 @@ def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Exec
         return lambda todo: cluster.execute(todo, scheduler=scheduler)
     from optid.studies.execution import workers as processes
 
-    processes.check_number(workers)
+    available_cores(workers, "workers", StudyError)
     return lambda todo: processes.execute(todo, workers=workers)
 
 

@@ -15,10 +15,10 @@ import resource
 import signal
 import sys
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from optid.processes import limit_memory
 from optid.studies.execution.machine import MB, resident_mb
 from optid.studies.storage.rows import ERROR, MEMORY_LIMIT
 
@@ -70,7 +70,7 @@ def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] 
         _kept = kept(_folder, token)
     before = resource.getrlimit(resource.RLIMIT_AS)
     try:
-        _limit_memory(memory_limit, held)
+        limit_memory(int((memory_limit - held) * MB))  # what is reserved and not used is free
         return dict(_function(pickle.loads(packed))), "", ""
     except MemoryError as error:
         return None, MEMORY_LIMIT, f"got no more memory ({error}); the limit is {memory_limit:g} MB"
@@ -118,15 +118,6 @@ def last_words(path: Path) -> str:
         places = [line for line in lines[fatal[-1]:] if line.startswith("File ")]
         return said or (f"at {places[0]}" if places else "")
     return lines[-1][-LONGEST:] if lines else ""
-
-
-def _limit_memory(limit: float, held: float) -> None:
-    """Let the system refuse memory beyond the limit; what the process has reserved and does not use is free."""
-    with suppress(OSError, ValueError):  # a system without this figure: the peak is compared when the cell has ended
-        reserved = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        wanted = reserved + max(int((limit - held) * MB), 0)
-        resource.setrlimit(resource.RLIMIT_AS, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
 
 
 def _die_with(parent: int) -> None:

@@ -21,8 +21,10 @@ from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from typing import Any
 
+from optid.data.reduction import available_cores
 from optid.errors import StudyError
-from optid.solving.isolated import GRACE, death
+from optid.processes import death
+from optid.solving.isolated import GRACE
 from optid.studies.execution.cell import lost_row, prepare, run_cell, without_warm
 from optid.studies.execution.worker import RETIRED, kept, last_words, note, run, start, words
 from optid.studies.grid import Cell
@@ -34,17 +36,6 @@ STILLBORN = 3  # pools whose workers end before they are ready, one after anothe
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 Row = dict[str, Any]
-
-
-def cores() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def check_number(workers: int | None) -> None:
-    """Raise StudyError for a number of processes that is no positive integer."""
-    if workers is not None and (not isinstance(workers, int) or isinstance(workers, bool) or workers < 1):
-        raise StudyError(f"workers must be a positive integer, a number of processes; {workers!r} is not")
 
 
 def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
@@ -62,8 +53,7 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
         StudyError: no positive number, or workers that do not start (with their last words); as for `Pool`.
     """
     todo = deque(cells)
-    check_number(workers)
-    pool = Pool(function, min(workers or cores(), max(len(todo), 1)))
+    pool = Pool(function, min(available_cores(workers, "workers", StudyError), max(len(todo), 1)))
     try:
         yield from pool.run(todo)
     finally:

@@ -170,12 +170,10 @@ def time_growth(times: np.ndarray, n: np.ndarray, groups: np.ndarray) -> Growth:
         needs = (f"needs at least {MINIMUM_LENGTHS} record lengths, the longest {MINIMUM_SPREAD:g} times the shortest, "
                  f"solved on the same data; there {'is' if most == 1 else 'are'} at most {most}")
         return Growth(float("nan"), float("nan"), float("nan"), lengths, shown, needs)
-    means = np.bincount(place, logs) / np.bincount(place)
+    points = np.column_stack([np.log(pairs[:, 1]), np.bincount(place, logs) / np.bincount(place)])[several]
     kinds, number = np.unique(group[several], return_inverse=True)
-    design = np.column_stack([np.eye(len(kinds))[number], np.log(pairs[several, 1])])
-    cost, slope = means[several], np.linalg.pinv(design)[-1]  # a row of the pseudo-inverse has the norm of the error
-    rest = cost - design @ np.linalg.lstsq(design, cost)[0]
-    freedom = len(cost) - len(kinds) - 1  # one at least: a group has three lengths
-    half = float(student.ppf(0.975, freedom) * np.sqrt(rest @ rest / freedom * (slope @ slope)))
-    value = float(slope @ cost)
+    x, t = (points - means_of_groups(points, number)[number]).T  # the groups stand in order
+    value = float(x @ t / (x @ x))
+    rest, freedom = t - value * x, len(t) - len(kinds) - 1  # one at least: a group has three lengths
+    half = float(student.ppf(0.975, freedom) * np.sqrt(rest @ rest / freedom / (x @ x)))
     return Growth(value, value - half, value + half, lengths, shown)

@@ -85,13 +85,11 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
         pair = compare(costs[:, one], costs[:, other])
         beaten |= {one} if pair.behind else {other} if pair.ahead else set()
     unbeaten = [s for s in reliable if s not in beaten]
-    if not unbeaten:
-        missing = f"goes in a circle: each of {listed(candidates)} is behind another one on the {noun}s that both solve"
-        return Choice(CANNOT_TELL, "", (), candidates, {}, solved, missing)
     leaders = [s for s in unbeaten if counts[s] >= max(counts[unbeaten]) - allowed]
     common = known[:, leaders].all(axis=1)
-    if not common.any():
-        missing = f"needs a {noun} that {listed([names[s] for s in leaders])} all solve"
+    if not leaders or not common.any():
+        circle = f"goes in a circle: each of {listed(candidates)} is behind another one on the {noun}s that both solve"
+        missing = f"needs a {noun} that {listed([names[s] for s in leaders])} all solve" if leaders else circle
         return Choice(CANNOT_TELL, "", (), candidates, {}, solved, missing)
     lead = min(leaders, key=lambda s: compare(np.where(common, costs[:, s], np.nan), np.ones(len(costs))).value)
     against = {names[s]: compare(costs[:, s], costs[:, lead]) for s in np.flatnonzero(counts) if s != lead}

@@ -1,6 +1,6 @@
 """Solvers side by side on one record and one formulation: a line for each, and one sentence that says which to use."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ from optid.show.wording import seconds
 from optid.studies.storage.rows import ERROR, REFUSED, columns
 from optid.studies.verdicts.averages import MINOR
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
-from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, listed
+from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, grouped, listed
 from optid.studies.verdicts.verdict import Verdict, conclude
 
 
@@ -43,7 +43,7 @@ class Comparison:
     @property
     def reasons(self) -> dict[str, list[str]]:
         """Solvers that did not solve it by the sentence that says why."""
-        return _by_word((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
+        return grouped((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
 
     @property
     def common_error(self) -> str | None:
@@ -61,7 +61,7 @@ class Comparison:
         if not solved and not self.lines:
             return Statement(FAIR, "No solver takes this formulation", "choose others (optid solvers).", "solver")
         if not solved:
-            states = _by_word((line.state, line.solver) for line in self.lines)
+            states = grouped((line.state, line.solver) for line in self.lines)
             why = "; ".join(f"{state}: {listed(names)}" for state, names in states.items())
             return Statement(BAD, f"No solver reached {at}", f"{counting(self.accuracy)}; {why}.", "solver")
         first, *others = solved
@@ -127,13 +127,6 @@ def _order(line: Line) -> tuple[Any, ...]:
     states = (SOLVED, WORSE_MINIMUM)
     rank = states.index(line.state) if line.state in states else len(states) + (line.state == FALSE_CLAIM)
     return rank, not line.proved, np.nan_to_num(line.cold, nan=np.inf), line.solver
-
-
-def _by_word(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    for word, solver in pairs:
-        found.setdefault(word, []).append(solver)
-    return found
 
 
 def _median(values: np.ndarray) -> float:

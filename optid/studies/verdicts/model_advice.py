@@ -104,5 +104,5 @@ def _one(quality: Quality, one: DataSet) -> str:
         return f"on {one.name} {listed(choice.leaders)} tie, {shown} ({records})"
     name = min(rivals, key=lambda rival: choice.against[rival].value)
     so_far = " so far" if choice.kind == CANNOT_TELL and quality.choice.kind != CANNOT_TELL else ""
-    place = _place(quality, choice, name, "record")
-    return f"on {one.name} {choice.first}{so_far}, {shown}, {name} {place} ({records})"
+    said = f"on {one.name} {choice.first}{so_far}, {shown}, {name} {_place(quality, choice, name, 'record')}"
+    return said if said.endswith(f", {records})") else f"{said} ({records})"  # the interval says how many, too

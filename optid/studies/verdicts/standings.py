@@ -7,9 +7,7 @@ import numpy as np
 from optid.studies.storage.rows import REFUSED
 from optid.studies.verdicts.averages import (
     Growth,
-    Paired,
     Profile,
-    paired,
     performance_profiles,
     shifted_geometric_mean,
     time_growth,
@@ -34,7 +32,6 @@ class Standing:
     fit: float  # the same of the whole fit; building, judging and proving take their time, too
     proved: int  # problems on which what it solved is proved globally optimal
     penalised: float  # the time with every failure counted as the time limit; inf where a limit is not known
-    against: Paired | None  # its time against the first choice's; None for the first choice and where there is none
     residual: float  # median verified residual on what it solved
     growth: Growth  # of its time with the record length
     failures: dict[str, int]  # {why not solved: problems}, most frequent first
@@ -83,7 +80,7 @@ def compare_solvers(found: Results, name: str = "") -> Section:
 
     def order(standing: Standing) -> tuple:
         """First choice, candidates by their time against it, then by what was solved."""
-        ratio = standing.against.value if standing.against is not None else 1.0
+        ratio = choice.against[standing.solver].value if standing.solver in choice.against else 1.0
         candidate = standing.solver in choice.candidates
         return (standing.solver != choice.first, not candidate, ratio if candidate else -standing.solved,
                 standing.penalised if np.isfinite(standing.penalised) else np.inf, standing.solver)
@@ -107,13 +104,11 @@ def _standings(found: Results, counted: np.ndarray, choice: Choice) -> list[Stan
         words, counts = np.unique(state[ran & ~solved].astype(str), return_counts=True)
         known = found.residual[solved, s]
         known = known[np.isfinite(known)]
-        other = choice.first and solver != choice.first
         made.append(Standing(
             solver=solver, problems=int(ran.sum()), solved=int(solved.sum()), refused=int((state == REFUSED).sum()),
             false_claims=int(found.false[:, s].sum()), fastest=int(fastest[:, s].sum()),
             time=shifted_geometric_mean(mine[solved]), fit=shifted_geometric_mean(found.fit[solved, s]),
             proved=int(found.proved[:, s].sum()), penalised=shifted_geometric_mean(np.where(solved, mine, limits)[ran]),
-            against=paired(mine, times[:, found.solvers.index(choice.first)]) if other else None,
             residual=float(np.median(known)) if known.size else float("nan"),
             growth=time_growth(mine, found.n, found.group),
             failures={str(words[i]): int(counts[i]) for i in np.argsort(-counts, kind="stable")}))

@@ -1,9 +1,12 @@
 """One sentence of a verdict, and how its numbers and names are written."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 from optid.program.solution import tolerance
+
+Key = TypeVar("Key")
 
 GOOD, FAIR, BAD = "good", "fair", "bad"
 NO_DIFFERENCE = "No difference beyond chance or"
@@ -18,6 +21,14 @@ class Statement:
     word: str  # the heading: what to do
     text: str  # why, with the numbers
     about: str  # "solver", "formulation", "data sets", "claims"
+
+
+def grouped(pairs: Iterable[tuple[Key, str]]) -> dict[Key, list[str]]:
+    """Return {key: its words}, both in order of appearance."""
+    found: dict[Key, list[str]] = {}
+    for key, word in pairs:
+        found.setdefault(key, []).append(word)
+    return found
 
 
 def plural(n: int, noun: str) -> str:

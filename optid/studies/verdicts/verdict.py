@@ -26,7 +26,7 @@ from optid.studies.verdicts.outcomes import (
 )
 from optid.studies.verdicts.quality import Quality, compare_formulations
 from optid.studies.verdicts.standings import Section, compare_solvers
-from optid.studies.verdicts.statement import BAD, FAIR, Statement, listed, plural
+from optid.studies.verdicts.statement import BAD, FAIR, Statement, grouped, listed, plural
 
 
 @dataclass(frozen=True)
@@ -176,23 +176,20 @@ def _refuted(found: Results, table: Table) -> Statement | None:
 
 
 def _false_claims(table: Table, found: Results) -> tuple[FalseClaim, ...]:
-    groups: dict[tuple[str, ...], list[str]] = {}
-    for i in np.flatnonzero(table["false_claim"]):
-        key = tuple(str(table[c][i]) for c in ("solver", "formulation", "status_claimed"))
-        groups.setdefault(key, []).append(table["reason"][i])
+    lies = [(int(i), str(table["reason"][i])) for i in np.flatnonzero(table["false_claim"])]
     for p, s in zip(*np.nonzero(found.state == CONTRADICTED)):
-        key = (found.solvers[s], str(found.formulation[p]), str(table["status_claimed"][found.row[p, s]]))
         winner = found.solvers[int(np.flatnonzero(found.solved[p])[0])]
-        groups.setdefault(key, []).append(f"{winner} has a verified point")
+        lies.append((int(found.row[p, s]), f"{winner} has a verified point"))
+    groups = grouped(((table["solver"][i], table["formulation"][i], table["status_claimed"][i]), reason)
+                     for i, reason in lies)
     claims = [FalseClaim(key[0], key[1], len(reasons), key[2], min(reasons)) for key, reasons in groups.items()]
     return tuple(sorted(claims, key=lambda c: (-c.count, c.solver, c.formulation, c.claimed)))
 
 
 def _failures(found: Results) -> tuple[Failure, ...]:
-    groups: dict[tuple[str, str, str], list[str]] = {}
-    for p, s in zip(*np.nonzero(~np.isin(found.state, (SOLVED, NOT_RUN, UNTIMED)))):
-        reason = str(found.reason[p, s])
-        groups.setdefault((found.solvers[s], str(found.state[p, s]), without_numbers(reason)), []).append(reason)
+    failed = zip(*np.nonzero(~np.isin(found.state, (SOLVED, NOT_RUN, UNTIMED))))
+    said = [(found.solvers[s], str(found.state[p, s]), str(found.reason[p, s])) for p, s in failed]
+    groups = grouped(((solver, state, without_numbers(reason)), reason) for solver, state, reason in said)
     failures = [Failure(solver, state, reasons[0] if len(set(reasons)) == 1 else shape, len(reasons))
                 for (solver, state, shape), reasons in groups.items()]
     return tuple(sorted(failures, key=lambda f: (f.state == REFUSED, -f.count, f.solver, f.state, f.reason)))
