@@ -248,6 +248,8 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:
         entering = new is not None and not entered and (
             damping > NEAR or new.at.value <= TRUSTED * here.at.after(step))
         if new is not None and (entering or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
+            if not damping and entered and fall > expected:
+                new = _longer(here, new, step, weight)
             previous, here, growth = here, new, 4.0
             entered = entered or new.outside <= INSIDE
             damping *= 0.1 if fall > 0.5 * expected else 1.0
@@ -265,6 +267,16 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:
             damping = 0.0  # only an undamped programme can confirm
     reason = f"{STEPS} programmes did not suffice"
     return (yield from _ended(here, reason, last, {**figures, "programmes": STEPS + more + 1}))
+
+
+def _longer(here: _Iterate, new: _Iterate, step: Array, weight: float) -> _Iterate:
+    """Go on along a step that gained more than its programme promised, as on a boundary that is curved inwards."""
+    for factor in 2.0 ** np.arange(1, PARTS + 1):
+        further = here.moved(here.x + factor * step)
+        if further is None or further.merit(weight) >= new.merit(weight):
+            break
+        new = further
+    return new
 
 
 def _shortened(here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:
