@@ -90,7 +90,7 @@ def hammerstein(folder: Path, quick: bool) -> dict:
     cases = [("stretch reflex", *reflex, 8, 59.3, [3, 6, 8], [8, 12, 16, 24], [2, 3, 4], [2, 4, 6],
               "monotone:decreasing"),
              ("actuator", *actuator, 6, 59.0, [0, 1], [4, 6, 8], [2, 3, 4, 5], [2, 3, 4, 5],
-              "monotone:increasing")]
+              "monotone:decreasing")]
     figures = {}
     for name, train, test, cells, goal, delays, sizes, nas, nbs, direction in cases:
         low, high = (float(end[0]) for end in train.ranges())
