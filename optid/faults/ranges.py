@@ -91,6 +91,15 @@ def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
     return low, high
 
 
+def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
+    """Return which samples (N,) lie at most so many samples behind an input that is outside its range."""
+    edges = np.zeros(len(u) + memory + 2, dtype=int)
+    for one in outside(model, u):
+        np.add.at(edges, one.samples, 1)
+        np.add.at(edges, one.samples + memory + 1, -1)
+    return np.cumsum(edges)[: len(u)] > 0
+
+
 def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:
     """Return what unknown effects outside the range add to the state (N, n, K) and to the output (N, l, K).
 

@@ -45,6 +45,7 @@ class Decisions:
         begun: first sample after the last input of which nothing is known.
         testable: (C,) whether a whole loss would be noticed.
         passing: [candidate, sample at which it has faded] of transients.
+        kept: the statistics (T, C) of all samples, where they are asked for.
     """
 
     columns: Columns
@@ -60,6 +61,7 @@ class Decisions:
     named_at: int = 0
     quiet: int = 0
     begun: int = 0
+    kept: list[Array] | None = None
 
     KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "passing"
 
@@ -77,6 +79,8 @@ class Decisions:
         """Count the samples (T, C) at the end of a block in which all is quiet."""
         loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.q, axis=1))
         self.quiet = self.quiet + len(statistic) if not loud.size else len(statistic) - 1 - int(loud[-1])
+        if self.kept is not None:
+            self.kept.append(statistic)
 
     def excitation(self, weight: Array, now: int, window: int) -> list[Event]:
         """Return what becomes testable or untestable along weights (T, C) of samples from `now` on."""
