@@ -90,6 +90,16 @@ def test_the_interval_of_a_sensor_gain_covers():
     assert inside >= 16  # 19 of 20 are expected
 
 
+def test_with_one_output_a_disturbance_of_unknown_direction_is_offered_beside_a_frozen_sensor():
+    A, B = np.array([[0.9, 0.2], [0.0, 0.8]]), np.array([[0.1], [1.0]])
+    model = noisy(A, B, np.array([[1.0, 0.0]]), 0.001 * np.eye(2), np.array([[0.01]]))
+    u = levels(300, 0)[:, :1]
+    load = {"load": np.array([1.0, 0.0])}
+    y = inject(model, u, Fault.step("process:load", 150, -0.4), seed=4, process=load)
+    answer = diagnose(model, (u, y), dictionary(model, kinds=["bias", "loss", "frozen"]))
+    assert answer.best is not None and answer.best.label == "process"
+
+
 def test_a_partial_loss_about_another_zero_is_a_loss_and_a_stuck_actuator_is_stuck():
     zero = -1.0  # the actuator does nothing there; f is the identity
     u = levels(COUNT, 0) + 0.5

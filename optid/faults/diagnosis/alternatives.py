@@ -48,8 +48,8 @@ def extended(found: Dictionary) -> Dictionary | None:
         replace(c, kind="stuck") for c in found.candidates
         if c.kind == "loss" and c.columns and c.zero is None and c.name not in stuck
     ]
-    alone = found.model.l == 1 and any(c.kind == "frozen" for c in found.candidates)  # any course explains a record
-    if found.unknown and not alone and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
+    known = found.model.l > 1 or any(c.kind != "frozen" for c in found.candidates)  # else any course explains a record
+    if found.unknown and known and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
         into_state, into_output = place_of(found.model, UNKNOWN_DIRECTION)
         more.append(Candidate(
             UNKNOWN_DIRECTION, "bias", into_state, into_output, members=(UNKNOWN_DIRECTION,),
