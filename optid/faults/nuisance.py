@@ -274,7 +274,4 @@ def sensitivities(
     for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
         sides = [_whitened(moved, steady, part, x0, present) for moved in (plus, minus)]
         columns[:, j] = (sides[0] - sides[1]) * factor
-    impulse = np.zeros((len(part.y), model.nx, model.nx))
-    impulse[0] = np.eye(model.nx)
-    start = steady.respond(impulse, np.zeros((len(part.y), model.l, model.nx)), present)
-    return columns, steady.whitened(start, present).reshape(present.size, model.nx)
+    return columns, steady.whitened(steady.jumps(0, present), present).reshape(present.size, model.nx)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
-from optid.faults.decoupling import decoupled
+from optid.faults.directions import decoupled
 from optid.faults.faults import Fault, channel_of, place_of
 from optid.faults.scheduled import with_schedules
 from optid.faults.whitening import Predictor, predictor
@@ -263,7 +263,7 @@ def dictionary(
         zeros: {input: the value at which its actuator does nothing}. A loss is the share (1 - gamma) of what the
             actuator does beyond that; without it any constant may be added.
         disturbances: names, as in `Fault`, of what may do anything at any time without being a fault: inputs, outputs,
-            directions of `process`. The predictor does not feel them (`optid.faults.decoupling`), and a direction that
+            directions of `process`. The predictor does not feel them (`optid.faults.directions`), and a direction that
             is declared a disturbance is no fault.
 
     Raises:

@@ -87,6 +87,13 @@ class Predictor:
         kernels.respond(A, C, K, L, shown, state, output, response)
         return response
 
+    def jumps(self, onset: int, present: Array) -> Array:
+        """Return what unit jumps of the state at a sample leave in the innovations (N, l, n) of readings (N, l)."""
+        (count, l), n = present.shape, len(self.A)  # noqa: E741
+        into_state = np.zeros((count, n, n))
+        into_state[onset] = np.eye(n)
+        return self.respond(into_state, np.zeros((count, l, n)), present)
+
     def run(self, model: "HammersteinSS", x0: Array, f: Array, fed: Array, y: Array,
             added: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
         """Return states (T + 1, n) and whitened innovations (T, l) of complete samples of the model.
@@ -190,6 +197,40 @@ class Whitened:
         """Return what a signature (N, l, d) of the innovations is in r: whitened like them."""
         white = self.predictor.whitened(signature, self.present)
         return white if self.nuisance is None else self.nuisance(white)
+
+
+def check_window(
+    model: "HammersteinSS", whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf
+) -> None:
+    """Refuse whitened innovations that a search or a test cannot take.
+
+    Args:
+        model: whose innovations they should be.
+        whitened: the window.
+        what: the search or the test, for messages.
+        onset: sample of the window from which something is supposed to have changed.
+        longest: readings of a window at most.
+
+    Raises:
+        StructureError: several experiments, an onset outside the window, a window that is too long.
+        DataError: other outputs than the model's, innovations that are not finite.
+    """
+    if not isinstance(whitened, Whitened):
+        raise StructureError(
+            f"{what} takes the whitened innovations of one experiment, as optid.faults.whiten returns them: take the "
+            "experiments of a record one by one."
+        )
+    count, outputs = whitened.r.shape
+    if outputs != model.l:
+        raise DataError(f"The window has {outputs} outputs; the dictionary is of {model.l}.")
+    if onset != int(onset) or not 0 <= onset < count:
+        raise StructureError(f"onset={onset!r} lies outside the window of {count} samples.")
+    if whitened.r.size > longest:
+        raise StructureError(
+            f"{whitened.r.size} readings are too many for this test ({longest}): use a shorter window.")
+    if not np.isfinite(whitened.r).all():
+        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
+        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
 
 
 def whiten(
