@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data, Experiment
+from optid.data.record import Data, Experiment, as_list
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
 from optid.faults.whitening import Predictor, predictor
@@ -218,7 +218,7 @@ def _predicted(
     """Every experiment with its initial state, whether a reading is there, and its whitened innovations (N l,)."""
     raw = in_units_of(model, data)
     given = model.initial_state(raw, "predict")
-    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
+    for part, x0 in zip(raw.experiments, as_list(given)):
         present = ~np.isnan(part.y)
         yield part, x0, present, _whitened(model, steady, part, x0, present)
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optid.data.record import Data
+from optid.data.record import Data, as_list
 from optid.errors import DataError
-from optid.faults.whitening import Whitened, predictor, whiten
+from optid.faults.whitening import predictor, whiten
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
@@ -153,7 +153,7 @@ def _energy(model: "HammersteinSS", data: Data) -> float:
         found = whiten(model, data)
     except DataError:
         return float("inf")
-    return float(sum(np.sum(part.r**2) for part in ([found] if isinstance(found, Whitened) else found)))
+    return float(sum(np.sum(part.r**2) for part in as_list(found)))
 
 
 def _runs(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

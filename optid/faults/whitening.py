@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array, compact
-from optid.data.record import Data
+from optid.data.record import Data, as_list, one_or_all
 from optid.errors import DataError, DataWarning, StructureError
+from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
 from optid.models.recursions import SHORT, propagated
@@ -93,34 +94,6 @@ class Predictor:
         into_state = np.zeros((count, n, n))
         into_state[onset] = np.eye(n)
         return self.respond(into_state, np.zeros((count, l, n)), present)
-
-    def run(self, model: "HammersteinSS", x0: Array, f: Array, fed: Array, y: Array,
-            added: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
-        """Return states (T + 1, n) and whitened innovations (T, l) of complete samples of the model.
-
-        Args:
-            model: with the functions of inputs and outputs.
-            x0: (n,) state before the first sample.
-            f: (T, r) functions of the inputs.
-            fed: (T, s) functions of the outputs.
-            y: (T, l) readings.
-            added: what is added to the next state (T, n) and to the output (T, l).
-        """
-        from optid.faults.kernels import add_product, predict
-
-        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
-        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
-                                       (model.D, f, direct)):
-            if matrix.any():
-                add_product(np.ascontiguousarray(matrix), signal, target)
-        if added is not None:
-            drive += added[0]
-            direct += added[1]
-        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
-        x[0] = x0
-        A, C, K, root = map(compact, (model.A, model.C, self.K, self.root))
-        predict(A, C, K, root, drive, y, direct, x, r)
-        return x, r
 
     def whitened(self, innovations: Array, present: Array | None = None) -> Array:
         """Return innovations (N, l) or (N, l, d) in units of their covariance, zero where a reading is missing.
@@ -255,24 +228,21 @@ def whiten(
     steady = scale or (predictor(model) if uncertainty is None else uncertainty.predictor)
     gained, raw, fitted = replace(model, K=steady.K), in_units_of(model, data), isinstance(x0, str) and x0 == "fit"
     given = gained.initial_state(raw, "predict") if fitted else x0
-    predicted = gained.predict(raw, x0=given)
-    predictions = predicted if isinstance(predicted, tuple) else (predicted,)
+    predictions = as_list(gained.predict(raw, x0=given))
     starts = [np.zeros(model.nx)] * len(predictions) if isinstance(given, str) else (
         [given] if len(predictions) == 1 else given)
     found = []
     for part, prediction, start in zip(raw.experiments, predictions, starts):
         present, start = ~np.isnan(part.y), np.asarray(start, dtype=float)
-        innovations, y = part.y - prediction, np.where(present, part.y, prediction)
+        states = simulation.visited(simulation.prepared(gained, "predict", part.u, part.y, None, ""), start)
+        innovations = part.y - prediction
         r = steady.whitened(np.where(present, innovations, 0.0), present)
-        fed = np.array([g(y[:, o]) for g, o in zip(model.feedback, model.output_of)]).reshape(-1, len(y)).T
-        states = None if np.isnan(part.u).any() else steady.run(
-            model, start, np.ascontiguousarray(model.expanded(part.u)), np.ascontiguousarray(fed), y)[0][:-1]
         white = Whitened(r, innovations, present, steady, model.outputs, states=states)
         if uncertainty is not None:
             nuisance = uncertainty.nuisance(part, start, present, free_start=fitted)
             white = replace(white, r=nuisance(r), nuisance=nuisance)
         found.append(white)
-    return found[0] if len(found) == 1 else tuple(found)
+    return one_or_all(found)
 
 
 @dataclass(frozen=True, eq=False)

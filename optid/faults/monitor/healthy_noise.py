@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, as_list
 from optid.errors import DataError
 from optid.faults.monitor.arl import COMMON, Calibration
 from optid.faults.nuisance import ModelUncertainty, sensitivities
 from optid.faults.ranges import unsure_since
 from optid.faults.signatures import Dictionary
-from optid.faults.whitening import OTHER_SCALE, Predictor, Whitened, health, whiten
+from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
 from optid.models import NoiseCovariances
 from optid.models.experiments import in_units_of
 
@@ -43,7 +43,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     raw = in_units_of(known.model, data)
     given = known.model.initial_state(raw, "predict")
     effects, inputs = [], []
-    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
+    for part, x0 in zip(raw.experiments, as_list(given)):
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
         by_parameter, _ = sensitivities(known.model, known.predictor, here, x0, there, known.root)
@@ -70,7 +70,7 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     """
     white, steady = whiten(found.model, healthy, scale=found.predictor), found.predictor
     parts = [replace(part, present=part.present & ~unsure_since(found.model, record.u, steady.settling)[:, None])
-             for part, record in zip([white] if isinstance(white, Whitened) else white, healthy.raw().experiments)]
+             for part, record in zip(as_list(white), healthy.raw().experiments)]
     judged = health(parts)
     if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
         return found, ""
