@@ -22,9 +22,6 @@ if TYPE_CHECKING:
 ADDITIVE = ("bias", "drift", "jump", "spike")
 """Kinds whose signature depends on nothing but the model and the time since the onset."""
 
-SUMS = {"jump": 0, "spike": 0, "drift": 2}
-"""How often the response to an impulse is summed for the signature of a kind; once for the others."""
-
 KINDS = {
     "bias": ("actuator", "sensor", "process"),
     "drift": ("actuator", "sensor", "process"),
@@ -193,9 +190,7 @@ class Dictionary:
         c = self[candidate] if isinstance(candidate, str) else candidate
         since = np.arange(count) - onset
         if c.additive:
-            course = (since == 0).astype(float)
-            for _ in range(SUMS.get(c.kind, 1)):
-                course = np.cumsum(course)
+            course = course_of(c.kind, since)
             return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
         if c.kind == "schedule":
             raise StructureError(f"{c.label}: its signature depends on the states: ask scan(...) for it.")
@@ -241,6 +236,12 @@ class Dictionary:
         lines += [f"  {a} and {b} are close: sine {sine:.3f}" for a, b, sine in self.near]
         lines += [f"  left out: {label}, {why}" for label, why in self.excluded.items()]
         return "\n".join(lines + ["  unknown: none of these"] * self.unknown)
+
+
+def course_of(kind: str, since: np.ndarray) -> Array:
+    """Return the course (N,) of an additive fault of unit size, by the samples (N,) since its onset."""
+    return np.asarray((since == 0) if kind in ("jump", "spike") else np.maximum(since + 1, 0) if kind == "drift" else
+                      (since >= 0), dtype=float)
 
 
 def dictionary(
@@ -327,14 +328,8 @@ def _horizon(steady: Predictor) -> int:
 
 def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
     """Return the signature (N, l, d) from the onset on; of a candidate that has none, that of a bias in its place."""
-    impulse = np.zeros((count, *candidate.into_state.shape))
-    impulse[0] = candidate.into_state
-    direct = np.zeros((count, *candidate.into_output.shape))
-    direct[0] = candidate.into_output
-    found = steady.whitened(steady.respond(impulse, direct))
-    for _ in range(SUMS.get(candidate.kind, 1)):
-        found = np.cumsum(found, axis=0)
-    return found
+    course = course_of(candidate.kind, np.arange(count))[:, None, None]
+    return steady.whitened(steady.respond(course * candidate.into_state, course * candidate.into_output))
 
 
 def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> list[Candidate]:
