@@ -142,7 +142,8 @@ class Decisions:
 
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
         rule, noise = self.rules, noisy_sensor(window)
-        louder = noise.gain - float(self.q.min())  # a noise that has grown is an answer, too
+        # a noise that has grown is an answer, too, and the likely one where it was the answer before
+        louder = noise.gain - float(self.q.min()) * (self.named != AGAIN)
         share = np.exp(np.clip(np.append(gains, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
         chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is named
