@@ -54,11 +54,9 @@ class Outside(NamedTuple):
 
 
 def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
-    """Return the inputs that leave the range their nonlinearities were identified over.
+    """Return the inputs (N, m) that leave the range their nonlinearities were identified over.
 
-    Args:
-        model: the model; a function without an interval, or one that the user gave, is known everywhere.
-        u: (N, m) inputs.
+    A function without an interval, or one that the user gave, is known everywhere.
     """
     found = []
     for column, (low, high) in enumerate(zip(*known_range(model))):

@@ -111,9 +111,7 @@ class CourseProblem:
     def pruned(self, columns: Array, support: np.ndarray) -> np.ndarray:
         """Drop changes one by one as long as the criterion falls: neighbours that share one change become one.
 
-        Args:
-            columns: (N l, N) of all changes.
-            support: changes to begin with.
+        The columns (N l, N) are those of all changes; the support is where they are to begin with.
         """
         kept = list(support)
         best = self.criterion(self.refitted(columns[:, kept])[1], EACH * len(kept)) if kept else np.inf
@@ -135,12 +133,7 @@ class CourseProblem:
         return np.array(kept, dtype=int)
 
     def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
-        """Move every change to the sample where it explains most beside the others, until none moves.
-
-        Args:
-            columns: (N l, N) of all changes.
-            kept: changes to begin with.
-        """
+        """Move every change to the sample where it explains most beside the others, until none moves; as `pruned`."""
         sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         each = Atoms("change", np.arange(self.count), (columns / sizes).T[:, :, None], np.ones((self.count, 1, 1)), 0.0)
         _, found = exchanged([each], self.r, [("change", int(k)) for k in kept], -1.0)

@@ -16,13 +16,9 @@ HALVINGS = 60
 
 
 def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tuple[Estimate, ...]:
-    """Return the faults of an explanation with their intervals, in the order of their onsets.
+    """Return the faults of an explanation with intervals of this coverage, in the order of their onsets.
 
-    Args:
-        found: the explanation.
-        coverage: nominal probability of every interval.
-        window: samples N.
-        edge: onsets nearer than this to the start or the end of the record leave the size to its interval.
+    Onsets nearer than `edge` to the start or the end of the window, of N samples, leave the size to its interval.
     """
     weights, best, first = found.weights, found.best, 0
     result = []

@@ -42,14 +42,8 @@ def cleaned(
 ) -> tuple[Scan, Experiment, tuple[tuple[int, int], ...]]:
     """Search a record without the influence of wild readings.
 
-    Args:
-        found: the candidates.
-        part: the record.
-        whitened_of: its whitened innovations.
-
-    Returns:
-        The search of the bounded innovations, the record without the readings that were taken out, and these
-        (sample, output).
+    Returned are the search of the bounded innovations, the record without the readings that were taken out, and these
+    (sample, output).
     """
     wide, taken, whitened = with_spikes(found), [], whitened_of(part)
     while len(taken) < MOST * whitened.present.sum():

@@ -12,13 +12,7 @@ TONES = {"healthy": "good", "faulty": "bad"}
 
 
 def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str = "") -> Path:
-    """Write a diagnosis as a self-contained HTML page.
-
-    Args:
-        found: the diagnosis, not one that was read from a file.
-        path: the file, replaced when it exists.
-        record: name of the record.
-        command: the command line behind it.
+    """Write a diagnosis as a self-contained HTML page, with the name of the record and the command line behind it.
 
     Raises:
         StructureError: a diagnosis read from a file: the record is not in it.

@@ -211,9 +211,6 @@ def untestable(found: Scan) -> dict[str, str]:
     A loss shows as a lack of movement. Where the input stands still, a loss is an offset of the actuator, and where the
     function of it is zero, it is nothing. So the whole record is asked how large a complete loss would be beside a
     constant offset of the same actuator.
-
-    Args:
-        found: the search of the record.
     """
     result = {}
     for c, candidate in enumerate(found.dictionary.candidates):

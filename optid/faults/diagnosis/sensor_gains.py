@@ -43,13 +43,7 @@ class _Grid(NamedTuple):
 
 
 def sensor_gains(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
-    """Return the sensors of a dictionary (kind "loss") that may have lost a share of their reading.
-
-    Args:
-        found: the dictionary.
-        white: the window.
-        part: the record behind it.
-    """
+    """Return the sensors of a dictionary (kind "loss") that may have lost a share of their reading in a window."""
     if white.states is None or found.model.feedback or np.any(found.model.L):
         return []
     candidates = [c for c in found.candidates if c.kind == "loss" and not c.columns]

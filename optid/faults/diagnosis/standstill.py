@@ -24,15 +24,10 @@ def without_flat_lines(record: Data, number: int) -> tuple[Experiment, tuple[Fla
 
 
 def frozen(lines: Sequence[FlatLine], record: Data, found: Dictionary, edge: int) -> tuple[Estimate, ...]:
-    """Return the sensors that stand still, each at its longest run.
+    """Return the sensors that stand still, each at its longest run, as known to the dictionary or not.
 
-    The first of the equal readings may be the last true one: the fault begins with the second.
-
-    Args:
-        lines: what stands still.
-        record: the record.
-        found: the dictionary; a sensor that it does not know as frozen is named as well.
-        edge: a run that begins nearer to the start of the record may have begun before it.
+    The first of the equal readings may be the last true one: the fault begins with the second. A run that begins nearer
+    to the start of the record than `edge` may have begun before it.
     """
     longest = {line.name: line for line in sorted(lines, key=lambda line: line.count)}
     faults = []

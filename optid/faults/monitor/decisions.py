@@ -115,14 +115,7 @@ class Decisions:
         return sorted(events, key=lambda e: e.sample)
 
     def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
-        """Decide what the last sample means.
-
-        Args:
-            now: its number.
-            window: the search.
-            plant: the filter.
-            hold: whether nothing may be named yet, because a sensor repeats its reading.
-        """
+        """Decide what the last sample means; nothing may be named while a sensor repeats its reading (`hold`)."""
         gains = np.where(window.peak > 0, window.statistic - self.q, -np.inf)
         best, watching = int(np.argmax(gains)), self.phase == WATCHING
         if self.phase in (WATCHING, LOST) and gains[best] > 0:

@@ -13,13 +13,7 @@ TONES = {"healthy": "good", "refitted": "good", "as diagnosed": "fair", "ambiguo
 
 
 def write(found: Reformulation, path: str | Path, *, record: str = "", command: str = "") -> Path:
-    """Write a reformulation as a self-contained HTML page.
-
-    Args:
-        found: the reformulation.
-        path: the file, replaced when it exists.
-        record: name of the record.
-        command: the command line behind it.
+    """Write a reformulation as a self-contained HTML page, with the name of the record and the command line behind it.
 
     Raises:
         OSError: the file cannot be written.
