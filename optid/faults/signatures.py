@@ -288,10 +288,10 @@ def dictionary(
     names = [name for name in names if name.partition(":")[2] not in apart]
     names += [f"process:{c}" for c in process or {} if c not in apart]
     at_rest = {_chosen([name], model.inputs)[0]: float(value) for name, value in (zeros or {}).items()}
-    raw = [_candidate(model, name, kind, process, at_rest) for kind in wanted if kind != "jump" for name in names
+    raw = [candidate_of(model, name, kind, process, at_rest) for kind in wanted if kind != "jump" for name in names
            if name.partition(":")[0] in KINDS[kind]]
     if state_jump or "jump" in wanted:
-        raw.append(_candidate(model, "state", "jump", None, {}))
+        raw.append(candidate_of(model, "state", "jump"))
     excluded: dict[str, str] = {}
     found = [kept for candidate in raw for kept in _seen(steady, candidate, excluded)]
     if not found:
@@ -310,15 +310,17 @@ def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
     return chosen
 
 
-def _candidate(
-    model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None, zeros: Mapping[str, float]
+def candidate_of(
+    model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
+    zeros: Mapping[str, float] | None = None,
 ) -> Candidate:
+    """Return a candidate by its name and kind; arguments and errors as of `place_of` and `dictionary`."""
     into_state, into_output = place_of(model, name, None, process)
     new = Candidate(name, kind, into_state, into_output, places=(name,))
     if kind in ("loss", "stuck") and name.startswith("actuator"):
         c = channel_of(model.inputs, name)
         columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
-        new = replace(new, columns=columns, zero=zeros.get(name.partition(":")[2]))
+        new = replace(new, columns=columns, zero=(zeros or {}).get(name.partition(":")[2]))
     return replace(new, members=(new.own_label,))
 
 

@@ -107,7 +107,7 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     """The diagnosis of experiment `number`; `noise` are arguments of `whiten`, and a remark is reported in any case."""
     model = found.model
     part, lines = without_flat_lines(record, number)
-    stuck = frozen(lines, record, found, 2 * model.nx)
+    stuck = frozen(lines, found, 2 * model.nx)
     first = search_record(record, part, found, asked, noise)
     notes = [remark, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u))]
     seen, ranking, alarm = find(first)

@@ -15,7 +15,7 @@ from optid.arrays import Array
 from optid.data.record import Experiment
 from optid.faults.diagnosis.posterior import marginal
 from optid.faults.search.scanning import Scan, scan
-from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Whitened
 
 BOUND = 2.5
@@ -87,13 +87,9 @@ def _fitted(search: Scan) -> Array:
 
 def with_spikes(found: Dictionary) -> Dictionary:
     """Return a dictionary that has the outliers of all sensors, behind its own candidates."""
-    n, l = found.model.nx, found.model.l  # noqa: E741
     known = {c.name for c in found.candidates if c.kind == "spike"}
-    more = [
-        Candidate(f"sensor:{name}", "spike", np.zeros((n, 1)), column[:, None], (), (f"sensor:{name} spike",),
-                  (f"sensor:{name}",), True)
-        for name, column in zip(found.model.outputs, np.eye(l)) if f"sensor:{name}" not in known
-    ]
+    more = [replace(candidate_of(found.model, f"sensor:{name}", "spike"), bounded_deflection=True)
+            for name in found.model.outputs if f"sensor:{name}" not in known]
     return found.with_candidates(more)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from optid.data.record import Data, Experiment
 from optid.faults.diagnosis.answers import Estimate
 from optid.faults.screening import FlatLine, flat_lines
-from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.signatures import Dictionary, candidate_of
 
 
 def without_flat_lines(record: Data, number: int) -> tuple[Experiment, tuple[FlatLine, ...]]:
@@ -23,7 +23,7 @@ def without_flat_lines(record: Data, number: int) -> tuple[Experiment, tuple[Fla
     return replace(part, y=y) if lines else part, lines
 
 
-def frozen(lines: Sequence[FlatLine], record: Data, found: Dictionary, edge: int) -> tuple[Estimate, ...]:
+def frozen(lines: Sequence[FlatLine], found: Dictionary, edge: int) -> tuple[Estimate, ...]:
     """Return the sensors that stand still, each at its longest run, as known to the dictionary or not.
 
     The first of the equal readings may be the last true one: the fault begins with the second. A run that begins nearer
@@ -32,12 +32,8 @@ def frozen(lines: Sequence[FlatLine], record: Data, found: Dictionary, edge: int
     longest = {line.name: line for line in sorted(lines, key=lambda line: line.count)}
     faults = []
     for name, line in longest.items():
-        o = record.outputs.index(name.partition(":")[2])
         known = [c for c in found.candidates if c.kind == "frozen" and name in c.places]
-        candidate = known[0] if known else Candidate(
-            name, "frozen", np.zeros((found.model.nx, 1)), np.eye(found.model.l)[:, [o]],
-            members=(f"{name} frozen",), places=(name,),
-        )
+        candidate = known[0] if known else candidate_of(found.model, name, "frozen")
         onset, censored, value = line.first + 1, line.first < edge, np.array([line.value])
         faults.append(Estimate(
             candidate.label, name, "frozen", candidate, onset, (0 if censored else onset, onset), censored, value,

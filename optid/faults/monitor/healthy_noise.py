@@ -75,30 +75,27 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
         return found, ""
     signals = [np.where(part.present, part.innovations, 0.0) for part in parts]
-    taps, covariance = ([], _covariance(signals)) if judged.white else _autoregression(signals)
+    taps, covariance = _autoregression(signals, (0,) if judged.white else ORDERS)
     said = (f"on the healthy record the innovations are not those of the model (whiteness p = {judged.p_value:.2g}, "
             f"size {judged.ratio:.2f} times the predicted one): its noise is taken from that record"
             + (f", as an autoregression of order {len(taps)}." if taps else "."))
     return _recoloured(found, taps, covariance), said
 
 
-def _covariance(signals: list[Array]) -> Array:
-    return np.asarray(sum(s.T @ s for s in signals) / sum(len(s) for s in signals))
-
-
-def _autoregression(signals: list[Array]) -> tuple[list[Array], Array]:
+def _autoregression(signals: list[Array], orders: tuple[int, ...]) -> tuple[list[Array], Array]:
     """Taps (l, l) and covariance of what is left, by least squares; the order by BIC."""
     l, best = signals[0].shape[1], (np.inf, [], np.eye(1))  # noqa: E741
-    most = max(ORDERS)
-    for order in ORDERS:
-        past = np.vstack([np.hstack([s[most - i : len(s) - i] for i in range(1, order + 1)]) for s in signals])
+    most = max(orders)
+    for order in orders:
+        past = np.vstack([np.hstack([s[most:, :0], *(s[most - i : len(s) - i] for i in range(1, order + 1))])
+                          for s in signals])
         now = np.vstack([s[most:] for s in signals])
         weights = np.linalg.lstsq(past, now, rcond=None)[0]
         left = now - past @ weights
         covariance = left.T @ left / len(left)
         score = len(left) * float(np.linalg.slogdet(covariance)[1]) + order * l * l * np.log(len(left))
         if score < best[0]:
-            best = score, [part.T for part in np.split(weights, order)], covariance
+            best = score, [part.T for part in np.split(weights, max(order, 1))][:order], covariance
     return best[1], best[2]
 
 
