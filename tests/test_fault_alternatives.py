@@ -78,7 +78,7 @@ def test_the_likelihood_of_a_sensor_gain_is_that_of_a_kalman_filter_with_another
 def test_the_interval_of_a_sensor_gain_covers():
     model, u, inside = small(), levels(COUNT, 0), 0
     found = dictionary(model, kinds=["loss"])
-    from optid.faults.diagnosis.intervals import estimates
+    from optid.faults.diagnosis.posterior import estimates
     from optid.faults.diagnosis.records import record_of
 
     for seed in range(20):

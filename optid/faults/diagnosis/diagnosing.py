@@ -11,7 +11,7 @@ from optid.errors import StructureError
 from optid.faults.diagnosis.alternatives import final_effect
 from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate, Evidence
 from optid.faults.diagnosis.courses import LONGEST
-from optid.faults.diagnosis.intervals import estimates
+from optid.faults.diagnosis.posterior import estimates
 from optid.faults.diagnosis.ranking import NOTHING, Fit, find
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
 from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of
