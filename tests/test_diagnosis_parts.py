@@ -25,7 +25,7 @@ from optid.faults.diagnosis.posterior import (
     single,
     smallest_set,
 )
-from optid.faults.search.pair_search import pairs
+from optid.faults.search.subsets import pairs
 from optid.faults.search.sweeps import sweep
 from optid.faults.whitening import Whitened
 
