@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -150,10 +150,10 @@ def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float]
 def _energy(model: "HammersteinSS", data: Data) -> float:
     """Energy of the innovations; infinite where the model is not defined for such inputs."""
     try:
-        found = whiten(model, data)
+        found: list[Any] = as_list(whiten(model, data))
     except DataError:
         return float("inf")
-    return float(sum(np.sum(part.r**2) for part in as_list(found)))
+    return float(sum(np.sum(part.r**2) for part in found))
 
 
 def _runs(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

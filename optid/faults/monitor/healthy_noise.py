@@ -1,7 +1,7 @@
 """What healthy records say about the noise: its colour, its size, and how much the thresholds must rise."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -65,16 +65,17 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     """Return a dictionary with the noise that a healthy record shows, and what was changed.
 
     Samples after an input left its identified range say nothing of the noise. Innovations that are white and of the
-    size predicted leave the dictionary as it is. Otherwise they get an autoregression, whose
-    order is chosen by BIC; its past innovations are states beside those of the plant.
+    size predicted leave the dictionary as it is. Otherwise they get an autoregression, whose order is chosen by BIC;
+    its past innovations are states beside those of the plant.
     """
-    white, steady = whiten(found.model, healthy, scale=found.predictor), found.predictor
+    steady = found.predictor
+    whole: list[Any] = as_list(whiten(found.model, healthy, scale=steady))
     parts = [replace(part, present=part.present & ~unsure_since(found.model, record.u, steady.settling)[:, None])
-             for part, record in zip(as_list(white), healthy.raw().experiments)]
+             for part, record in zip(whole, healthy.raw().experiments)]
     judged = health(parts)
     if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
         return found, ""
-    signals = [np.where(part.present, part.innovations, 0.0) for part in parts]
+    signals = [np.where(part.present, part.innovations, np.nan) for part in parts]
     taps, covariance = _autoregression(signals, (0,) if judged.white else ORDERS)
     said = (f"on the healthy record the innovations are not those of the model (whiteness p = {judged.p_value:.2g}, "
             f"size {judged.ratio:.2f} times the predicted one): its noise is taken from that record"
@@ -87,9 +88,8 @@ def _autoregression(signals: list[Array], orders: tuple[int, ...]) -> tuple[list
     l, best = signals[0].shape[1], (np.inf, [], np.eye(1))  # noqa: E741
     most = max(orders)
     for order in orders:
-        past = np.vstack([np.hstack([s[most:, :0], *(s[most - i : len(s) - i] for i in range(1, order + 1))])
-                          for s in signals])
-        now = np.vstack([s[most:] for s in signals])
+        rows = np.vstack([np.hstack([s[most - i : len(s) - i] for i in range(order + 1)]) for s in signals])
+        now, past = np.split(rows[~np.isnan(rows).any(axis=1)], [l], axis=1)
         weights = np.linalg.lstsq(past, now, rcond=None)[0]
         left = now - past @ weights
         covariance = left.T @ left / len(left)
