@@ -69,10 +69,10 @@ def draw(path: Path, record: tuple[np.ndarray, np.ndarray], events: list, rebuil
 
     if rebuilt.schedule is not None:
         one = rebuilt.schedule.values[0]
-        shape.plot(one.u, one.healthy, "--", color="gray", label="before")
-        shape.errorbar(one.u, one.values, 2 * one.std, fmt="o-", color="tab:orange", capsize=3, label="refitted")
+        shape.plot(one.nodes, one.healthy, "--", color="gray", label="before")
+        shape.errorbar(one.nodes, one.values, 2 * one.std, fmt="o-", color="tab:orange", capsize=3, label="refitted")
         ratio = (one.healthy[-1] - one.healthy[0]) / (2 * np.tanh(1.8))  # gauge of the identified model
-        shape.plot(one.u, (1 - LOST) * ratio * np.tanh(1.5 * one.u), color="black", linewidth=1, label="truth")
+        shape.plot(one.nodes, (1 - LOST) * ratio * np.tanh(1.5 * one.nodes), color="black", linewidth=1, label="truth")
     shape.set(title="actuator u2", xlabel="input", ylabel="effect")
     shape.legend(fontsize=8)
 

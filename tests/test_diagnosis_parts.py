@@ -16,9 +16,16 @@ from optid.errors import ModelFileError, StructureError
 from optid.faults import Answer, Certificate, Diagnosis, Estimate, dictionary, load_diagnosis, scan, thresholds
 from optid.faults.consistency.leftover import alarm_probability, left_over
 from optid.faults.diagnosis.answers import Remaining
-from optid.faults.diagnosis.intervals import mixture_intervals, onset_range
-from optid.faults.diagnosis.posterior import SPREADS, marginal, several, single, smallest_set
-from optid.faults.search.pair_search import pairs
+from optid.faults.diagnosis.posterior import (
+    SPREADS,
+    marginal,
+    mixture_intervals,
+    onset_range,
+    several,
+    single,
+    smallest_set,
+)
+from optid.faults.search.subsets import pairs
 from optid.faults.search.sweeps import sweep
 from optid.faults.whitening import Whitened
 

@@ -51,7 +51,7 @@ def test_the_likelihood_is_that_of_the_full_covariance(found, missing, onset):
 
 def test_a_wrong_start_changes_nothing(found):
     w = white(found, 2)
-    moved = replace(w, r=w.r + 50 * (start_matrix(found, w) @ [1.0, -2.0, 0.5]).reshape(N, 2))
+    moved = replace(w, r=w.r + 50 * (start_matrix(w) @ [1.0, -2.0, 0.5]).reshape(N, 2))
     a, b = (noise_test(found, x, draws=1000) for x in (w, moved))
     for change in a.changes:
         assert b[change.label].gain == pytest.approx(change.gain, abs=1e-6)

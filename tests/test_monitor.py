@@ -277,6 +277,19 @@ def test_an_actuator_at_rest_is_untestable_and_does_not_alarm():
     assert all(350 <= e.sample < 365 for e in events if e.kind == "testable")
 
 
+def test_noise_that_grows_is_named_although_jumps_of_the_state_explain_a_few_samples():
+    A = np.array([[0.96, 0, 0.1, 0], [0, 0.92, 0, 0.1], [0, 0, 0.9, 0], [0, 0, 0, 0.87]])
+    model = noisy(A, np.array([[0.5, 0], [0, 0.5], [0, 0.3], [0.3, 0]]), np.eye(4)[:2], 0.01 * np.eye(4),
+                  0.01 * np.eye(2))
+    u = levels(400, 4)
+    for output, seed in (("y1", 1), ("y2", 2), ("y1", 3), ("y2", 4)):
+        monitor = watch(model, listed(model, "bias", "drift", "loss", "stuck"), level=25.0)
+        y = inject(model, u, Fault.sensor_noise(f"sensor:{output}", 300, scale=4.0), seed=seed)
+        named = next(e for e in monitor.run(u, y) if e.kind == "isolated" and e.sample >= 300)
+        assert named.candidates == ((f"sensor:{output} noise", 1.0),)
+        assert abs(named.onset - 300) <= 2 and 2 < named.size[0] < 8
+
+
 def test_what_no_candidate_explains_is_unknown():
     model = plant()
     found, u = listed(model, "bias"), levels(300, 6)

@@ -6,12 +6,9 @@
 * heater: a heater whose power is the square of its voltage, under a PI controller that reads the faulty sensor.
 
 Every plant is integrated between samples with its own physics, faults included. The model is identified by optid from
-3,000 healthy samples.
-
-    python benchmarks/faults/strange_plants.py [--runs 4] [--plant tanks motor heater]
+3,000 healthy samples; `strange_figures.py` measures what is then said.
 """
 
-import argparse
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -249,40 +246,3 @@ HOW: dict[str, dict[str, Any]] = {
     "heater": {**_STATES, "nx": 2, "basis": "polynomial:2"},
 }
 """How each plant is identified; the instruments allow for the closed loop of the heater."""
-
-
-def main() -> None:
-    from optid.faults import diagnose as diagnosed
-    from optid.faults import dictionary, health, whiten
-
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--runs", type=int, default=4)
-    parser.add_argument("--plant", nargs="+", default=list(PLANTS), choices=list(PLANTS))
-    parser.add_argument("--samples", type=int, default=400)
-    given = parser.parse_args()
-    warnings.simplefilter("ignore")
-    for name in given.plant:
-        alarms, right, said = 0, dict.fromkeys(FAILURES[name], 0), {}
-        for run in range(given.runs):
-            fit, _ = identify(name, run)
-            later = record(name, *simulate(name, 2000, 1000 + run))
-            judged = health(whiten(fit.model, later))
-            print(f"{name} {run}: whiteness p = {judged.p_value:.2g}, size {judged.ratio:.2f}", flush=True)
-            kinds = ["bias", "loss", "stuck", "drift", "frozen", "noise", "spike"]
-            found = dictionary(fit.model, kinds=kinds)
-            healthy = record(name, *simulate(name, given.samples, 2000 + run))
-            alarms += diagnosed(fit, healthy, found).detected
-            for failure in FAILURES[name]:
-                faulty = failure._replace(onset=given.samples // 2)
-                u, y = simulate(name, given.samples, 3000 + run, faulty)
-                answer = diagnosed(fit, record(name, u, y), found)
-                parts = {label.split(" ")[0] for a in answer.candidates for label in a.labels}
-                right[failure] += failure.part in parts
-                said[failure] = ", ".join(a.label for a in answer.candidates)
-        print(f"{name}: {alarms} of {given.runs} healthy records alarmed")
-        for failure, count in right.items():
-            print(f"  {failure.part:<14}{failure.kind:<8}{count} of {given.runs} name the part; last: {said[failure]}")
-
-
-if __name__ == "__main__":
-    main()

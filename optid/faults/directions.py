@@ -1,19 +1,89 @@
-"""Directions of process faults in the terms of the outputs, for models whose states mean nothing by themselves."""
+"""Disturbances by their directions, and declared ones of any course: predictors that do not feel them.
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+A disturbance d of which nothing is known is white noise of unlimited variance for the one who has to guess it, so that
+the steady Kalman predictor of a model with the noise Q + s^2 E E', R + s^2 F F', S + s^2 E F' is, for large s, the
+optimal filter that decouples d (E in the state equation, F in the output equation). Its innovations grow with s along
+as many axes as disturbances can be told apart at the outputs; these axes carry nothing else and are taken out of the
+whitening. On the others thresholds and false alarms are those of a plant without d, whatever its course.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import LookupFailed, StructureError, nearest
-from optid.faults.whitening import predictor
+from optid.faults.faults import place_of
+from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
+UNLIMITED = 1e5
+"""Standard deviation of a disturbance, in those of the innovations that it reaches."""
+
 ROUND = 1e-6
 """Share of an isotropic covariance that is added where the process noise has no power."""
+
+GENERIC = np.exp(0.7j) * 1.3
+"""A point of the plane at which the rank of the transfer from the disturbances to the outputs is taken."""
+
+
+def decoupled(
+    model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
+) -> tuple["HammersteinSS", Predictor]:
+    """Return a model whose noise holds disturbances of any course, and its predictor, which does not feel them.
+
+    Args:
+        model: with noise covariances.
+        disturbances: names as in `Fault`: "actuator:u1", "sensor:y1", "process:load"; the part before the colon may be
+            left out where one channel or direction has the name.
+        process: directions (n,) in the state equation by name.
+
+    Raises:
+        LookupFailed: no such channel or direction.
+        StructureError: a direction of another shape; disturbances that cover all outputs: nothing is left to judge; or
+            one that no output sees.
+    """
+    steady = predictor(model)
+    kinds = {"actuator": model.inputs, "sensor": model.outputs, "process": tuple(process or {})}
+    parts = [place_of(model, _full_name(name, kinds), None, process) for name in disturbances]
+    E, F = np.hstack([part[0] for part in parts]), np.hstack([part[1] for part in parts])
+    A, into = model.A + model.L @ model.C, E + model.L @ F  # what reaches the reading is fed back
+    transfer = model.C @ np.linalg.solve(GENERIC * np.eye(model.nx) - A, into) + F
+    seen = steady.root @ transfer
+    sizes = np.linalg.norm(seen, axis=0)
+    if not np.all(sizes > 0):
+        raise StructureError(f"No output ever sees one of the disturbances {', '.join(disturbances)}: leave it out.")
+    silent = int(np.linalg.matrix_rank(seen / sizes, tol=1e-8))
+    if silent >= model.l:
+        raise StructureError(
+            f"The disturbances {', '.join(disturbances)} of any course cover all outputs ({', '.join(model.outputs)}): "
+            "nothing is left to judge. Declare fewer of them, or add a sensor."
+        )
+    assert model.noise is not None
+    E, F, noise = UNLIMITED * E / sizes, UNLIMITED * F / sizes, model.noise
+    louder = replace(model, noise=replace(noise, Q=noise.Q + E @ E.T, R=noise.R + F @ F.T, S=noise.S + E @ F.T))
+    loud = predictor(louder)
+    _, axes = np.linalg.eigh(steady.root @ loud.covariance @ steady.root.T)
+    kept = axes[:, : model.l - silent].T @ steady.root  # combinations of the outputs that do not feel them
+    white = np.linalg.solve(np.linalg.cholesky(kept @ loud.covariance @ kept.T), kept)
+    r: Any = np.linalg.qr(np.vstack([white, np.zeros((silent, model.l))])[:, ::-1], mode="r")  # triangular again
+    return louder, replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
+
+
+def _full_name(name: str, kinds: Mapping[str, Sequence[str]]) -> str:
+    """The name of a place with the part before the colon."""
+    if ":" in name:
+        return name
+    here = [kind for kind, names in kinds.items() if name in names]
+    if len(here) == 1:
+        return f"{here[0]}:{name}"
+    known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
+    raise LookupFailed(f"disturbance {name!r}: {'none' if not here else 'several'} of {known} has this name.")
 
 
 def direction_of(model: "HammersteinSS", outputs: Mapping[str, float]) -> Array:

@@ -111,12 +111,8 @@ class Isolability:
         """Faults that no record can tell apart."""
         return [tuple(label.split(" | ")) for label in self.labels if " | " in label]
 
-    def table(self) -> str:
-        """Print sizes, rivals and angles, and the quantitative isolability matrix."""
-        return str(self)
-
     def __str__(self) -> str:
-        """Print the table, the matrix and what to know about them, in 80 columns."""
+        """Print sizes, rivals and angles, the isolability matrix and what to know about them, in 80 columns."""
         where = "unknown" if self.onset == "unknown" else f"known, {self.onset}"
         lines = [
             f"window {self.window} samples, onset {where}, false alarm {self.false_alarm:g},",

@@ -10,11 +10,7 @@ from optid.show.panels import shorten, styled
 
 @styled
 def draw(found: Isolability) -> Figure:
-    """Draw the deflections that tell each fault from each other, and the chances by deflection.
-
-    Args:
-        found: what the study found.
-    """
+    """Draw the deflections that tell each fault from each other, and the chances by deflection."""
     needed = found.matrix * found.unit[:, None]
     count = len(found.labels)
     names = [shorten(label, 22) for label in found.labels]

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data, Experiment
+from optid.data.record import Data, Experiment, as_list
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
 from optid.faults.whitening import Predictor, predictor
@@ -218,7 +218,7 @@ def _predicted(
     """Every experiment with its initial state, whether a reading is there, and its whitened innovations (N l,)."""
     raw = in_units_of(model, data)
     given = model.initial_state(raw, "predict")
-    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
+    for part, x0 in zip(raw.experiments, as_list(given)):
         present = ~np.isnan(part.y)
         yield part, x0, present, _whitened(model, steady, part, x0, present)
 
@@ -274,7 +274,4 @@ def sensitivities(
     for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
         sides = [_whitened(moved, steady, part, x0, present) for moved in (plus, minus)]
         columns[:, j] = (sides[0] - sides[1]) * factor
-    impulse = np.zeros((len(part.y), model.nx, model.nx))
-    impulse[0] = np.eye(model.nx)
-    start = steady.respond(impulse, np.zeros((len(part.y), model.l, model.nx)), present)
-    return columns, steady.whitened(start, present).reshape(present.size, model.nx)
+    return columns, steady.whitened(steady.jumps(0, present), present).reshape(present.size, model.nx)

@@ -54,11 +54,9 @@ class Outside(NamedTuple):
 
 
 def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
-    """Return the inputs that leave the range their nonlinearities were identified over.
+    """Return the inputs (N, m) that leave the range their nonlinearities were identified over.
 
-    Args:
-        model: the model; a function without an interval, or one that the user gave, is known everywhere.
-        u: (N, m) inputs.
+    A function without an interval, or one that the user gave, is known everywhere.
     """
     found = []
     for column, (low, high) in enumerate(zip(*known_range(model))):
@@ -89,6 +87,15 @@ def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
         room *= min(1.0, float(np.min(UNSEEN * noise / np.maximum(seen, 1e-300))))
         low[column], high[column] = first - room, last + room
     return low, high
+
+
+def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
+    """Return which samples (N,) lie at most so many samples behind an input that is outside its range."""
+    edges = np.zeros(len(u) + memory + 2, dtype=int)
+    for one in outside(model, u):
+        np.add.at(edges, one.samples, 1)
+        np.add.at(edges, one.samples + memory + 1, -1)
+    return np.cumsum(edges)[: len(u)] > 0
 
 
 def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:

@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 def with_schedules(found: "Dictionary", schedules: Mapping[str, Fault]) -> "Dictionary":
     """Return the dictionary with known changes of A and B as further candidates, "process:<name> schedule".
 
-    Args:
-        found: the dictionary.
-        schedules: `Fault.schedule` by name; sample k of its matrices is sample k of the window, and its onset is not
-            read: all are searched.
+    Sample k of their matrices is sample k of the window; the onset of a schedule is not read: all are searched.
 
     Raises:
         StructureError: another kind of fault, a name that is there already.

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.data.record import Data
+from optid.data.record import Data, as_list
 from optid.errors import DataError
-from optid.faults.whitening import Whitened, predictor, whiten
+from optid.faults.whitening import predictor, whiten
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
@@ -150,10 +150,10 @@ def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float]
 def _energy(model: "HammersteinSS", data: Data) -> float:
     """Energy of the innovations; infinite where the model is not defined for such inputs."""
     try:
-        found = whiten(model, data)
+        found: list[Any] = as_list(whiten(model, data))
     except DataError:
         return float("inf")
-    return float(sum(np.sum(part.r**2) for part in ([found] if isinstance(found, Whitened) else found)))
+    return float(sum(np.sum(part.r**2) for part in found))
 
 
 def _runs(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
-from optid.faults.decoupling import decoupled
+from optid.faults.directions import decoupled
 from optid.faults.faults import Fault, channel_of, place_of
 from optid.faults.scheduled import with_schedules
 from optid.faults.whitening import Predictor, predictor
@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 
 ADDITIVE = ("bias", "drift", "jump", "spike")
 """Kinds whose signature depends on nothing but the model and the time since the onset."""
-
-SUMS = {"jump": 0, "spike": 0, "drift": 2}
-"""How often the response to an impulse is summed for the signature of a kind; once for the others."""
 
 KINDS = {
     "bias": ("actuator", "sensor", "process"),
@@ -193,9 +190,7 @@ class Dictionary:
         c = self[candidate] if isinstance(candidate, str) else candidate
         since = np.arange(count) - onset
         if c.additive:
-            course = (since == 0).astype(float)
-            for _ in range(SUMS.get(c.kind, 1)):
-                course = np.cumsum(course)
+            course = course_of(c.kind, since)
             return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
         if c.kind == "schedule":
             raise StructureError(f"{c.label}: its signature depends on the states: ask scan(...) for it.")
@@ -243,6 +238,12 @@ class Dictionary:
         return "\n".join(lines + ["  unknown: none of these"] * self.unknown)
 
 
+def course_of(kind: str, since: np.ndarray) -> Array:
+    """Return the course (N,) of an additive fault of unit size, by the samples (N,) since its onset."""
+    return np.asarray((since == 0) if kind in ("jump", "spike") else np.maximum(since + 1, 0) if kind == "drift" else
+                      (since >= 0), dtype=float)
+
+
 def dictionary(
     model: "HammersteinSS", *, actuators: str | Sequence[str] = "all", sensors: str | Sequence[str] = "all",
     kinds: str | Sequence[str] = ("bias",), process: Mapping[str, ArrayLike] | None = None, state_jump: bool = True,
@@ -263,7 +264,7 @@ def dictionary(
         zeros: {input: the value at which its actuator does nothing}. A loss is the share (1 - gamma) of what the
             actuator does beyond that; without it any constant may be added.
         disturbances: names, as in `Fault`, of what may do anything at any time without being a fault: inputs, outputs,
-            directions of `process`. The predictor does not feel them (`optid.faults.decoupling`), and a direction that
+            directions of `process`. The predictor does not feel them (`optid.faults.directions`), and a direction that
             is declared a disturbance is no fault.
 
     Raises:
@@ -287,10 +288,10 @@ def dictionary(
     names = [name for name in names if name.partition(":")[2] not in apart]
     names += [f"process:{c}" for c in process or {} if c not in apart]
     at_rest = {_chosen([name], model.inputs)[0]: float(value) for name, value in (zeros or {}).items()}
-    raw = [_candidate(model, name, kind, process, at_rest) for kind in wanted if kind != "jump" for name in names
+    raw = [candidate_of(model, name, kind, process, at_rest) for kind in wanted if kind != "jump" for name in names
            if name.partition(":")[0] in KINDS[kind]]
     if state_jump or "jump" in wanted:
-        raw.append(_candidate(model, "state", "jump", None, {}))
+        raw.append(candidate_of(model, "state", "jump"))
     excluded: dict[str, str] = {}
     found = [kept for candidate in raw for kept in _seen(steady, candidate, excluded)]
     if not found:
@@ -309,15 +310,17 @@ def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
     return chosen
 
 
-def _candidate(
-    model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None, zeros: Mapping[str, float]
+def candidate_of(
+    model: "HammersteinSS", name: str, kind: str, process: Mapping[str, ArrayLike] | None = None,
+    zeros: Mapping[str, float] | None = None,
 ) -> Candidate:
+    """Return a candidate by its name and kind; arguments and errors as of `place_of` and `dictionary`."""
     into_state, into_output = place_of(model, name, None, process)
     new = Candidate(name, kind, into_state, into_output, places=(name,))
     if kind in ("loss", "stuck") and name.startswith("actuator"):
         c = channel_of(model.inputs, name)
         columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
-        new = replace(new, columns=columns, zero=zeros.get(name.partition(":")[2]))
+        new = replace(new, columns=columns, zero=(zeros or {}).get(name.partition(":")[2]))
     return replace(new, members=(new.own_label,))
 
 
@@ -327,14 +330,8 @@ def _horizon(steady: Predictor) -> int:
 
 def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
     """Return the signature (N, l, d) from the onset on; of a candidate that has none, that of a bias in its place."""
-    impulse = np.zeros((count, *candidate.into_state.shape))
-    impulse[0] = candidate.into_state
-    direct = np.zeros((count, *candidate.into_output.shape))
-    direct[0] = candidate.into_output
-    found = steady.whitened(steady.respond(impulse, direct))
-    for _ in range(SUMS.get(candidate.kind, 1)):
-        found = np.cumsum(found, axis=0)
-    return found
+    course = course_of(candidate.kind, np.arange(count))[:, None, None]
+    return steady.whitened(steady.respond(course * candidate.into_state, course * candidate.into_output))
 
 
 def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> list[Candidate]:

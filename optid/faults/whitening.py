@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array, compact
-from optid.data.record import Data
+from optid.data.record import Data, as_list, one_or_all
 from optid.errors import DataError, DataWarning, StructureError
+from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 from optid.models.kalman import kalman_gain
 from optid.models.recursions import SHORT, propagated
@@ -87,33 +88,12 @@ class Predictor:
         kernels.respond(A, C, K, L, shown, state, output, response)
         return response
 
-    def run(self, model: "HammersteinSS", x0: Array, f: Array, fed: Array, y: Array,
-            added: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
-        """Return states (T + 1, n) and whitened innovations (T, l) of complete samples of the model.
-
-        Args:
-            model: with the functions of inputs and outputs.
-            x0: (n,) state before the first sample.
-            f: (T, r) functions of the inputs.
-            fed: (T, s) functions of the outputs.
-            y: (T, l) readings.
-            added: what is added to the next state (T, n) and to the output (T, l).
-        """
-        from optid.faults.kernels import add_product, predict
-
-        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
-        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
-                                       (model.D, f, direct)):
-            if matrix.any():
-                add_product(np.ascontiguousarray(matrix), signal, target)
-        if added is not None:
-            drive += added[0]
-            direct += added[1]
-        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
-        x[0] = x0
-        A, C, K, root = map(compact, (model.A, model.C, self.K, self.root))
-        predict(A, C, K, root, drive, y, direct, x, r)
-        return x, r
+    def jumps(self, onset: int, present: Array) -> Array:
+        """Return what unit jumps of the state at a sample leave in the innovations (N, l, n) of readings (N, l)."""
+        (count, l), n = present.shape, len(self.A)  # noqa: E741
+        into_state = np.zeros((count, n, n))
+        into_state[onset] = np.eye(n)
+        return self.respond(into_state, np.zeros((count, l, n)), present)
 
     def whitened(self, innovations: Array, present: Array | None = None) -> Array:
         """Return innovations (N, l) or (N, l, d) in units of their covariance, zero where a reading is missing.
@@ -192,6 +172,40 @@ class Whitened:
         return white if self.nuisance is None else self.nuisance(white)
 
 
+def check_window(
+    model: "HammersteinSS", whitened: Whitened, what: str, onset: int = 0, longest: float = np.inf
+) -> None:
+    """Refuse whitened innovations that a search or a test cannot take.
+
+    Args:
+        model: whose innovations they should be.
+        whitened: the window.
+        what: the search or the test, for messages.
+        onset: sample of the window from which something is supposed to have changed.
+        longest: readings of a window at most.
+
+    Raises:
+        StructureError: several experiments, an onset outside the window, a window that is too long.
+        DataError: other outputs than the model's, innovations that are not finite.
+    """
+    if not isinstance(whitened, Whitened):
+        raise StructureError(
+            f"{what} takes the whitened innovations of one experiment, as optid.faults.whiten returns them: take the "
+            "experiments of a record one by one."
+        )
+    count, outputs = whitened.r.shape
+    if outputs != model.l:
+        raise DataError(f"The window has {outputs} outputs; the dictionary is of {model.l}.")
+    if onset != int(onset) or not 0 <= onset < count:
+        raise StructureError(f"onset={onset!r} lies outside the window of {count} samples.")
+    if whitened.r.size > longest:
+        raise StructureError(
+            f"{whitened.r.size} readings are too many for this test ({longest}): use a shorter window.")
+    if not np.isfinite(whitened.r).all():
+        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
+        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
+
+
 def whiten(
     model: "HammersteinSS", data: Data, *, x0: Any = "fit", uncertainty: "ModelUncertainty | None" = None,
     scale: Predictor | None = None,
@@ -214,24 +228,21 @@ def whiten(
     steady = scale or (predictor(model) if uncertainty is None else uncertainty.predictor)
     gained, raw, fitted = replace(model, K=steady.K), in_units_of(model, data), isinstance(x0, str) and x0 == "fit"
     given = gained.initial_state(raw, "predict") if fitted else x0
-    predicted = gained.predict(raw, x0=given)
-    predictions = predicted if isinstance(predicted, tuple) else (predicted,)
+    predictions = as_list(gained.predict(raw, x0=given))
     starts = [np.zeros(model.nx)] * len(predictions) if isinstance(given, str) else (
         [given] if len(predictions) == 1 else given)
     found = []
     for part, prediction, start in zip(raw.experiments, predictions, starts):
         present, start = ~np.isnan(part.y), np.asarray(start, dtype=float)
-        innovations, y = part.y - prediction, np.where(present, part.y, prediction)
+        states = simulation.visited(simulation.prepared(gained, "predict", part.u, part.y, None, ""), start)
+        innovations = part.y - prediction
         r = steady.whitened(np.where(present, innovations, 0.0), present)
-        fed = np.array([g(y[:, o]) for g, o in zip(model.feedback, model.output_of)]).reshape(-1, len(y)).T
-        states = None if np.isnan(part.u).any() else steady.run(
-            model, start, np.ascontiguousarray(model.expanded(part.u)), np.ascontiguousarray(fed), y)[0][:-1]
         white = Whitened(r, innovations, present, steady, model.outputs, states=states)
         if uncertainty is not None:
             nuisance = uncertainty.nuisance(part, start, present, free_start=fitted)
             white = replace(white, r=nuisance(r), nuisance=nuisance)
         found.append(white)
-    return found[0] if len(found) == 1 else tuple(found)
+    return one_or_all(found)
 
 
 @dataclass(frozen=True, eq=False)

@@ -42,14 +42,10 @@ def left_over(whitened: Whitened, rest: Array, magnitudes: int, further: float =
 
 
 def alarm_probability(gain: float, false_alarm: float) -> float:
-    """Return the probability that a healthy window exceeds its thresholds by as much.
+    """Return the probability that a healthy window exceeds its thresholds, of this false-alarm rate, by as much.
 
     The maximum of many statistics with exponential tails exp(-x / 2) has a Gumbel law; its place follows from the
     false-alarm rate of the thresholds. Below p = 0.1 it is exact to a tenth, above it errs on the side of larger ones.
-
-    Args:
-        gain: largest statistic less its threshold.
-        false_alarm: probability that a healthy window exceeds the thresholds.
     """
     return float(-np.expm1(np.log1p(-false_alarm) * np.exp(-gain / 2)))
 

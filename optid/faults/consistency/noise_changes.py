@@ -15,9 +15,9 @@ import numpy as np
 
 from optid.arrays import Array, check_probability
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.consistency.waveforms import RANK, check_window, same_place, start_matrix, waveform_matrix
+from optid.faults.consistency.waveforms import LONGEST, RANK, same_place, start_matrix, waveform_matrix
 from optid.faults.signatures import Candidate, Dictionary
-from optid.faults.whitening import Whitened
+from optid.faults.whitening import Whitened, check_window
 
 NATS = 3.0
 """Places whose log-likelihood is at most this much below the best are in the set."""
@@ -217,8 +217,8 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
     Raises:
         DataError, StructureError: as `check_window`; no reading sees noise in any of the places.
     """
-    check_window(found, whitened, onset, "The noise test")
-    start = start_matrix(found, whitened) if free_start else np.zeros((whitened.r.size, 0))
+    check_window(found.model, whitened, "The noise test", onset, LONGEST)
+    start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
     left, sizes, _ = np.linalg.svd(start, full_matrices=False)
     start = left[:, sizes > 1e-8 * max(float(sizes.max(initial=0.0)), 1e-300)]
     places = []
@@ -261,7 +261,7 @@ def noise_test(
         raise DataError(
             f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "
             f"{int(np.ceil(10 / false_alarm))}, or a higher probability.")
-    check_window(found, whitened, onset, "The noise test")
+    check_window(found.model, whitened, "The noise test", onset, LONGEST)
     prepared = noise_search(found, whitened, onset=onset, free_start=free_start) if search is None else search
     levels = prepared.healthy(draws, seed) if healthy is None else healthy
     window = whitened.r.reshape(1, -1)

@@ -1,6 +1,5 @@
 """Covariances of a window by lag, and what more noise at a place adds to them."""
 
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,9 +7,8 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.noise_changes import noise_places
-from optid.faults.consistency.waveforms import check_window
 from optid.faults.signatures import Dictionary
-from optid.faults.whitening import Predictor, Whitened
+from optid.faults.whitening import Predictor, Whitened, check_window
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +108,7 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
         DataError: fewer than ten complete samples for every lag, innovations that are not finite.
         StructureError: lags or an onset that do not fit the window, several experiments, no place.
     """
-    check_window(found, whitened, onset, "The match of covariances", sys.maxsize)
+    check_window(found.model, whitened, "The match of covariances", onset)
     l, used = whitened.r.shape[1], len(whitened.r) - int(onset)  # noqa: E741
     if lags is None:
         lags = min(whitened.predictor.settling, max(1, used // 10))

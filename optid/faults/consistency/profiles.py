@@ -9,6 +9,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.waveforms import waveform_matrix
+from optid.faults.search.atoms import Atoms, exchanged
 from optid.faults.signatures import Candidate
 
 if TYPE_CHECKING:
@@ -23,12 +24,6 @@ PRIORS = {
 
 EACH = 2
 """Degrees of freedom of a change: its size and its place."""
-
-ROUNDS = 20
-"""Passes over the changes in which they are moved, at most."""
-
-ALIKE = 2e-6
-"""Share of a change of its own below which the others explain it."""
 
 LONGEST = 2000
 """Samples of a window at most."""
@@ -116,9 +111,7 @@ class CourseProblem:
     def pruned(self, columns: Array, support: np.ndarray) -> np.ndarray:
         """Drop changes one by one as long as the criterion falls: neighbours that share one change become one.
 
-        Args:
-            columns: (N l, N) of all changes.
-            support: changes to begin with.
+        The columns (N l, N) are those of all changes; the support is where they are to begin with.
         """
         kept = list(support)
         best = self.criterion(self.refitted(columns[:, kept])[1], EACH * len(kept)) if kept else np.inf
@@ -140,29 +133,11 @@ class CourseProblem:
         return np.array(kept, dtype=int)
 
     def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
-        """Move every change to the sample where it explains most beside the others, until none moves.
-
-        Args:
-            columns: (N l, N) of all changes.
-            kept: changes to begin with.
-        """
-        places = [int(k) for k in kept]
-        for _ in range(ROUNDS):
-            before = list(places)
-            for i in range(len(places)):
-                others = places[:i] + places[i + 1 :]
-                basis = np.linalg.qr(columns[:, others])[0] if others else np.zeros((len(columns), 0))
-                rest = self.r - basis @ (basis.T @ self.r)
-                own = np.einsum("ij,ij->j", columns, columns)
-                left = own - np.sum((basis.T @ columns) ** 2, axis=0)
-                there = left > ALIKE * own
-                energy = np.where(there, (columns.T @ rest) ** 2 / np.where(there, left, 1.0), -np.inf)
-                best = int(np.argmax(energy))
-                if energy[best] > energy[places[i]] * (1 + 1e-9):
-                    places[i] = best
-            if places == before:
-                break
-        return np.unique(places)
+        """Move every change to the sample where it explains most beside the others, until none moves; as `pruned`."""
+        sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        each = Atoms("change", np.arange(self.count), (columns / sizes).T[:, :, None], np.ones((self.count, 1, 1)), 0.0)
+        _, found = exchanged([each], self.r, [("change", int(k)) for k in kept], -1.0)
+        return np.unique([place for _, place in found]).astype(int)
 
 
 def course_problem(found: "Scan", label: str) -> CourseProblem:

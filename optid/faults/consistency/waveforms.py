@@ -16,7 +16,7 @@ from optid.data.record import Data
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.screening import FlatLine, flat_lines
 from optid.faults.signatures import Candidate, Dictionary
-from optid.faults.whitening import Whitened
+from optid.faults.whitening import Whitened, check_window
 
 RANK = 1e-10
 """Singular values below this share of the largest are none."""
@@ -138,13 +138,13 @@ def waveform_test(
         StructureError: one output only, several experiments, a window that is too long.
     """
     check_probability(probability, "probability")
-    check_window(found, whitened, onset, "The waveform test")
+    check_window(found.model, whitened, "The waveform test", onset, LONGEST)
     if found.model.l < 2:
         raise StructureError(
             "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
             "(bias, drift, loss) can be told apart by the exact search."
         )
-    start = start_matrix(found, whitened) if free_start else np.zeros((whitened.r.size, 0))
+    start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
     columns: dict[str, list[Candidate]] = {}
     untested: dict[str, str] = {}
     for candidate in found.candidates:
@@ -190,13 +190,9 @@ def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened,
     return np.asarray(whitened.seen(response).reshape(whitened.r.size, -1))
 
 
-def start_matrix(found: Dictionary, whitened: Whitened) -> Array:
+def start_matrix(whitened: Whitened) -> Array:
     """Return what an error of the state at the start leaves in the window, (N l, n)."""
-    n, (count, l) = found.model.nx, whitened.r.shape  # noqa: E741
-    into_state = np.zeros((count, n, n))
-    into_state[0] = np.eye(n)
-    response = whitened.predictor.respond(into_state, np.zeros((count, l, n)), whitened.present)
-    return np.asarray(whitened.seen(response).reshape(whitened.r.size, -1))
+    return whitened.seen(whitened.predictor.jumps(0, whitened.present)).reshape(whitened.r.size, -1)
 
 
 def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probability: float, d: int) -> Consistency:
@@ -238,32 +234,3 @@ def same_place(first: Candidate, second: Candidate) -> bool:
     """Whether two candidates are in one place: waveforms of both are the same."""
     parts = [np.vstack([c.into_state, c.into_output]) for c in (first, second)]
     return parts[0].shape == parts[1].shape and bool(np.allclose(*parts, rtol=1e-12, atol=0))
-
-
-def check_window(found: Dictionary, whitened: Whitened, onset: int, what: str, longest: int = LONGEST) -> None:
-    """Refuse whitened innovations that a test cannot take.
-
-    Args:
-        found: the candidates.
-        whitened: the window.
-        onset: sample of the window from which something is supposed to have changed.
-        what: the test, for messages.
-        longest: readings of a window at most.
-
-    Raises:
-        StructureError: several experiments, an onset outside the window, a window that is too long.
-        DataError: other outputs than the model's, innovations that are not finite.
-    """
-    if not isinstance(whitened, Whitened):
-        raise StructureError(f"{what} takes the whitened innovations of one experiment: test them one by one.")
-    count, outputs = whitened.r.shape
-    if outputs != found.model.l:
-        raise DataError(f"The window has {outputs} outputs; the dictionary is of {found.model.l}.")
-    if onset != int(onset) or not 0 <= onset < count:
-        raise StructureError(f"onset={onset!r} lies outside the window of {count} samples.")
-    if whitened.r.size > longest:
-        raise StructureError(
-            f"{whitened.r.size} readings are too many for this test ({longest}): use a shorter window.")
-    if not np.isfinite(whitened.r).all():
-        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
-        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")

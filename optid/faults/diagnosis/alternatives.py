@@ -18,8 +18,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.diagnosis.posterior import Explanation, share_bound, share_prior
-from optid.faults.faults import place_of
-from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.signatures import Candidate, Dictionary, candidate_of
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -48,13 +47,9 @@ def extended(found: Dictionary) -> Dictionary | None:
         replace(c, kind="stuck") for c in found.candidates
         if c.kind == "loss" and c.columns and c.zero is None and c.name not in stuck
     ]
-    alone = found.model.l == 1 and any(c.kind == "frozen" for c in found.candidates)  # any course explains a record
-    if found.unknown and not alone and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
-        into_state, into_output = place_of(found.model, UNKNOWN_DIRECTION)
-        more.append(Candidate(
-            UNKNOWN_DIRECTION, "bias", into_state, into_output, members=(UNKNOWN_DIRECTION,),
-            places=(UNKNOWN_DIRECTION,),
-        ))
+    known = found.model.l > 1 or any(c.kind != "frozen" for c in found.candidates)  # else any course explains a record
+    if found.unknown and known and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
+        more.append(candidate_of(found.model, UNKNOWN_DIRECTION, "bias"))
     sines = np.full((len(more), len(more)), np.nan)
     return replace(found, candidates=tuple(more), excluded={}, sines=sines) if more else None
 

@@ -42,13 +42,7 @@ def without_signature(found: Dictionary) -> tuple[list[Candidate], list[Candidat
 
 
 def courses(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
-    """Return the frozen sensors and the noises of a dictionary that may explain a record.
-
-    Args:
-        found: the candidates.
-        white: the window.
-        part: the record behind it.
-    """
+    """Return the frozen sensors and the noises of a dictionary that may explain a window, and the record behind it."""
     if white.r.size > LONGEST:
         return []
     frozen, noises = without_signature(found)

@@ -8,14 +8,14 @@ import numpy as np
 
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.faults.consistency.standstill import Frozen, frozen
 from optid.faults.diagnosis.alternatives import final_effect
-from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Evidence
+from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate, Evidence
 from optid.faults.diagnosis.courses import LONGEST
-from optid.faults.diagnosis.intervals import estimates
+from optid.faults.diagnosis.posterior import estimates
 from optid.faults.diagnosis.ranking import NOTHING, Fit, find
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
-from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of, without_flat_lines
+from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of
+from optid.faults.diagnosis.standstill import frozen, without_flat_lines
 from optid.faults.nuisance import uncertain_start
 from optid.faults.ranges import outside
 from optid.faults.screening import check_channels
@@ -106,10 +106,10 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
           ) -> Diagnosis:
     """The diagnosis of experiment `number`; `noise` are arguments of `whiten`, and a remark is reported in any case."""
     model = found.model
-    still = without_flat_lines(record, number)
-    stuck = frozen(still, record, found, 2 * model.nx)
-    first = search_record(record, still.part, found, asked, noise)
-    notes = [remark, *(f"{line}." for line in still.lines), _outliers(first), *map(str, outside(model, still.part.u))]
+    part, lines = without_flat_lines(record, number)
+    stuck = frozen(lines, found, 2 * model.nx)
+    first = search_record(record, part, found, asked, noise)
+    notes = [remark, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u))]
     seen, ranking, alarm = find(first)
     notes.append(ranking.note)
     fits = ranking.fits if not found.unknown or ranking.explains else ()
@@ -119,18 +119,18 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         notes.append("With one output only faults of a known course can be told apart.")
     answers = _answers(seen, fits, stuck)
     certificate = ranking.certificate if fits or ranking.certificate.kind == "infeasible healthy" else NOTHING
-    if stuck.faults and not fits:
-        certificate = Certificate("flat line", float(stuck.count))
+    if stuck and not fits:
+        certificate = Certificate("flat line", float(max(line.count for line in lines)))
     remaining = None
     if alarm:
         remaining = ranking.fits[0].remaining if ranking.fits else seen.healthy
     white, search = seen.whitened, seen.search
     fitted = fits[0].fitted if fits else np.zeros_like(white.r)
     return Diagnosis(
-        verdict="faulty" if stuck.faults or fits else _without_answer(seen, alarm),
-        detected=bool(alarm or stuck.faults),
+        verdict="faulty" if stuck or fits else _without_answer(seen, alarm),
+        detected=bool(alarm or stuck),
         best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
-        p_value=0.0 if stuck.faults else first.p_value, certificate=certificate,
+        p_value=0.0 if stuck else first.p_value, certificate=certificate,
         untestable=dict(seen.lost) | _not_searched(seen), window=len(white.r), false_alarm=asked.false_alarm,
         coverage=asked.coverage, method=asked.method, status=" ".join(note for note in notes if note),
         model=model.title, outputs=model.outputs, dt=model.dt, remaining=remaining,
@@ -160,15 +160,15 @@ def _not_searched(seen: RecordSearch) -> dict[str, str]:
     return lost | {c.label: why for c in found.candidates if c.kind == "frozen" and model.l == 1}
 
 
-def _answers(seen: RecordSearch, fits: tuple[Fit, ...], stuck: Frozen) -> tuple[Answer, ...]:
+def _answers(seen: RecordSearch, fits: tuple[Fit, ...], stuck: tuple[Estimate, ...]) -> tuple[Answer, ...]:
     """The set of answers, sensors that stand still in each of them."""
     model, result = seen.dictionary.model, []
-    if not fits and stuck.faults:
-        return (Answer(stuck.faults, 1.0, float("inf")),)
+    if not fits and stuck:
+        return (Answer(stuck, 1.0, float("inf")),)
     for fit in fits:
         faults = estimates(fit.explanation, seen.asked.coverage, len(fit.fitted), 2 * model.nx)
         faults = tuple(replace(one, effect=final_effect(model, one.name, one.size)) for one in faults)
-        merged = tuple(sorted((*stuck.faults, *faults), key=lambda fault: fault.onset))
+        merged = tuple(sorted((*stuck, *faults), key=lambda fault: fault.onset))
         result.append(Answer(merged, fit.probability, fit.gain))
     return tuple(result)
 

@@ -15,7 +15,7 @@ from optid.arrays import Array
 from optid.data.record import Experiment
 from optid.faults.diagnosis.posterior import marginal
 from optid.faults.search.scanning import Scan, scan
-from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Whitened
 
 BOUND = 2.5
@@ -42,14 +42,8 @@ def cleaned(
 ) -> tuple[Scan, Experiment, tuple[tuple[int, int], ...]]:
     """Search a record without the influence of wild readings.
 
-    Args:
-        found: the candidates.
-        part: the record.
-        whitened_of: its whitened innovations.
-
-    Returns:
-        The search of the bounded innovations, the record without the readings that were taken out, and these
-        (sample, output).
+    Returned are the search of the bounded innovations, the record without the readings that were taken out, and these
+    (sample, output).
     """
     wide, taken, whitened = with_spikes(found), [], whitened_of(part)
     while len(taken) < MOST * whitened.present.sum():
@@ -93,13 +87,9 @@ def _fitted(search: Scan) -> Array:
 
 def with_spikes(found: Dictionary) -> Dictionary:
     """Return a dictionary that has the outliers of all sensors, behind its own candidates."""
-    n, l = found.model.nx, found.model.l  # noqa: E741
     known = {c.name for c in found.candidates if c.kind == "spike"}
-    more = [
-        Candidate(f"sensor:{name}", "spike", np.zeros((n, 1)), column[:, None], (), (f"sensor:{name} spike",),
-                  (f"sensor:{name}",), True)
-        for name, column in zip(found.model.outputs, np.eye(l)) if f"sensor:{name}" not in known
-    ]
+    more = [replace(candidate_of(found.model, f"sensor:{name}", "spike"), bounded_deflection=True)
+            for name in found.model.outputs if f"sensor:{name}" not in known]
     return found.with_candidates(more)
 
 

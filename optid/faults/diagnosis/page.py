@@ -1,12 +1,10 @@
 """A diagnosis as one HTML page that carries its figure with it."""
 
 from pathlib import Path
-from typing import Any
 
-from optid import __version__
 from optid.faults.diagnosis import words
 from optid.faults.diagnosis.answers import Diagnosis
-from optid.show.page import figure, template, versions
+from optid.faults.page import write_page
 from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "faulty": "bad"}
@@ -14,55 +12,30 @@ TONES = {"healthy": "good", "faulty": "bad"}
 
 
 def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str = "") -> Path:
-    """Write a diagnosis as a self-contained HTML page.
-
-    Args:
-        found: the diagnosis, not one that was read from a file.
-        path: the file, replaced when it exists.
-        record: name of the record.
-        command: the command line behind it.
+    """Write a diagnosis as a self-contained HTML page, with the name of the record and the command line behind it.
 
     Raises:
         StructureError: a diagnosis read from a file: the record is not in it.
         OSError: the file cannot be written.
     """
-    path = Path(path)
-    path.write_text(render(found, record=record, command=command), encoding="utf-8")
-    return path
-
-
-def render(found: Diagnosis, *, record: str = "", command: str = "") -> str:
-    """Return the page that `write` writes."""
     best = ", what the best answer leaves in them, and its onset with the interval" if found.best is not None else ""
     several = "; the probability of every answer in the set" if len(found.candidates) > 1 else ""
     caption = (
         f"Whitened innovations of every output{best}; the energy that every candidate explains by its onset, beyond "
         f"the threshold at which a healthy plant alarms{several}."
     )
-    content: dict[str, Any] = {
-        "version": __version__,
-        "title": f"Diagnosis: {found.verdict}",
-        "lead": " · ".join(part for part in (record, found.model, f"{found.window} samples") if part),
-        "tone": TONES.get(found.verdict, "fair"),
-        "word": words.headline(found),
-        "sentences": words.explained(found, notes=False),
-        "cards": _cards(found),
-        "notes": [*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())],
-        "answers": _answers(found) if found.candidates else None,
-        "figures": [figure("diagnosis", found.plot, caption)],
-        "evidence": _evidence(found),
-        "call": command or "optid.faults.diagnose(model, data)",
-        "versions": versions(),
-        "text": str(found),
-        "sections": [
-            ("verdict", "Verdict"), *[("answers", "Answers")] * bool(found.candidates), ("figures", "Figure"),
-            ("evidence", "Evidence"), ("reproduce", "Reproduce"),
-        ],
-    }
-    return template("diagnosis.html.j2").render(content)
+    return write_page(
+        path, f"Diagnosis: {found.verdict}", (record, found.model, f"{found.window} samples"),
+        headings=("Answers", "What the record shows", "What the answer rests on"), draw=found.plot, caption=caption,
+        cards=_cards(found), tables=[_answers(found)] * bool(found.candidates), facts=_evidence(found),
+        tone=TONES.get(found.verdict, "fair"), word=words.headline(found),
+        sentences=words.explained(found, notes=False),
+        notes=[*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())],
+        call=command or "optid.faults.diagnose(model, data)", text=str(found),
+    )
 
 
-def _cards(found: Diagnosis) -> list[dict[str, str]]:
+def _cards(found: Diagnosis) -> list[tuple[str, str]]:
     cards = [("p-value of health", words.probability_words(found.p_value))]
     if found.best is not None:
         fault = found.best.faults[0]
@@ -73,7 +46,7 @@ def _cards(found: Diagnosis) -> list[dict[str, str]]:
         ]
     if found.remaining is not None:
         cards.append(("p-value of what is left", words.probability_words(found.remaining.p_value)))
-    return [{"label": label, "value": value} for label, value in cards]
+    return cards
 
 
 def _answers(found: Diagnosis) -> Table:

@@ -23,9 +23,6 @@ ROWS = 12
 def draw(found: Diagnosis) -> Figure:
     """Draw the innovations with the signature of the best answer, the energies explained, and the probabilities.
 
-    Args:
-        found: the diagnosis.
-
     Raises:
         StructureError: a diagnosis read from a file: the record is not in it.
     """

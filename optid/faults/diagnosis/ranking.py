@@ -14,10 +14,9 @@ from optid.faults.diagnosis.answers import Certificate, Remaining
 from optid.faults.diagnosis.counting import recounted
 from optid.faults.diagnosis.posterior import Explanation, several, single, smallest_set
 from optid.faults.diagnosis.record_search import RecordSearch
-from optid.faults.search.pair_search import pairs
 from optid.faults.search.programmes import solved
 from optid.faults.search.scanning import scan
-from optid.faults.search.subsets import SubsetSearch, polish
+from optid.faults.search.subsets import SubsetSearch, pairs, polish
 
 if TYPE_CHECKING:
     from optid.faults.search.sparse import SparseResult

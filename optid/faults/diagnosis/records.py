@@ -1,14 +1,13 @@
 """A diagnosis before any search: the record, the scale of the noise, readings that stand still."""
 
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.data.record import Data, Experiment
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty
-from optid.faults.screening import FlatLine, check_channels, flat_lines
+from optid.faults.screening import check_channels
 from optid.faults.whitening import Predictor, health, predictor, whiten
 from optid.models.experiments import in_units_of
 
@@ -115,27 +114,3 @@ def uncertainty_of(
         return None, ""
     found = model_uncertainty(model, data, decoupled=decoupled)
     return found, "The uncertainty of the identified model counts as noise."
-
-
-@dataclass(frozen=True, eq=False)
-class Flattened:
-    """A record (`part`) without the readings that stand still (`lines`)."""
-
-    part: Experiment
-    lines: tuple[FlatLine, ...]
-
-
-def without_flat_lines(record: Data, number: int) -> Flattened:
-    """Take readings of experiment `number` (from 0) out that are identical to the bit from the second on.
-
-    The first of them may be the last true one.
-    """
-    part = record.experiments[number]
-    lines = tuple(line for line in flat_lines(record) if line.experiment == number)
-    if not lines:
-        return Flattened(part, ())
-    y = np.array(part.y)
-    for line in lines:
-        o = record.outputs.index(line.name.partition(":")[2])
-        y[line.first + 1 : line.first + line.count, o] = np.nan
-    return Flattened(replace(part, y=y), lines)

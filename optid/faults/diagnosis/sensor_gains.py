@@ -2,8 +2,8 @@
 
 A lost share of a sensor is another row of C (of D and of the offset) from the onset on, so that the exact likelihood is
 that of a Kalman filter with this row, started from the state that the healthy one had at the onset. It is computed for
-many shares and onsets at once, over a grid that closes in on the most probable ones. A dead sensor, gamma = 1, reads
-its noise and is the end of the range.
+many shares and onsets at once, over a grid that closes in on the most probable onset and, once that is known to the
+sample, on the share. A dead sensor, gamma = 1, reads its noise and is the end of the range.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ from optid.faults.whitening import Predictor, Whitened, predictor
 SHARES, ONSETS = 17, 15
 """Shares and onsets of a grid."""
 
-ROUNDS = 12
+ROUNDS = 20
 """Grids at most, each about the best point of the one before."""
 
 CLOSER = 0.35
@@ -43,13 +43,7 @@ class _Grid(NamedTuple):
 
 
 def sensor_gains(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
-    """Return the sensors of a dictionary (kind "loss") that may have lost a share of their reading.
-
-    Args:
-        found: the dictionary.
-        white: the window.
-        part: the record behind it.
-    """
+    """Return the sensors of a dictionary (kind "loss") that may have lost a share of their reading in a window."""
     if white.states is None or found.model.feedback or np.any(found.model.L):
         return []
     candidates = [c for c in found.candidates if c.kind == "loss" and not c.columns]
@@ -76,14 +70,14 @@ def _judged(found: Dictionary, candidate: Candidate, white: Whitened, part: Expe
         weights /= weights.sum()
         std = float(np.sqrt(max(weights @ grid.shares**2 - (weights @ grid.shares) ** 2, 0.0)))
         step, apart = int(np.max(np.diff(onsets), initial=1)), float(shares[1] - shares[0])
-        if step == 1 and apart < FINE * std:
-            break
-        if step > 1:
+        if step > 1:  # beside a wrong onset another share is the best one
             wide *= CLOSER
             reach = max(int(wide / 2), ONSETS // 2)
             near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, last), ONSETS).astype(int)
             onsets = np.unique(near)
-        if apart >= FINE * std:
+        elif apart < FINE * std:
+            break
+        else:
             high *= CLOSER
             middle = float(np.clip(shares[g], high / 2, 1 - high / 2))
             shares = np.linspace(max(middle - high / 2, 1e-6), middle + high / 2, SHARES)

@@ -156,12 +156,7 @@ def course_words(found: "Diagnosis") -> str:
 
 
 def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
-    """Say in three sentences what was found, how sure that is, and what it rests on.
-
-    Args:
-        found: the diagnosis.
-        notes: add what could not be judged, and the status.
-    """
+    """Say in three sentences what was found, how sure that is, and what it rests on; notes say what was not judged."""
     name = found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
     departs = f"The record departs from the healthy {name} (p-value {probability_words(found.p_value)}), but "
     silent = _list(list(found.untestable)) if found.untestable else ""

@@ -37,6 +37,9 @@ CHUNK = 20_000
 RUNS = 4
 """Simulations that may run at the same time; the result does not depend on how many do."""
 
+COMMON = 0.1
+"""Share of blocks by whose energies a healthy record is compared with the simulation."""
+
 NODES = 80
 """Nodes of the quadrature; the run lengths of the usual charts are right to ten digits."""
 
@@ -54,6 +57,7 @@ class Calibration:
         alarms: false alarms among them at these thresholds.
         seed: of the simulation.
         extrapolated: whether the simulation was too short for so rare an alarm and the tail was extrapolated.
+        common: largest energy over its threshold that a tenth of the simulated blocks reach; NaN without a simulation.
     """
 
     labels: tuple[str, ...]
@@ -64,6 +68,7 @@ class Calibration:
     alarms: int
     seed: int | None
     extrapolated: bool = False
+    common: float = float("nan")
 
     def __str__(self) -> str:
         """Say what the thresholds rest on."""
@@ -137,7 +142,8 @@ def calibrate(
         largest = np.vstack(list(pool.map(run, np.random.SeedSequence(seed).spawn(RUNS))))
     q, alarms = equalised(largest, window, arl0)
     labels = tuple(c.label for c in columns.candidates)
-    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated)
+    common = float(np.quantile(np.max(largest / q, axis=1), 1 - COMMON))
+    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated, common)
 
 
 def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: Array) -> Array:

@@ -1,6 +1,7 @@
 """The decisions of a monitor: alarm, name, carry, clear."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,11 +25,26 @@ of the threshold (`forgiven`). Nothing explains an alarm when the energy that is
 large (`odd`).
 """
 
+ODD = 4.3
+"""Standard deviations by which what more noise of one sensor leaves along the others may be too large."""
+
+FEWEST = 4
+"""Samples that a noise must have grown for."""
+
 WATCHING, NAMING, SETTLING, LOST = range(4)
 """Phases: no alarm; alarm, not named; named, the size still growing sharp; an alarm that no candidate explains."""
 
 NOTHING, AGAIN = -1, -2
 """No candidate is named; the alarm is one that no candidate has explained before."""
+
+
+class Loudness(NamedTuple):
+    """The sensor whose noise seems to have grown: -1 for none; by which factor, for how many samples, and the gain."""
+
+    sensor: int = -1
+    factor: float = 1.0
+    count: int = 0
+    gain: float = 0.0
 
 
 @dataclass(eq=False)
@@ -45,6 +61,7 @@ class Decisions:
         begun: first sample after the last input of which nothing is known.
         testable: (C,) whether a whole loss would be noticed.
         passing: [candidate, sample at which it has faded] of transients.
+        kept: the statistics (T, C) of all samples, where they are asked for.
     """
 
     columns: Columns
@@ -60,6 +77,7 @@ class Decisions:
     named_at: int = 0
     quiet: int = 0
     begun: int = 0
+    kept: list[Array] | None = None
 
     KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "passing"
 
@@ -77,6 +95,8 @@ class Decisions:
         """Count the samples (T, C) at the end of a block in which all is quiet."""
         loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.q, axis=1))
         self.quiet = self.quiet + len(statistic) if not loud.size else len(statistic) - 1 - int(loud[-1])
+        if self.kept is not None:
+            self.kept.append(statistic)
 
     def excitation(self, weight: Array, now: int, window: int) -> list[Event]:
         """Return what becomes testable or untestable along weights (T, C) of samples from `now` on."""
@@ -95,14 +115,7 @@ class Decisions:
         return sorted(events, key=lambda e: e.sample)
 
     def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
-        """Decide what the last sample means.
-
-        Args:
-            now: its number.
-            window: the search.
-            plant: the filter.
-            hold: whether nothing may be named yet, because a sensor repeats its reading.
-        """
+        """Decide what the last sample means; nothing may be named while a sensor repeats its reading (`hold`)."""
         gains = np.where(window.peak > 0, window.statistic - self.q, -np.inf)
         best, watching = int(np.argmax(gains)), self.phase == WATCHING
         if self.phase in (WATCHING, LOST) and gains[best] > 0:
@@ -121,8 +134,10 @@ class Decisions:
         return Event("cleared", now)
 
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
-        rule = self.rules
-        share = np.exp((gains - gains[best]) / 2)
+        rule, noise = self.rules, noisy_sensor(window)
+        # a noise that has grown is an answer, too, and the likely one where it was the answer before
+        louder = noise.gain - float(self.q.min()) * (self.named != AGAIN)
+        share = np.exp(np.clip(np.append(gains, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
         chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is named
         if self.phase == NAMING:
@@ -132,6 +147,8 @@ class Decisions:
             testable = self.columns.candidates[best].additive or self.testable[best]
             if self.quiet >= rule["still"] or (late and gains[best] <= 0):
                 return self._clear(now)
+            if louder > gains[best] and (late or share[-1] >= rule["certainty"] * share.sum()):
+                return self._lost(now, best, window, noise)
             if not late and not (sure and gains[best] > 0 and free >= 4 and testable):
                 return None
         else:
@@ -142,7 +159,7 @@ class Decisions:
                 return self._clear(now)
             odd, free = self._left_over(chosen, window)
         if odd > rule["odd"]:
-            return self._lost(now, chosen, window)
+            return self._lost(now, chosen, window, noise)
         if self.phase == NAMING or chosen != self.named:
             self.phase, self.named, self.named_at = SETTLING, chosen, now
             return self._event("isolated", now, chosen, gains, window)
@@ -158,17 +175,16 @@ class Decisions:
         window.restart()
         self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
 
-    def _lost(self, now: int, best: int, window: Window) -> Event | None:
+    def _lost(self, now: int, best: int, window: Window, noise: Loudness) -> Event | None:
         said, onset = self.named == AGAIN, now - int(window.peak[best]) + 1
         energy = float(window.statistic[best])
-        sensor, factor = noisy_sensor(window, int(window.peak[best]))
         self.phase, self.named, self.quiet = LOST, AGAIN, 0
         window.restart()
         if said:
             return None
-        if sensor >= 0:
-            return Event("isolated", now, ((f"sensor:{self.outputs[sensor]} noise", 1.0),), onset, (factor,), energy,
-                         "size is the factor of the standard deviation")
+        if noise.gain > self.q.min():
+            return Event("isolated", now, ((f"sensor:{self.outputs[noise.sensor]} noise", 1.0),), now - noise.count + 1,
+                         (noise.factor,), noise.gain, "size is the factor of the standard deviation")
         return Event("isolated", now, (("unknown", 1.0),), onset, (), energy, "no candidate explains it")
 
     def _left_over(self, number: int, window: Window) -> tuple[float, float]:
@@ -235,22 +251,22 @@ def _fading(plant: RunningFilter, energy: float, faded: float) -> int:
     return 1 + int(np.ceil(np.log(faded / energy) / np.log(min(max(radius, 1e-6), 1 - 1e-6)) / 2))
 
 
-def noisy_sensor(window: Window, count: int) -> tuple[int, float]:
-    """Return the sensor whose noise has grown over the last samples, and by which factor; -1 where none explains it.
+def noisy_sensor(window: Window) -> Loudness:
+    """Return the sensor whose noise has most likely grown since some sample, and twice the log-likelihood gained.
 
     More noise of one sensor makes the whitened innovations larger along one direction alone, the others stay as they
     are.
     """
-    r, root = window.recent(count), window.steady.root
-    l, best, found, factor = r.shape[1], 0.0, -1, 1.0  # noqa: E741
-    if len(r) < 4:
-        return found, factor
-    total = float(np.sum(r**2))
-    for o, alongside in enumerate((r @ (root / np.linalg.norm(root, axis=0))).T):
-        along = float(np.sum(alongside**2))
-        share, free = along / len(r), (l - 1) * len(r)
-        rest = ((total - along) / free) ** (1 / 3) - 1 + 2 / (9 * free) if l > 1 else 0.0
-        gain = len(r) * (share - 1 - np.log(share)) if share > 1 else 0.0
-        if gain > best and rest < 4.3 * np.sqrt(2 / (9 * max(free, 1))):
-            best, found, factor = gain, o, float(np.sqrt(share))
-    return (found, factor) if best > 12 else (-1, 1.0)
+    r, root = window.recent(min(int(window.clock[0]), window.length)), window.steady.root
+    l, n = r.shape[1], np.arange(1, len(r) + 1)[:, None]  # noqa: E741
+    along = np.cumsum((r @ (root / np.linalg.norm(root, axis=0))) ** 2, axis=0)
+    share, free = along / n, (l - 1) * n
+    total = np.cumsum(np.sum(r**2, axis=1))[:, None]
+    # Wilson and Hilferty: the cube root of chi2 / free is nearly Gaussian
+    rest = np.cbrt((total - along) / np.maximum(free, 1)) - 1 + 2 / (9 * np.maximum(free, 1))
+    possible = (share > 1) & (n >= FEWEST) & ((l == 1) | (rest < ODD * np.sqrt(2 / (9 * np.maximum(free, 1)))))
+    gain = np.where(possible, n * (share - 1 - np.log(np.maximum(share, 1.0))), 0.0)
+    if not gain.any():
+        return Loudness()
+    k, o = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
+    return Loudness(o, float(np.sqrt(share[k, o])), k + 1, float(gain[k, o]))

@@ -1,17 +1,18 @@
 """What healthy records say about the noise: its colour, its size, and how much the thresholds must rise."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.record import Data
+from optid.data.record import Data, as_list
 from optid.errors import DataError
-from optid.faults.monitor.arl import Calibration, block_maxima
+from optid.faults.monitor.arl import COMMON, Calibration
 from optid.faults.nuisance import ModelUncertainty, sensitivities
+from optid.faults.ranges import unsure_since
 from optid.faults.signatures import Dictionary
-from optid.faults.whitening import OTHER_SCALE, Predictor, Whitened, health, whiten
+from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
 from optid.models import NoiseCovariances
 from optid.models.experiments import in_units_of
 
@@ -27,16 +28,14 @@ ORDERS = 1, 2, 3, 4, 6, 8
 LONGEST = 3000
 """Samples of the identification along which the effect of uncertain parameters is simulated."""
 
-COMMON = 0.1
-"""Share of windows whose energies are compared with those of white noise."""
 
-
-def parameter_effect(known: ModelUncertainty, data: Data) -> tuple[Array, Array]:
+def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> tuple[Array, Array]:
     """Return what uncertain parameters of unit variance leave in the whitened innovations of the record they came from.
 
     Args:
         known: the uncertainty.
         data: the record.
+        steady: what whitens: the predictor of the uncertainty, or that with the colour of a healthy record.
 
     Returns:
         (T, l, q), and the functions of the inputs (T, r) along which it does.
@@ -44,51 +43,59 @@ def parameter_effect(known: ModelUncertainty, data: Data) -> tuple[Array, Array]
     raw = in_units_of(known.model, data)
     given = known.model.initial_state(raw, "predict")
     effects, inputs = [], []
-    for part, x0 in zip(raw.experiments, given if isinstance(given, tuple) else (given,)):
+    for part, x0 in zip(raw.experiments, as_list(given)):
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
         by_parameter, _ = sensitivities(known.model, known.predictor, here, x0, there, known.root)
-        effects.append(by_parameter.reshape(*here.y.shape, -1))
+        effects.append(_recoloured_effect(by_parameter.reshape(*here.y.shape, -1), known.predictor, steady))
         inputs.append(known.model.expanded(here.u))
     return np.concatenate(effects), np.nan_to_num(np.concatenate(inputs))
+
+
+def _recoloured_effect(effect: Array, before: Predictor, steady: Predictor) -> Array:
+    """Whiten (T, l, q) by a predictor whose last states are the past innovations of another one."""
+    raw, taps = np.linalg.pinv(before.root) @ effect, steady.C[:, len(before.A) :]
+    left = raw.copy()
+    for lag, tap in enumerate(np.split(taps, taps.shape[1] // len(raw[0]), axis=1) if taps.size else [], start=1):
+        left[lag:] -= tap @ raw[:-lag]
+    return steady.root @ left
 
 
 def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     """Return a dictionary with the noise that a healthy record shows, and what was changed.
 
-    Innovations that are white and of the size predicted leave it as it is. Otherwise they get an autoregression, whose
-    order is chosen by BIC; its past innovations are states beside those of the plant.
+    Samples after an input left its identified range say nothing of the noise. Innovations that are white and of the
+    size predicted leave the dictionary as it is. Otherwise they get an autoregression, whose order is chosen by BIC;
+    its past innovations are states beside those of the plant.
     """
-    white = whiten(found.model, healthy, scale=found.predictor)
-    judged = health(white)
+    steady = found.predictor
+    whole: list[Any] = as_list(whiten(found.model, healthy, scale=steady))
+    parts = [replace(part, present=part.present & ~unsure_since(found.model, record.u, steady.settling)[:, None])
+             for part, record in zip(whole, healthy.raw().experiments)]
+    judged = health(parts)
     if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
         return found, ""
-    parts = [white] if isinstance(white, Whitened) else list(white)
-    signals = [np.where(part.present, part.innovations, 0.0) for part in parts]
-    taps, covariance = ([], _covariance(signals)) if judged.white else _autoregression(signals)
+    signals = [np.where(part.present, part.innovations, np.nan) for part in parts]
+    taps, covariance = _autoregression(signals, (0,) if judged.white else ORDERS)
     said = (f"on the healthy record the innovations are not those of the model (whiteness p = {judged.p_value:.2g}, "
             f"size {judged.ratio:.2f} times the predicted one): its noise is taken from that record"
             + (f", as an autoregression of order {len(taps)}." if taps else "."))
     return _recoloured(found, taps, covariance), said
 
 
-def _covariance(signals: list[Array]) -> Array:
-    return np.asarray(sum(s.T @ s for s in signals) / sum(len(s) for s in signals))
-
-
-def _autoregression(signals: list[Array]) -> tuple[list[Array], Array]:
+def _autoregression(signals: list[Array], orders: tuple[int, ...]) -> tuple[list[Array], Array]:
     """Taps (l, l) and covariance of what is left, by least squares; the order by BIC."""
     l, best = signals[0].shape[1], (np.inf, [], np.eye(1))  # noqa: E741
-    most = max(ORDERS)
-    for order in ORDERS:
-        past = np.vstack([np.hstack([s[most - i : len(s) - i] for i in range(1, order + 1)]) for s in signals])
-        now = np.vstack([s[most:] for s in signals])
+    most = max(orders)
+    for order in orders:
+        rows = np.vstack([np.hstack([s[most - i : len(s) - i] for i in range(order + 1)]) for s in signals])
+        now, past = np.split(rows[~np.isnan(rows).any(axis=1)], [l], axis=1)
         weights = np.linalg.lstsq(past, now, rcond=None)[0]
         left = now - past @ weights
         covariance = left.T @ left / len(left)
         score = len(left) * float(np.linalg.slogdet(covariance)[1]) + order * l * l * np.log(len(left))
         if score < best[0]:
-            best = score, [part.T for part in np.split(weights, order)], covariance
+            best = score, [part.T for part in np.split(weights, max(order, 1))][:order], covariance
     return best[1], best[2]
 
 
@@ -122,30 +129,20 @@ def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calib
     """Return thresholds that a healthy record keeps: all of them get one factor, never below one.
 
     A record is rarely long enough to show alarms as rare as a monitor wants them. The factor is the larger of two: how
-    much larger the energies are that a tenth of its windows reach than those of white noise, and what the largest of
-    all asks for.
+    much larger the energies are that a tenth of its windows reach than those of the simulation behind `base`, and what
+    the largest of all asks for.
 
     Raises:
         DataError: a record of fewer than 20 windows.
     """
-    found, window, columns = monitor.dictionary, monitor.window, monitor.columns
-    raw = in_units_of(found.model, healthy)
-    white = whiten(found.model, raw, scale=found.predictor)
-    parts = [white] if isinstance(white, Whitened) else list(white)
-    seen, usual = [], []
-    rng = np.random.default_rng(monitor.seed)
-    for part, experiment in zip(parts, raw.experiments):
-        f = np.nan_to_num(found.model.expanded(experiment.u))
-        f = np.vstack([f[:1], f])
-        for rows, target, repeats in ((part.r, seen, 1), (None, usual, 5)):
-            for _ in range(repeats):
-                r = rng.standard_normal(part.r.shape) if rows is None else rows
-                target.append(block_maxima(columns, found.predictor, window, f, r) / base.q)
-    largest, white_largest = (np.max(np.vstack(blocks), axis=1) for blocks in (seen, usual))
+    window, records = monitor.window, in_units_of(monitor.dictionary.model, healthy).experiments
+    watched = [monitor.watched(part.u, part.y)[: len(part.y) // window * window] for part in records]
+    blocks = np.vstack([one.reshape(-1, window, len(base.q)).max(axis=1) for one in watched])
+    largest = np.max(blocks / base.q, axis=1)
     if len(largest) < FEWEST:
         raise DataError(
             f"The healthy record has {len(largest)} stretches of {window} samples: {FEWEST} are needed for thresholds."
         )
-    ratio = float(np.quantile(largest, 1 - COMMON) / np.quantile(white_largest, 1 - COMMON))
+    ratio = float(np.quantile(largest, 1 - COMMON)) / base.common
     factor = max(1.0, ratio, 1.05 * float(largest.max()))
-    return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.r) for part in parts))
+    return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.y) for part in records))

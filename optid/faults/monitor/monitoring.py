@@ -100,16 +100,16 @@ class Monitor:
         unknown = set(rules) - set(RULES)
         if unknown:
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
-        self.remark, effect, inputs = "", None, None
-        if uncertainty is not None:
-            known = uncertainty if isinstance(uncertainty, ModelUncertainty) else model_uncertainty(model, uncertainty)
+        self.remark, effect, inputs, known = "", None, None, uncertainty
+        if known is not None:
+            known = known if isinstance(known, ModelUncertainty) else model_uncertainty(model, known)
             found = replace(found, predictor=known.predictor)
-            if isinstance(uncertainty, Data):
-                effect, inputs = parameter_effect(known, uncertainty)
         if healthy is not None:
             found, self.remark = observed(found, healthy)
             if self.remark:
                 warnings.warn(self.remark, DataWarning, stacklevel=2)
+        if known is not None and isinstance(uncertainty, Data):
+            effect, inputs = parameter_effect(known, uncertainty, found.predictor)
         self._set(found, int(window), seed, {**RULES, **rules} | ({} if found.unknown else {"odd": np.inf}))
         for c in found.candidates:
             if c.label in self.skipped and c.kind != "loss":  # the gains of sensors are among the kinds by default
@@ -235,6 +235,15 @@ class Monitor:
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
         return [event for start in range(0, len(u), BLOCK)
                 for event in self._take_in(u[start : start + BLOCK], y[start : start + BLOCK])]
+
+    def watched(self, u: Array, y: Array) -> Array:
+        """Return the statistics (N, C) along a record in raw units without any decision; the monitor stays as it is."""
+        twin = Monitor.__new__(Monitor)
+        twin._set(self.dictionary, self.window, self.seed, self.decisions.rules)  # with thresholds that are infinite
+        twin.plant.lose()
+        twin.decisions.kept = []
+        twin.run(u, y)
+        return np.vstack(twin.decisions.kept)
 
     def _take_in(self, u: Array, y: Array) -> list[Event]:
         start, count = self.samples, len(u)

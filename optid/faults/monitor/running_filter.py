@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from optid.arrays import Array
-from optid.faults.kernels import add_product
+from optid.arrays import Array, compact
+from optid.faults.kernels import add_product, predict
 from optid.faults.monitor.columns import SPARE, Columns, Matrices, Window
 from optid.faults.monitor.search_kernel import DRIFT, JUMP
 from optid.faults.whitening import Predictor
@@ -105,7 +105,20 @@ class RunningFilter:
             fed: (T, s) functions of the outputs.
             y: (T, l) readings.
         """
-        return self.steady.run(self.model, self.x, f, fed, y, self.additions(f) if self.held.any() else None)
+        model, steady = self.model, self.steady
+        drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
+        for matrix, signal, target in ((model.B, f, drive), (model.E, fed, drive), (model.L, y, drive),
+                                       (model.D, f, direct)):
+            if matrix.any():
+                add_product(np.ascontiguousarray(matrix), signal, target)
+        if self.held.any():
+            for target, added in zip((drive, direct), self.additions(f)):
+                target += added
+        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
+        x[0] = self.x
+        A, C, K, root = map(compact, (model.A, model.C, steady.K, steady.root))
+        predict(A, C, K, root, drive, y, direct, x, r)
+        return x, r
 
     def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
         """Take in one sample; return the whitened innovation (l,) and the matrices of the search.

@@ -184,16 +184,10 @@ def advise(
     model: "HammersteinSS", members: Sequence[Damage], u: Array | None, robust: Allocation | None, why_not: str,
     *, action: str = "auto", seed: int = 0,
 ) -> Ambiguity:
-    """Choose between waiting, probing and acting robustly.
+    """Choose between waiting, probing and acting robustly ("auto"), or take the action asked for.
 
-    Args:
-        model: the healthy model.
-        members: the explanations that are left.
-        u: (N, m) recent inputs, from which the ordinary input is judged; None where there are none.
-        robust: control for all of them, where there is one.
-        why_not: why there is none.
-        action: "wait", "probe", "robust", or "auto".
-        seed: of the probe.
+    The ordinary input is judged from recent inputs u (N, m), where there are some; where no control is right for all
+    members, `why_not` says why.
 
     Raises:
         StructureError: an action that is not possible here.

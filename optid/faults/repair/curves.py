@@ -51,11 +51,6 @@ class Curve:
         return self.basis.nodes
 
     @property
-    def u(self) -> Array:
-        """The nodes, as the results have always called them."""
-        return self.nodes
-
-    @property
     def values_open(self) -> int:
         """How many values are estimated."""
         return 1 if self.dead else self.nodes.size

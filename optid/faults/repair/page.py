@@ -1,62 +1,35 @@
 """A reformulation as one HTML page that carries its figure with it."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from optid import __version__
+from optid.faults.page import write_page
 from optid.faults.repair.reformulation import HEADS, Reformulation
 from optid.faults.repair.schedule import fit_words
-from optid.show.page import figure, template, versions
 from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "refitted": "good", "as diagnosed": "fair", "ambiguous": "bad"}
 
 
 def write(found: Reformulation, path: str | Path, *, record: str = "", command: str = "") -> Path:
-    """Write a reformulation as a self-contained HTML page.
-
-    Args:
-        found: the reformulation.
-        path: the file, replaced when it exists.
-        record: name of the record.
-        command: the command line behind it.
+    """Write a reformulation as a self-contained HTML page, with the name of the record and the command line behind it.
 
     Raises:
         OSError: the file cannot be written.
     """
-    Path(path).write_text(render(found, record=record, command=command), encoding="utf-8")
-    return Path(path)
-
-
-def render(found: Reformulation, *, record: str = "", command: str = "") -> str:
-    """Return the page that `write` writes."""
     caption = (
         "Effect of every actuator before and now, with twice its standard error (open dots: no sample lies there); "
         "outputs that can be held at rest; predicted errors of the outputs without their noise."
     )
-    content: dict[str, Any] = {
-        "version": __version__,
-        "title": f"Reformulation: {found.status}",
-        "lead": " · ".join(part for part in (record, found.healthy.title) if part),
-        "tone": TONES[found.status],
-        "word": HEADS[found.status],
-        "sentences": _sentences(found),
-        "cards": _cards(found),
-        "notes": list(dict.fromkeys(note for note in found.notes)),
-        "tables": _tables(found),
-        "figures": [figure("reformulation", found.plot, caption)],
-        "members": [{"title": member.label, "text": str(member)} for member in found.members],
-        "call": command or "optid.faults.reformulate(model, diagnosis, data)",
-        "versions": versions(),
-        "text": str(found),
-        "sections": [("verdict", "Result"), ("tables", "Values"), ("figures", "Figure"), ("members", "Explanations"),
-                     ("reproduce", "Reproduce")],
-    }
-    empty = {name for name in ("members", "tables") if not content[name]}
-    content["sections"] = [pair for pair in content["sections"] if pair[0] not in empty]
-    return template("reformulation.html.j2").render(content)
+    return write_page(
+        path, f"Reformulation: {found.status}", (record, found.healthy.title),
+        headings=("What is there now", "Before and now", "Explanations"), draw=found.plot, caption=caption,
+        cards=_cards(found), tables=_tables(found), texts=[(member.label, str(member)) for member in found.members],
+        tone=TONES[found.status], word=HEADS[found.status], sentences=_sentences(found),
+        notes=list(dict.fromkeys(found.notes)), call=command or "optid.faults.reformulate(model, diagnosis, data)",
+        text=str(found),
+    )
 
 
 def _sentences(found: Reformulation) -> list[str]:
@@ -75,7 +48,7 @@ def _sentences(found: Reformulation) -> list[str]:
     return lines
 
 
-def _cards(found: Reformulation) -> list[dict[str, str]]:
+def _cards(found: Reformulation) -> list[tuple[str, str]]:
     cards = []
     if found.schedule is not None:
         cards.append(("samples after the fault", str(found.schedule.samples)))
@@ -86,7 +59,7 @@ def _cards(found: Reformulation) -> list[dict[str, str]]:
     if found.allocation is not None:
         cards.append(("actuators that move", ", ".join(found.allocation.moving) or "none"))
         cards.append(("route of the allocation", found.allocation.route))
-    return [{"label": label, "value": value} for label, value in cards]
+    return cards
 
 
 def _tables(found: Reformulation) -> list[Table]:

@@ -18,11 +18,7 @@ COLOURS = (ORANGE, GREEN, BLUE)
 
 @styled
 def draw(found: "Reformulation") -> Figure:
-    """Draw the nonlinearities before and now, the outputs that can be held, and what replaces a lost sensor.
-
-    Args:
-        found: the reformulation.
-    """
+    """Draw the nonlinearities before and now, the outputs that can be held, and what replaces a lost sensor."""
     inputs = found.healthy.m
     flat = found.healthy.l == 2
     lost = bool(found.observer.lost)  # with all sensors left nothing has changed of what they say

@@ -19,7 +19,7 @@ from optid.data.record import Data
 from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.faults.repair.curves import Curve, curve_of
-from optid.faults.signatures import Candidate
+from optid.faults.signatures import Candidate, course_of
 from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models.experiments import in_units_of
 from optid.models.nonlinearity import Nonlinearity
@@ -392,6 +392,4 @@ def _states(steady: Predictor, drive: Array, innovations: Array, x0: Array) -> A
 
 def _course(kind: str, count: int, held: bool) -> Array:
     """Course of a fault that adds something, from the first sample it changes on."""
-    since = np.arange(count) - int(held)
-    course = {"jump": since == 0, "drift": np.maximum(since + 1, 0)}.get(kind, since >= 0)
-    return np.asarray(course, dtype=float)
+    return course_of(kind, np.arange(count) - int(held))

@@ -79,12 +79,7 @@ class Schedule:
 
 
 def fit_words(low: float, high: float) -> str:
-    """Return an interval of a fit in words; a fit below zero is worse than the mean of the outputs, by how much or not.
-
-    Args:
-        low: lower end, %.
-        high: upper end, %.
-    """
+    """Say an interval of a fit (%); one below zero is worse than the mean of the outputs, by how much or not."""
     if high <= 0:
         return "none: what is left of the outputs is smaller than the uncertainty of the refit"
     return f"{max(low, 0.0):.1f} to {high:.1f} %"
@@ -96,16 +91,7 @@ def refit(
 ) -> tuple["HammersteinSS", Schedule]:
     """Refit what a fault broke, and all parameters once held-out samples say that this is better.
 
-    Args:
-        model: the healthy model.
-        data: the record with the fault.
-        damage: what broke.
-        constraints: of the damaged nonlinearities; see `formulations.faults.refit`.
-        prior: what is believed beforehand; by default with the curvature that makes the record most probable.
-        nodes: values of a nonlinearity that has no nodes of its own.
-        stage: "affected only", "all with prior", or "auto": by hold-out.
-        solver: back end.
-        seed: of the draws behind the interval of the fit.
+    The damage says what broke; the other arguments are those of `reformulate`.
 
     Warns:
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.

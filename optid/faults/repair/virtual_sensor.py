@@ -152,11 +152,7 @@ def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
 
 
 def check_stabilisable(model: "HammersteinSS", left: Sequence[int]) -> None:
-    """Refuse when a mode that does not decay is moved by no actuator that is left.
-
-    Args:
-        model: the plant.
-        left: functions of the inputs (columns of B) that still move.
+    """Refuse when a mode that does not decay is moved by none of the functions of the inputs that are left.
 
     Raises:
         StructureError: with the mode.

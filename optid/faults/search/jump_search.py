@@ -12,10 +12,9 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.errors import StructureError
-from optid.faults.search.scanning import check_window
 from optid.faults.search.sweeps import inverse_roots
 from optid.faults.signatures import Dictionary
-from optid.faults.whitening import Whitened
+from optid.faults.whitening import Whitened, check_window
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
@@ -81,7 +80,7 @@ def state_jumps(
         StructureError: an uncertain model (its nuisance ties all segments together), several experiments, a window
             that is too long, impossible numbers.
     """
-    check_window(found, whitened, "state_jumps")
+    check_window(found.model, whitened, "state_jumps")
     count = len(whitened.r)
     if whitened.nuisance is not None:
         raise StructureError("An uncertain model ties all segments together: whiten without it for this search.")
@@ -89,24 +88,24 @@ def state_jumps(
     if count > LONGEST:
         raise StructureError(f"{count} samples are too many for all segments ({LONGEST}): use a shorter window.")
     price = _price(found, whitened, penalty)
-    energies, best = _segmented(segment_costs(found, whitened), np.sum(whitened.r**2, axis=1), int(most))
+    energies, best = _segmented(segment_costs(whitened), np.sum(whitened.r**2, axis=1), int(most))
     chosen = best[int(np.argmin(energies + price * np.arange(energies.size)))]
     sizes = np.zeros((0, found.model.nx))
     if chosen:  # by least squares, all together
-        flat = np.concatenate([_response(found, whitened, k).reshape(whitened.r.size, -1) for k in chosen], axis=1)
+        flat = np.concatenate([_response(whitened, k).reshape(whitened.r.size, -1) for k in chosen], axis=1)
         sizes = np.linalg.lstsq(flat, whitened.r.ravel(), rcond=1e-10)[0].reshape(len(chosen), -1)
     return StateJumps(chosen, np.asarray(sizes, dtype=float), energies, best, price)
 
 
-def segment_costs(found: Dictionary, whitened: Whitened) -> Array:
+def segment_costs(whitened: Whitened) -> Array:
     """Return the energy (N, N + 1) left of the samples i to j - 1 after a jump at i; inf for empty segments."""
     count = len(whitened.r)
     costs = np.full((count, count + 1), np.inf)
     energy = np.concatenate([[0.0], np.cumsum(np.sum(whitened.r**2, axis=1))])
     complete = bool(whitened.present.all())
-    trace, roots = _response(found, whitened, 0), np.empty(0)
+    trace, roots = _response(whitened, 0), np.empty(0)
     for i in range(count):
-        own = trace[: count - i] if complete else _response(found, whitened, i)[i:]
+        own = trace[: count - i] if complete else _response(whitened, i)[i:]
         if i == 0 or not complete:  # without gaps a later onset shifts the trace
             products = np.cumsum(np.einsum("kop,koq->kpq", own, own), axis=0)
             roots = inverse_roots(products, np.asarray(np.linalg.eigvalsh(products)[:, -1], dtype=float))
@@ -116,13 +115,9 @@ def segment_costs(found: Dictionary, whitened: Whitened) -> Array:
     return costs
 
 
-def _response(found: Dictionary, whitened: Whitened, onset: int) -> Array:
+def _response(whitened: Whitened, onset: int) -> Array:
     """What unit jumps of the state leave, (N, l, n)."""
-    count, n = len(whitened.r), found.model.nx
-    into_state = np.zeros((count, n, n))
-    into_state[onset] = np.eye(n)
-    into_output = np.zeros((count, found.model.l, n))
-    return whitened.seen(whitened.predictor.respond(into_state, into_output, whitened.present))
+    return whitened.seen(whitened.predictor.jumps(onset, whitened.present))
 
 
 def _segmented(costs: Array, squares: Array, most: int) -> tuple[Array, tuple[tuple[int, ...], ...]]:

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.errors import LookupFailed, StructureError, nearest
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary
-from optid.faults.whitening import Whitened
+from optid.faults.whitening import Whitened, check_window
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
@@ -163,7 +163,7 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         StructureError: several experiments at once, onsets outside the window, a window that is too short, no candidate
             with a signature.
     """
-    check_window(found, whitened, "scan")
+    check_window(found.model, whitened, "scan")
     prepared = sweep(found, whitened, u)
     correlations = prepared.correlations(whitened.r)
     statistic = prepared.statistic(correlations)
@@ -175,20 +175,6 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         statistic[:, np.setdiff1d(np.arange(count), chosen)] = np.nan
     inputs = None if u is None else np.asarray(u, dtype=float).reshape(len(whitened.r), -1)
     return Scan(found, whitened, inputs, statistic, prepared, correlations)
-
-
-def check_window(found: Dictionary, whitened: Whitened, search: str) -> None:
-    """Refuse several experiments, other outputs than the model's, and innovations that are not finite."""
-    if not isinstance(whitened, Whitened):
-        raise StructureError(
-            f"{search} takes the whitened innovations of one experiment, as optid.faults.whiten returns them: take the "
-            "experiments of a record one by one."
-        )
-    if whitened.r.shape[1] != found.model.l:
-        raise DataError(f"The window has {whitened.r.shape[1]} outputs; the dictionary is of {found.model.l}.")
-    if not np.isfinite(whitened.r).all():
-        k, o = np.argwhere(~np.isfinite(whitened.r))[0]
-        raise DataError(f"The innovation of output {whitened.outputs[o]!r} at sample {k} is not finite.")
 
 
 def shorten(text: str, most: int) -> str:

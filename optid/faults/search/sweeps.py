@@ -149,17 +149,14 @@ class Sweep:
 
     def largest(self, windows: Array) -> Array:
         """Return the largest energy over the onsets for windows (M, N, l), (M, C); NaN for what is not tested."""
+        from optid.faults.search.sweep_kernels import correlate, explained
+
         shown = windows if self.present is None else np.where(self.present, windows, 0.0)
         if self.nuisance is not None:
             shown = np.moveaxis(self.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
-        return self._largest(compact(shown))
-
-    def _largest(self, windows: Array) -> Array:
-        from optid.faults.search.sweep_kernels import correlate, explained
-
         correlations = np.empty((self.window, self.tables.group.size))
         statistic, result = np.full(self.tested.shape, np.nan), np.empty((len(windows), len(self.tested)))
-        for window, row in zip(windows, result):
+        for window, row in zip(compact(shown), result):
             correlate(self.tables, window, correlations)
             explained(self.tables, correlations, self.roots, statistic)
             np.fmax.reduce(statistic, axis=1, where=self.tested, initial=-np.inf, out=row)
