@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from optid.identify.search import search as searching
 from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, RUNGS, Ladder, gain
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, free_parameters, tried
+from optid.identify.validation.predictions import prediction_fit
 from optid.models.layout import Layout
 from optid.statistics import collect
 
@@ -79,15 +81,16 @@ def test_a_record_too_short_for_the_blocks_is_refused():
         Blocks.of(plant(30), 4)
 
 
-def test_the_errors_of_a_block_are_those_of_the_free_run_from_a_state_fitted_to_its_beginning():
+def test_the_errors_of_a_block_are_those_of_a_validation_on_it():
     data = plant(400, start=5.0)
     blocks = Blocks.of(data, 4)
     model = optid.fit(data, "oe.exact", na=1, nb=1, nk=1).model
     energy, measure = blocks.errors(model, 1)
     part = data.window(100, 200)
-    x0 = model.initial_state(part.window(0, 33))
-    expected = np.sum((np.ravel(model.simulate(part, x0=x0)) - part.y.ravel()) ** 2)
+    expected = np.sum((np.ravel(model.simulate(part, x0="fit")) - part.y.ravel()) ** 2)
     assert energy[0] == pytest.approx(expected, rel=1e-9)
+    fitted = 100 * (1 - np.sqrt(energy[0] / np.sum((part.y - part.y.mean()) ** 2)))
+    assert fitted == pytest.approx(prediction_fit(model, part, "simulation")[0])
     assert measure[0] == pytest.approx(100 * np.var(data.y))
     assert pooled_fit(energy[None], measure[None]) == pytest.approx(100 * (1 - np.sqrt(expected / measure[0])))
 
@@ -208,6 +211,26 @@ def test_of_structures_that_are_as_good_the_smaller_is_best():
 def test_a_model_whose_run_diverges_in_a_block_is_never_chosen():
     simple, wild = trial(LINEAR, [0.5] * 4), trial(INPUTS, [0.001, 0.001, 0.001, np.inf])
     assert ladder_of(simple, wild).choice() is simple and ladder_of(wild).choice() is None
+
+
+def test_a_model_that_got_stuck_on_the_whole_record_is_worth_what_it_fits_there():
+    sound = trial(LINEAR, [0.1] * 4)
+    stuck = replace(trial(INPUTS, [0.01] * 4), estimation=30.0)
+    assert stuck.score == 30.0 and sound.score == pytest.approx(100 * (1 - np.sqrt(0.1)))
+    assert ladder_of(sound, stuck).choice() is sound
+
+
+def test_a_refit_that_got_worse_is_made_again_as_on_trial(monkeypatch, short):
+    """More starts may end elsewhere: the model that is handed over is never worse than what was chosen."""
+    asked = []
+
+    def worse(data, formulation, **arguments):
+        asked.append(arguments)
+        return optid.fit(data, formulation, **{**arguments, **({} if "starts" in arguments else {"nk": [9]})})
+
+    monkeypatch.setattr(searching, "fit", worse)
+    found = identify(plant(300), classes=[LINEAR], workers=1)
+    assert len(asked) == 2 and "starts" in asked[1] and found.fit.simulation_fit[0] > 90
 
 
 @pytest.mark.slow

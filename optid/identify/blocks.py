@@ -17,9 +17,9 @@ from optid.data.stretches import between_gaps
 from optid.errors import DataError, OptidError, RankError
 
 SHORTEST = 10  # samples of a part of an experiment: shorter ones say more of their initial state than of the plant
-LEAD, LEAST = 0.33, 30  # share of a block to which its initial state is fitted; samples of that part at least
 NEAR = 0.15  # a border of experiments this near to that of two blocks, as a share of their length, takes its place
 RUNAWAY = 10.0  # a run diverges where it leaves so many times the range of the outputs
+LEAD, LEAST = 0.33, 30  # share of a block that unstable models have to go on from; samples of that part at least
 
 
 class Part(NamedTuple):
@@ -84,22 +84,19 @@ class Blocks:
         """Return the energy of the errors of a model on a block, and what it is measured by, by output: (l,), (l,).
 
         The measure is the variance of the output in the whole record times the samples that were compared; the energy
-        is infinite where the model runs away.
+        is infinite where the model runs away, an unstable one also from a state fitted to the beginning of the block.
 
         Args:
             model: the model.
             block: number of the block.
-            horizon: samples ahead of the prediction; None for the free run, from states fitted to the beginning of the
-                block: more would let slow modes follow what they cannot.
+            horizon: samples ahead of the prediction; None for the free run from an initial state fitted to the block,
+                as a model is validated on any other record.
         """
         part, (variance, span) = self.block(block).raw(), self.outputs
         try:  # what runs away is told by its energy
-            if horizon is None:
-                states = [model.initial_state(part.select(experiments=i).window(0, _lead(e.n_samples)))
-                          for i, e in enumerate(part.experiments)]
-                found = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
-            else:
-                found = as_list(model.predict(part, horizon))
+            found = as_list(model.simulate(part, x0="fit") if horizon is None else model.predict(part, horizon))
+            if horizon is None and not model.is_stable and self._diverges(model, part):
+                return np.full(self.data.l, np.inf), np.zeros(self.data.l)
         except OptidError:
             return np.full(self.data.l, np.inf), np.zeros(self.data.l)
         y, run = np.vstack([e.y for e in part.experiments]), np.vstack(found)
@@ -111,6 +108,17 @@ class Blocks:
         if not here.any(axis=0).all():
             raise DataError(f"block {block + 1} has no sample of an output that can be compared: use fewer blocks")
         return np.where(wild, np.inf, energy), variance * here.sum(axis=0)
+
+    def _diverges(self, model: Any, part: Data) -> bool:
+        """Whether a model that follows the first third of every experiment leaves the range of the record after it."""
+        states = [model.initial_state(part.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
+                  for i, n in enumerate(e.n_samples for e in part.experiments)]
+        runs = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
+        return any(np.nanmax(np.abs(run - e.y) / self.outputs[1]) > RUNAWAY for run, e in zip(runs, part.experiments))
+
+    def fit(self, model: Any, horizon: int | None = None) -> float:
+        """Return the fit in % of one model over all blocks; minus infinity where it runs away in one."""
+        return pooled_fit(*map(np.array, zip(*(self.errors(model, b, horizon) for b in range(len(self))))))
 
 
 def joined(data: Data, parts: Iterable[Part]) -> Data:
@@ -124,6 +132,3 @@ def pooled_fit(energy: Array, measure: Array) -> float:
         return -np.inf
     return float(100 * np.mean(1 - np.sqrt(energy.sum(axis=0) / np.maximum(measure.sum(axis=0), 1e-300))))
 
-
-def _lead(samples: int) -> int:
-    return min(max(round(LEAD * samples), LEAST), samples)

@@ -15,9 +15,9 @@ from optid.data.record import Data, not_a_record
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
-from optid.identify.search.ladder import CLEAR, KINDS, LINEAR, RUNGS, Ladder, few_levels, gain
+from optid.identify.search.ladder import CLEAR, EQUAL, KINDS, LINEAR, RUNGS, Ladder, few_levels, gain
 from optid.identify.search.pool import Pool
-from optid.identify.search.trial import Candidate, Trial, tried
+from optid.identify.search.trial import Candidate, Trial, spared, tried
 from optid.identify.verdict import Verdict, verdict
 from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
@@ -130,8 +130,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     chosen = ladder.choice()
     if chosen is None:
         raise _nothing(list(ladder.trials.values()))
-    found = fit(data, chosen.candidate.formulation, solver=solver, accuracy=accuracy, constraints=rules,
-                **chosen.candidate.arguments)
+    found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
     why = reasons(ladder, best)
     if len(possible) < len(classes):
         why.append("no input has more than five levels: functions cannot be told from straight lines between them, and "
@@ -196,6 +195,15 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
             found.append(f"{kind}: none of {len(several)} structures was as good as what is chosen "
                          f"(first: {several[0].reason})")
     return found
+
+
+def _refitted(chosen: Trial, blocks: Blocks, horizon: int | None, settings: Mapping[str, Any]) -> Fit:
+    """Fit a structure to the whole record with all its starts; as on trial where that follows the record better."""
+    candidate = chosen.candidate
+    found = fit(blocks.data, candidate.formulation, **settings, **candidate.arguments)
+    if 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation):
+        return found
+    return fit(blocks.data, candidate.formulation, **settings, **candidate.arguments, **spared(candidate))
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None], clock: float, budget: float, trial: Trial) -> None:
