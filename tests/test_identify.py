@@ -10,14 +10,13 @@ import pytest
 import optid
 from optid.bases import Linear
 from optid.errors import DataError, DataWarning, OptidError, RankError, SolverFailed, StructureError
-from optid.identify.blocks import Blocks, pooled_fit
+from optid.identify.blocks import Blocks, joined, pooled_fit
 from optid.identify.delays import LagSums, linear, scan, sharp_delays
 from optid.identify.search import identify
 from optid.identify.search import search as searching
 from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, RUNGS, Ladder, gain
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, free_parameters, tried
-from optid.identify.validation.predictions import prediction_fit
 from optid.models.layout import Layout
 from optid.statistics import collect
 
@@ -61,11 +60,10 @@ def test_every_sample_is_left_out_once(lengths):
     for b in range(4):
         for part in blocks.parts[b]:
             seen[part.experiment][part.first : part.last] += 1
-        inside = sum(e.n_samples for e in blocks.block(b).experiments)
-        outside = blocks.without(b)
-        assert inside + outside.n_samples <= data.n_samples
+        inside, outside = joined(data, blocks.parts[b]), blocks.without(b)
+        assert inside.n_samples + outside.n_samples <= data.n_samples
         left = np.concatenate([e.y.ravel() for e in outside.experiments])
-        assert not np.isin(left, np.concatenate([e.y.ravel() for e in blocks.block(b).experiments])).any()
+        assert not np.isin(left, np.concatenate([e.y.ravel() for e in inside.experiments])).any()
     assert all(np.max(counts) == 1 for counts in seen)
     assert sum(counts.sum() for counts in seen) >= 0.9 * data.n_samples
 
@@ -81,18 +79,34 @@ def test_a_record_too_short_for_the_blocks_is_refused():
         Blocks.of(plant(30), 4)
 
 
-def test_the_errors_of_a_block_are_those_of_a_validation_on_it():
+@pytest.mark.parametrize("block, first", [(0, 0), (1, 50), (3, 200)])
+def test_the_errors_of_a_block_are_those_of_a_free_run_through_it(block, first):
     data = plant(400, start=5.0)
     blocks = Blocks.of(data, 4)
     model = optid.fit(data, "oe.exact", na=1, nb=1, nk=1).model
-    energy, measure = blocks.errors(model, 1)
-    part = data.window(100, 200)
-    expected = np.sum((np.ravel(model.simulate(part, x0="fit")) - part.y.ravel()) ** 2)
-    assert energy[0] == pytest.approx(expected, rel=1e-9)
-    fitted = 100 * (1 - np.sqrt(energy[0] / np.sum((part.y - part.y.mean()) ** 2)))
-    assert fitted == pytest.approx(prediction_fit(model, part, "simulation")[0])
+    energy, measure = blocks.errors(model, block)
+    around, inside = data.window(first, first + 200), slice(100 * block - first, 100 * block - first + 100)
+    error = (np.ravel(model.simulate(around, x0="fit")) - around.y.ravel())[inside]
+    assert energy[0] == pytest.approx(np.sum(error**2), rel=1e-9)
     assert measure[0] == pytest.approx(100 * np.var(data.y))
-    assert pooled_fit(energy[None], measure[None]) == pytest.approx(100 * (1 - np.sqrt(expected / measure[0])))
+    assert pooled_fit(energy[None], measure[None]) == pytest.approx(100 * (1 - np.sqrt(np.sum(error**2) / measure[0])))
+
+
+def test_errors_leave_out_what_is_missing():
+    data = plant(400)
+    u, y = np.array(data.u), np.array(data.y)
+    u[140:145], y[170:180] = np.nan, np.nan
+    model = optid.fit(data, "oe.exact", na=1, nb=1, nk=1).model
+    energy, measure = Blocks.of(optid.Data(u, y), 4).errors(model, 1)
+    runs = [(data.window(50, 140), slice(50, 90)), (data.window(145, 250), slice(0, 55))]
+    expected = 0.0
+    for around, inside in runs:
+        gone = np.array(around.y)
+        gone[25:35] = np.nan if len(around) == 105 else gone[25:35]
+        x0 = model.initial_state(optid.Data(around.u, gone))
+        expected += np.nansum((model.simulate(around, x0=x0) - gone)[inside] ** 2)
+    assert energy[0] == pytest.approx(expected, rel=1e-8)
+    assert measure[0] == pytest.approx(85 * np.nanvar(y))
 
 
 def test_errors_do_not_depend_on_units():
