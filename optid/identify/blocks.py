@@ -18,6 +18,7 @@ from optid.errors import DataError, OptidError, RankError
 
 SHORTEST = 10  # samples of a part of an experiment: shorter ones say more of their initial state than of the plant
 NEAR = 0.15  # a border of experiments this near to that of two blocks, as a share of their length, takes its place
+LEAD, LEAST = 0.33, 30  # share of a block that unstable models have to go on from; samples of that part at least
 RUNAWAY = 10.0  # a run diverges where it leaves so many times the range of the outputs
 WIDER = 2
 """Times its own length that the free run of a block covers, if its experiment is so long, as records to validate on do.
@@ -25,7 +26,6 @@ WIDER = 2
 A state fitted to the block alone follows slow disturbances as it cannot in a longer record, one fitted to its beginning
 has to foretell plants that integrate from less than any validation gives.
 """
-LEAD, LEAST = 0.33, 30  # share of a run that unstable models have to go on from; samples of that part at least
 
 
 class Part(NamedTuple):
@@ -86,7 +86,7 @@ class Blocks:
         """Return the energy of the errors of a model on a block, and what it is measured by, by output: (l,), (l,).
 
         The measure is the variance of the output in the whole record times the samples that were compared; the energy
-        is infinite where the model runs away, an unstable one also from a state fitted to the beginning alone.
+        is infinite where the model runs away, an unstable one also from a state fitted to a third of the block.
 
         Args:
             model: the model.
@@ -100,9 +100,11 @@ class Blocks:
             around = self._around(part)
             try:  # what runs away is told by its energy
                 runs = as_list(model.simulate(around, x0="fit") if horizon is None else model.predict(around, horizon))
-                if horizon is None and not model.is_stable and self._diverges(model, around):
-                    return np.full(self.data.l, np.inf), np.zeros(self.data.l)
+                # a state fitted to all of a run hides an unstable mode
+                wild = horizon is None and not model.is_stable and self._diverges(model, block)
             except OptidError:
+                wild, runs = True, []
+            if wild:
                 return np.full(self.data.l, np.inf), np.zeros(self.data.l)
             for e, run in zip(around.experiments, runs):
                 begin = round((e.start - self.data.experiments[part.experiment].start) / self.data.dt)
@@ -125,12 +127,13 @@ class Blocks:
         first = min(max((part.first + part.last - length) // 2, 0), samples - length)
         return between_gaps(joined(self.data, [Part(part.experiment, first, first + length)]), 2).raw()
 
-    def _diverges(self, model: Any, around: Data) -> bool:
-        """Whether a model that follows the first third of every experiment leaves the range of the record after it."""
-        states = [model.initial_state(around.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
-                  for i, n in enumerate(e.n_samples for e in around.experiments)]
-        runs = as_list(model.simulate(around, x0=states if len(states) > 1 else states[0]))
-        return any(np.any(np.abs(run - e.y) > RUNAWAY * self.outputs[1]) for run, e in zip(runs, around.experiments))
+    def _diverges(self, model: Any, block: int) -> bool:
+        """Whether a model that follows the first third of a block leaves the range of the record in the rest of it."""
+        part = between_gaps(joined(self.data, self.parts[block]), 2).raw()
+        states = [model.initial_state(part.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
+                  for i, n in enumerate(e.n_samples for e in part.experiments)]
+        runs = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
+        return any(np.any(np.abs(run - e.y) > RUNAWAY * self.outputs[1]) for run, e in zip(runs, part.experiments))
 
     def fit(self, model: Any, horizon: int | None = None) -> float:
         """Return the fit in % of one model over all blocks; minus infinity where it runs away in one."""
