@@ -69,11 +69,11 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
              progress: Callable[[str], None] | None = None) -> Identification:
     """Find a structure for a record by blocked cross-validation, and fit it to the whole record.
 
-    Every structure is fitted to the record without one block after another, and simulates the block that was left out
-    from an initial state fitted to it. Classes of models follow each other from the simple to the rich; a richer one is
-    chosen only where the pooled fit improves and the median over the blocks of the log ratio of error energies exceeds
-    0.2. A model whose run leaves the range of the record in a block is never chosen. An interrupt (Ctrl-C) ends the
-    search with the best so far.
+    Every structure is fitted to the record without one block after another, and runs freely through the block that was
+    left out; its initial state is fitted to the block and as much again around it. Classes of models follow each other
+    from the simple to the rich; a richer one is chosen only where the pooled fit improves and the median over the
+    blocks of the log ratio of error energies exceeds 0.2. A model whose run leaves the range of the record in a block
+    is never chosen. An interrupt (Ctrl-C) ends the search with the best so far.
 
     Args:
         data: the record.
