@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import pytest
 import optid
 from optid.bases import Linear
 from optid.errors import DataError, DataWarning, OptidError, RankError, SolverFailed, StructureError
-from optid.identify.blocks import Blocks, pooled_fit
+from optid.identify.blocks import Blocks, joined, pooled_fit
 from optid.identify.delays import LagSums, linear, scan, sharp_delays
 from optid.identify.search import identify
 from optid.identify.search import search as searching
@@ -59,11 +60,10 @@ def test_every_sample_is_left_out_once(lengths):
     for b in range(4):
         for part in blocks.parts[b]:
             seen[part.experiment][part.first : part.last] += 1
-        inside = sum(e.n_samples for e in blocks.block(b).experiments)
-        outside = blocks.without(b)
-        assert inside + outside.n_samples <= data.n_samples
+        inside, outside = joined(data, blocks.parts[b]), blocks.without(b)
+        assert inside.n_samples + outside.n_samples <= data.n_samples
         left = np.concatenate([e.y.ravel() for e in outside.experiments])
-        assert not np.isin(left, np.concatenate([e.y.ravel() for e in blocks.block(b).experiments])).any()
+        assert not np.isin(left, np.concatenate([e.y.ravel() for e in inside.experiments])).any()
     assert all(np.max(counts) == 1 for counts in seen)
     assert sum(counts.sum() for counts in seen) >= 0.9 * data.n_samples
 
@@ -79,17 +79,34 @@ def test_a_record_too_short_for_the_blocks_is_refused():
         Blocks.of(plant(30), 4)
 
 
-def test_the_errors_of_a_block_are_those_of_the_free_run_from_a_state_fitted_to_its_beginning():
+@pytest.mark.parametrize("block, first", [(0, 0), (1, 50), (3, 200)])
+def test_the_errors_of_a_block_are_those_of_a_free_run_through_it(block, first):
     data = plant(400, start=5.0)
     blocks = Blocks.of(data, 4)
     model = optid.fit(data, "oe.exact", na=1, nb=1, nk=1).model
-    energy, measure = blocks.errors(model, 1)
-    part = data.window(100, 200)
-    x0 = model.initial_state(part.window(0, 33))
-    expected = np.sum((np.ravel(model.simulate(part, x0=x0)) - part.y.ravel()) ** 2)
-    assert energy[0] == pytest.approx(expected, rel=1e-9)
+    energy, measure = blocks.errors(model, block)
+    around, inside = data.window(first, first + 200), slice(100 * block - first, 100 * block - first + 100)
+    error = (np.ravel(model.simulate(around, x0="fit")) - around.y.ravel())[inside]
+    assert energy[0] == pytest.approx(np.sum(error**2), rel=1e-9)
     assert measure[0] == pytest.approx(100 * np.var(data.y))
-    assert pooled_fit(energy[None], measure[None]) == pytest.approx(100 * (1 - np.sqrt(expected / measure[0])))
+    assert pooled_fit(energy[None], measure[None]) == pytest.approx(100 * (1 - np.sqrt(np.sum(error**2) / measure[0])))
+
+
+def test_errors_leave_out_what_is_missing():
+    data = plant(400)
+    u, y = np.array(data.u), np.array(data.y)
+    u[140:145], y[170:180] = np.nan, np.nan
+    model = optid.fit(data, "oe.exact", na=1, nb=1, nk=1).model
+    energy, measure = Blocks.of(optid.Data(u, y), 4).errors(model, 1)
+    runs = [(data.window(50, 140), slice(50, 90)), (data.window(145, 250), slice(0, 55))]
+    expected = 0.0
+    for around, inside in runs:
+        gone = np.array(around.y)
+        gone[25:35] = np.nan if len(around) == 105 else gone[25:35]
+        x0 = model.initial_state(optid.Data(around.u, gone))
+        expected += np.nansum((model.simulate(around, x0=x0) - gone)[inside] ** 2)
+    assert energy[0] == pytest.approx(expected, rel=1e-8)
+    assert measure[0] == pytest.approx(85 * np.nanvar(y))
 
 
 def test_errors_do_not_depend_on_units():
@@ -208,6 +225,26 @@ def test_of_structures_that_are_as_good_the_smaller_is_best():
 def test_a_model_whose_run_diverges_in_a_block_is_never_chosen():
     simple, wild = trial(LINEAR, [0.5] * 4), trial(INPUTS, [0.001, 0.001, 0.001, np.inf])
     assert ladder_of(simple, wild).choice() is simple and ladder_of(wild).choice() is None
+
+
+def test_a_model_that_got_stuck_on_the_whole_record_is_worth_what_it_fits_there():
+    sound = trial(LINEAR, [0.1] * 4)
+    stuck = replace(trial(INPUTS, [0.01] * 4), estimation=30.0)
+    assert stuck.score == 30.0 and sound.score == pytest.approx(100 * (1 - np.sqrt(0.1)))
+    assert ladder_of(sound, stuck).choice() is sound
+
+
+def test_a_refit_that_got_worse_is_made_again_as_on_trial(monkeypatch, short):
+    """More starts may end elsewhere: the model that is handed over is never worse than what was chosen."""
+    asked = []
+
+    def worse(data, formulation, **arguments):
+        asked.append(arguments)
+        return optid.fit(data, formulation, **{**arguments, **({} if "starts" in arguments else {"nk": [9]})})
+
+    monkeypatch.setattr(searching, "fit", worse)
+    found = identify(plant(300), classes=[LINEAR], workers=1)
+    assert len(asked) == 2 and "starts" in asked[1] and found.fit.simulation_fit[0] > 90
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from formulations.constraints import shape
 from optid.bases import Linear, Polynomial, Triangular
 from optid.data.channels import Transform
 from optid.errors import DataError, DataWarning, InfeasibleError, RankError, StructureError
-from optid.identify.prediction_error import search
+from optid.identify.prediction_error import descent, search
 from optid.identify.prediction_error.descent import descend
 from optid.identify.prediction_error.search import plant_starts
 from optid.identify.prediction_error.transfer_errors import TransferErrors
@@ -276,6 +276,25 @@ def test_every_point_of_a_descent_is_stable():
 
     watched = Watched(data, unknowns, "norm", Transform.identity(1, 1))
     search.search(watched, lambda part: islice(plant_starts(part, 0), 8))
+
+
+@pytest.mark.parametrize("seed", [0, 6, 7])
+def test_a_plant_that_integrates_is_fitted_at_the_border_of_stability(monkeypatch, seed):
+    """Twice integrated, held by a controller: the local optima inside the unit circle explain next to nothing."""
+    rng, place, speed, samples = np.random.default_rng(seed), 0.0, 0.0, 400
+    y, u, target = np.zeros(samples), np.zeros(samples), np.repeat(rng.uniform(-1, 1, samples // 50), 50)
+    for k in range(samples):
+        y[k] = place + 0.005 * rng.standard_normal()
+        u[k] = 0.02 * (target[k] - place) - 0.25 * speed + 0.02 * rng.standard_normal()
+        place, speed = place + speed + 0.5 * u[k], speed + u[k] + 0.001 * rng.standard_normal()
+    reached = []
+    for better in (np.inf, descent.BETTER):
+        monkeypatch.setattr(descent, "BETTER", better)
+        with pytest.warns(DataWarning, match="unit circle|did not suffice"):
+            fit = optid.fit(optid.Data(u, y), "oe.exact", na=2, nb=2, nk=1, starts=3)
+        reached.append(fit.simulation_fit[0])
+    assert fit.model.is_stable and fit.solution.status is Status.LIMIT
+    assert reached[0] < 30 and reached[1] > 80
 
 
 @pytest.mark.slow

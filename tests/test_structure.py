@@ -16,7 +16,8 @@ from optid.bases import Polynomial
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.validation import validate
-from optid.identify.validation.structure import PRODUCTS, RANK, FTest, structure_test
+from optid.identify.validation.gram_tests import FTest
+from optid.identify.validation.structure import PRODUCTS, RANK, structure_test
 from optid.identify.validation.structure_alternatives import alternatives, wider
 from optid.identify.validation.structure_design import (
     Design,

@@ -1,7 +1,7 @@
 """Blocked cross-validation: contiguous blocks of a record, each left out of the fit once and simulated by it.
 
 Neighbouring samples are not independent, so that single samples left out would test nothing. What is left on both
-sides of a block are experiments of their own, and so is the block: its initial state is fitted to it.
+sides of a block are experiments of their own. What has been fitted to them runs freely through the block.
 """
 
 from collections.abc import Iterable
@@ -17,9 +17,15 @@ from optid.data.stretches import between_gaps
 from optid.errors import DataError, OptidError, RankError
 
 SHORTEST = 10  # samples of a part of an experiment: shorter ones say more of their initial state than of the plant
-LEAD, LEAST = 0.33, 30  # share of a block to which its initial state is fitted; samples of that part at least
 NEAR = 0.15  # a border of experiments this near to that of two blocks, as a share of their length, takes its place
+LEAD, LEAST = 0.33, 30  # share of a block that unstable models have to go on from; samples of that part at least
 RUNAWAY = 10.0  # a run diverges where it leaves so many times the range of the outputs
+WIDER = 2
+"""Times its own length that the free run of a block covers, if its experiment is so long, as records to validate on do.
+
+A state fitted to the block alone follows slow disturbances as it cannot in a longer record, one fitted to its beginning
+has to foretell plants that integrate from less than any validation gives.
+"""
 
 
 class Part(NamedTuple):
@@ -70,10 +76,6 @@ class Blocks:
             kept += [Part(i, int(a), int(b)) for a, b in zip(borders[::2], borders[1::2]) if b - a >= SHORTEST]
         return joined(self.data, kept)
 
-    def block(self, block: int) -> Data:
-        """Return a block, cut where an input is missing: a simulation needs every one of them."""
-        return between_gaps(joined(self.data, self.parts[block]), 2)
-
     @cached_property
     def outputs(self) -> tuple[Array, Array]:
         """Mean squared deviation of the outputs from their means (l,), and their range (l,)."""
@@ -84,33 +86,58 @@ class Blocks:
         """Return the energy of the errors of a model on a block, and what it is measured by, by output: (l,), (l,).
 
         The measure is the variance of the output in the whole record times the samples that were compared; the energy
-        is infinite where the model runs away.
+        is infinite where the model runs away, an unstable one also from a state fitted to a third of the block.
 
         Args:
             model: the model.
             block: number of the block.
-            horizon: samples ahead of the prediction; None for the free run, from states fitted to the beginning of the
-                block: more would let slow modes follow what they cannot.
+            horizon: samples ahead of the prediction; None for the free run. Its initial state is fitted to the block
+                and what surrounds it, `WIDER` in all.
         """
-        part, (variance, span) = self.block(block).raw(), self.outputs
-        try:  # what runs away is told by its energy
-            if horizon is None:
-                states = [model.initial_state(part.select(experiments=i).window(0, _lead(e.n_samples)))
-                          for i, e in enumerate(part.experiments)]
-                found = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
-            else:
-                found = as_list(model.predict(part, horizon))
-        except OptidError:
-            return np.full(self.data.l, np.inf), np.zeros(self.data.l)
-        y, run = np.vstack([e.y for e in part.experiments]), np.vstack(found)
-        here = np.isfinite(y) & (np.isfinite(run) if horizon is not None else True)
-        error = np.where(here, run - y, 0.0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            energy = np.sum(error**2, axis=0)
-        wild = ~np.isfinite(energy) | (np.max(np.abs(error), axis=0) > RUNAWAY * span)
-        if not here.any(axis=0).all():
+        variance, span = self.outputs
+        energy, count = np.zeros(self.data.l), np.zeros(self.data.l)
+        for part in self.parts[block]:
+            around = self._around(part)
+            try:  # what runs away is told by its energy
+                runs = as_list(model.simulate(around, x0="fit") if horizon is None else model.predict(around, horizon))
+                # a state fitted to all of a run hides an unstable mode
+                wild = horizon is None and not model.is_stable and self._diverges(model, block)
+            except OptidError:
+                wild, runs = True, []
+            if wild:
+                return np.full(self.data.l, np.inf), np.zeros(self.data.l)
+            for e, run in zip(around.experiments, runs):
+                begin = round((e.start - self.data.experiments[part.experiment].start) / self.data.dt)
+                rows = slice(max(part.first - begin, 0), max(part.last - begin, 0))
+                y, run = e.y[rows], run[rows]
+                here = np.isfinite(y) & (np.isfinite(run) if horizon is not None else True)
+                error = np.where(here, run - y, 0.0)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    wild = ~np.all(np.abs(error) <= RUNAWAY * span, axis=0)
+                    energy += np.where(wild, np.inf, np.sum(error**2, axis=0))
+                count += here.sum(axis=0)
+        if not count.all():
             raise DataError(f"block {block + 1} has no sample of an output that can be compared: use fewer blocks")
-        return np.where(wild, np.inf, energy), variance * here.sum(axis=0)
+        return energy, variance * count
+
+    def _around(self, part: Part) -> Data:
+        """Return a part and what surrounds it, cut where an input is missing: a simulation needs every one of them."""
+        samples = self.data.experiments[part.experiment].n_samples
+        length = min(WIDER * (part.last - part.first), samples)
+        first = min(max((part.first + part.last - length) // 2, 0), samples - length)
+        return between_gaps(joined(self.data, [Part(part.experiment, first, first + length)]), 2).raw()
+
+    def _diverges(self, model: Any, block: int) -> bool:
+        """Whether a model that follows the first third of a block leaves the range of the record in the rest of it."""
+        part = between_gaps(joined(self.data, self.parts[block]), 2).raw()
+        states = [model.initial_state(part.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
+                  for i, n in enumerate(e.n_samples for e in part.experiments)]
+        runs = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
+        return any(np.any(np.abs(run - e.y) > RUNAWAY * self.outputs[1]) for run, e in zip(runs, part.experiments))
+
+    def fit(self, model: Any, horizon: int | None = None) -> float:
+        """Return the fit in % of one model over all blocks; minus infinity where it runs away in one."""
+        return pooled_fit(*map(np.array, zip(*(self.errors(model, b, horizon) for b in range(len(self))))))
 
 
 def joined(data: Data, parts: Iterable[Part]) -> Data:
@@ -124,6 +151,3 @@ def pooled_fit(energy: Array, measure: Array) -> float:
         return -np.inf
     return float(100 * np.mean(1 - np.sqrt(energy.sum(axis=0) / np.maximum(measure.sum(axis=0), 1e-300))))
 
-
-def _lead(samples: int) -> int:
-    return min(max(round(LEAD * samples), LEAST), samples)

@@ -32,6 +32,7 @@ AGREE = 1e-4  # relative difference of the sums of squares within which two star
 # share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
 # where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best
 EXPLAINED = 0.1
+BETTER = 2.0  # times the errors' energy that a local optimum may have of that at the border of stability, and win
 ROUNDING = 1e-9  # relative difference of two sums of squares that were added up in different ways
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as stable:0.999")
@@ -113,6 +114,15 @@ class Descent:
     def value(self) -> float:
         """Sum of squared errors."""
         return self.at.value
+
+    @property
+    def rank(self) -> float:
+        """By what ends are compared, the smallest first.
+
+        At the border of stability there is no local optimum: an unstable model would be better still. A plant that
+        integrates has its best model there, though, and what is left as local optima may be useless.
+        """
+        return BETTER * self.value if self.border else self.value
 
 
 def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterations: int = STEPS,
@@ -207,17 +217,16 @@ def with_poles(criterion: Criterion, x: Array, a: Array) -> Descent:
 
 def best_of(criterion: Criterion, starts: Iterable[tuple[str, Array]], iterations: int = STEPS, *,
             enough: int | None = None) -> list[Descent]:
-    """Descend from every start; the best comes first, those that end at the border of stability last.
+    """Descend from every start; the best comes first, see `Descent.rank`.
 
-    There they are no local optima: an unstable model would be better still. Starts are (name, point) pairs, which may
-    be estimated as they are asked for: no more than ``enough`` of them where all of these ended at the same optimum and
-    it leaves little of the record unexplained.
+    Starts are (name, point) pairs, which may be estimated as they are asked for: no more than ``enough`` of them where
+    all of these ended at the same optimum and it leaves little of the record unexplained.
     """
     found: list[Descent] = []
     for name, x in starts:
         if criterion.admissible(x):
             found.append(descend(criterion, x, iterations=iterations, tolerance=COMPARED, start=name))
-            found.sort(key=lambda one: (one.border, one.value))
+            found.sort(key=lambda one: one.rank)
         if len(found) == enough and not any(one.border for one in found) and (
                 found[0].value <= EXPLAINED * criterion.energy):
             if agreement(found, 1e-12 * criterion.energy)[0] == enough:

@@ -60,9 +60,10 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
         best, x = found[0], np.zeros(criterion.unknowns.size)
         x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
         final = descend(criterion, best.x if part is criterion else x, start=best.start)
-        if best.border or not final.border or len(found) == 1 or found[1].border:
+        found[0] = replace(best, border=best.border or final.border)
+        if found[0].rank <= min(one.rank for one in found):
             break
-        found = [*found[1:], replace(best, border=True)]
+        found.sort(key=lambda one: one.rank)
     agreed, sentence = agreement(found, 1e-12 * part.energy)
     figures: dict[str, Any] = {"starts": sentence}
     if filtered:

@@ -15,9 +15,9 @@ from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
-from optid.identify.search.ladder import CLEAR, KINDS, LINEAR, RUNGS, Ladder, few_levels, gain
+from optid.identify.search.ladder import CLEAR, EQUAL, KINDS, LINEAR, RUNGS, Ladder, few_levels, gain
 from optid.identify.search.pool import Pool
-from optid.identify.search.trial import Candidate, Trial, tried
+from optid.identify.search.trial import Candidate, Trial, spared, tried
 from optid.identify.verdict import Verdict, verdict
 from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
@@ -69,11 +69,11 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
              progress: Callable[[str], None] | None = None) -> Identification:
     """Find a structure for a record by blocked cross-validation, and fit it to the whole record.
 
-    Every structure is fitted to the record without one block after another, and simulates the block that was left out
-    from an initial state fitted to it. Classes of models follow each other from the simple to the rich; a richer one is
-    chosen only where the pooled fit improves and the median over the blocks of the log ratio of error energies exceeds
-    0.2. A model whose run leaves the range of the record in a block is never chosen. An interrupt (Ctrl-C) ends the
-    search with the best so far.
+    Every structure is fitted to the record without one block after another, and runs freely through the block that was
+    left out; its initial state is fitted to the block and as much again around it. Classes of models follow each other
+    from the simple to the rich; a richer one is chosen only where the pooled fit improves and the median over the
+    blocks of the log ratio of error energies exceeds 0.2. A model whose run leaves the range of the record in a block
+    is never chosen. An interrupt (Ctrl-C) ends the search with the best so far.
 
     Args:
         data: the record.
@@ -128,8 +128,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     chosen = ladder.choice()
     if chosen is None:
         raise _nothing(list(ladder.trials.values()))
-    found = fit(data, chosen.candidate.formulation, solver=solver, accuracy=accuracy, constraints=rules,
-                **chosen.candidate.arguments)
+    found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
     why = reasons(ladder, best)
     if len(possible) < len(classes):
         why.append("no input has more than five levels: functions cannot be told from straight lines between them, and "
@@ -194,6 +193,15 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
             found.append(f"{kind}: none of {len(several)} structures was as good as what is chosen "
                          f"(first: {several[0].reason})")
     return found
+
+
+def _refitted(chosen: Trial, blocks: Blocks, horizon: int | None, settings: Mapping[str, Any]) -> Fit:
+    """Fit a structure to the whole record with all its starts; as on trial where that follows the record better."""
+    candidate = chosen.candidate
+    found = fit(blocks.data, candidate.formulation, **settings, **candidate.arguments)
+    if 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation):
+        return found
+    return fit(blocks.data, candidate.formulation, **settings, **candidate.arguments, **spared(candidate))
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None], clock: float, budget: float, trial: Trial) -> None:

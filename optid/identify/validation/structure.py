@@ -20,22 +20,21 @@ Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.special import fdtrc, ncfdtr
 
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.validation.correlations import lagged_products
+from optid.identify.validation.gram_tests import FTest, rank_one, rank_one_test, regressed, tested
 from optid.identify.validation.structure_alternatives import alternatives, wider
-from optid.identify.validation.structure_design import EXPLAINED, Design, Family, convolved
-from optid.statistics.factors import conditioning, dependent_column, root_of_gram
+from optid.identify.validation.structure_design import Design, Family, convolved
+from optid.statistics.factors import conditioning
 from optid.structures.bilinear import minimise
-from optid.structures.rank_one import RankOne, matrices
+from optid.structures.rank_one import matrices
 
 WHITE = np.ones(1)
 SIGNIFICANT = 5e-3
@@ -47,7 +46,6 @@ RANK = "different lags see different nonlinearities"
 FUNCTIONS = "functions of the inputs explain a part of the residuals"
 NOISE_ORDER, KEPT = 12, 0.4
 """Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
-DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
 TURNS, SHARPER = 3, 0.99
 """Regressions on fine functions, one on the filters between them; share of the variance they must leave to be used."""
 SAMPLES = 30_000
@@ -88,29 +86,6 @@ class Structure:
     def alternatives(self) -> set[str]:
         """What has been tested."""
         return {words for each in self.p_values.values() for words in each}
-
-
-@dataclass(frozen=True)
-class FTest:
-    """One F test: its p value, and the share of the residual variance that an alternative saves."""
-
-    p_value: float = 1.0
-    saving: float = 0.0
-
-    @classmethod
-    def of(cls, more: float, extra: int, rest: float, spare: int, unnoticed: float) -> "FTest":
-        """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom.
-
-        The hypothesis is that they would save no more than a share `unnoticed` of the variance if the record were long
-        enough to know them: the statistic follows a noncentral F distribution at that share. The saving discounts the
-        degrees of freedom.
-        """
-        if extra <= 0 or rest <= 0:
-            return cls()
-        free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
-        ratio = max(more, 0.0) / extra / free
-        p = 1 - ncfdtr(extra, spare, unnoticed * (spare + extra), ratio) if unnoticed else fdtrc(extra, spare, ratio)
-        return cls(float(max(p, 0.0)), float(1 - free / restricted))
 
 
 def structure_test(data: Data, simulated: Sequence[Array] | None = None) -> Structure:
@@ -168,7 +143,7 @@ def _test_output(design: Design, o: int) -> tuple[dict[str, FTest], list[float]]
     """Return the tests on one output by words, and the second over first singular value by input."""
     additive, _, rows = _gram(design, o, lambda i, part, u, y: [design.additive(u), y[:, None]])
     _refuse_few(rows, len(additive))
-    problem = _rank_one(additive, design.blocks, 1)
+    problem = rank_one(additive, design.blocks, 1)
     free = matrices(np.linalg.solve(problem.root, problem.target)[1:], design.blocks)
     # the residuals of the hypothesis: the free model would explain part of a slow noise and hide its colour
     found = minimise(problem, count=3).point
@@ -198,11 +173,12 @@ def _test_output(design: Design, o: int) -> tuple[dict[str, FTest], list[float]]
     gram, edges, rows = _gram(design, o, columns, _autoregression(residuals))
     # what was cut off the responses acts on all of the output, however small the residuals are
     cut = design.cut * float(np.var(np.concatenate(predicted))) / float(np.nanvar(np.concatenate(residuals)))
-    tests = _tested(gram, edges, rows, (PRODUCTS, *groups), UNNOTICED + cut)
+    tests = tested(gram, edges, rows, (PRODUCTS, *groups), UNNOTICED + cut)
     if PRODUCTS not in tests:
         _refuse_few(rows, edges[2])
     keep = np.r_[: edges[1], edges[-1] - 1]
-    tests[RANK], ratios = _rank_test(gram[np.ix_(keep, keep)], hypothesis, design.blocks, rows, UNNOTICED + cut)
+    tests[RANK], ratios = rank_one_test(gram[np.ix_(keep, keep)], hypothesis.theta, hypothesis.bs, design.blocks, rows,
+                                        UNNOTICED + cut)
     return tests, ratios
 
 
@@ -223,7 +199,7 @@ def _test_residuals(design: Design, o: int, simulated: Sequence[Array]) -> tuple
         return [one, rest, *(group[i][part] for group in groups.values()), (output - predicted[i][part])[:, None]]
 
     gram, edges, rows = _gram(design, o, columns, _autoregression(residuals))
-    return _tested(gram, edges, rows, (FUNCTIONS, *groups), UNNOTICED), [0.0] * design.data.m
+    return tested(gram, edges, rows, (FUNCTIONS, *groups), UNNOTICED), [0.0] * design.data.m
 
 
 def _gram(design: Design, o: int, columns: Callable[[int, slice, Array, Array], list[Array]], noise: Array = WHITE
@@ -242,27 +218,10 @@ def _gram(design: Design, o: int, columns: Callable[[int, slice, Array, Array], 
     return gram, np.cumsum([0, *sizes]).tolist(), rows
 
 
-def _tested(gram: Array, edges: list[int], rows: int, words: Sequence[str], unnoticed: float) -> dict[str, FTest]:
-    """Test every block but the first and the last, the residual, beside the first; those that the rows allow."""
-    tests = {}
-    for name, first, last in zip(words, edges[1:], edges[2:-1]):
-        keep = np.r_[: edges[1], first:last, edges[-1] - 1]
-        if rows >= 1.5 * keep.size:
-            tests[name] = _added(gram[np.ix_(keep, keep)], edges[1], rows, unnoticed)
-    return tests
-
-
-def _regressed(gram: Array) -> Array:
-    """Return the coefficients of the last column on the others, without directions that hardly differ."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    scaled = gram / np.outer(scale, scale)
-    return np.linalg.pinv(scaled[:-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:-1, -1] * scale[-1] / scale[:-1]
-
-
 def _sharpened(design: Design, o: int, hypothesis: _Hypothesis) -> _Hypothesis:
     """Fit the fine functions and the filters in turn, beginning with the filters of a hypothesis."""
-    def regressed(columns: Callable[[Array], Array]) -> Array:
-        return _regressed(_gram(design, o, lambda i, part, u, y: [np.ones((len(y), 1)), columns(u), y[:, None]])[0])
+    def fitted(columns: Callable[[Array], Array]) -> Array:
+        return regressed(_gram(design, o, lambda i, part, u, y: [np.ones((len(y), 1)), columns(u), y[:, None]])[0])
 
     def filtered(u: Array) -> Array:
         return np.hstack([convolved(f.values(u[:, c]) @ part[:, None], design.filters)[:, :, 0]
@@ -271,10 +230,10 @@ def _sharpened(design: Design, o: int, hypothesis: _Hypothesis) -> _Hypothesis:
     bs, theta, parts = hypothesis.bs, np.zeros(1), []
     for turn in range(TURNS):
         if turn:
-            found = regressed(filtered)[1:].reshape(design.data.m, -1)
+            found = fitted(filtered)[1:].reshape(design.data.m, -1)
             bs = [b / max(float(np.linalg.norm(b)), 1e-300) for b in found]
         lines: list[Array] = [design.filters @ b for b in bs]
-        theta = regressed(lambda u, lines=lines: design.finer(u, lines))
+        theta = fitted(lambda u, lines=lines: design.finer(u, lines))
         parts = np.split(theta[1:], np.cumsum([f.size for f in design.fine])[:-1])
     coarse = np.zeros(sum(p * j for p, j in design.blocks))
     return _Hypothesis(bs, list(zip(design.fine, parts)), np.concatenate([theta[:1], coarse, theta[1:]]))
@@ -289,7 +248,7 @@ def _responses(design: Design, leading: list[Array], additive: Array) -> Array:
     """
     m, size, starts = design.data.m, len(design.filters), 1 + np.cumsum([0, *(p * j for p, j in design.blocks)])
     chosen = [0, *(start + p * k for start, (p, j) in zip(starts, design.blocks) for k in range(j)), -1]
-    responses = [design.filters @ _regressed(additive[np.ix_(chosen, chosen)])[1:].reshape(m, -1).T]
+    responses = [design.filters @ regressed(additive[np.ix_(chosen, chosen)])[1:].reshape(m, -1).T]
     for c, coefficients in enumerate(leading):
         lines = design.filters @ coefficients.T
         strongest = int(np.argmax(np.abs(lines[:, 0])))
@@ -351,73 +310,3 @@ def _autoregression(residuals: list[Array]) -> Array:
         if (criterion := total * np.log(variance) + 2 * order) < least:
             best, least = a, criterion
     return best
-
-
-def _distinct(gram: Array, least: float) -> Array:
-    """Combinations (n, k) of columns in which their Gram matrix is the identity; small eigenvalues are left out."""
-    values, vectors = np.linalg.eigh((gram + gram.T) / 2)
-    return vectors[:, values > least] / np.sqrt(values[values > least])
-
-
-def _added(gram: Array, n: int, rows: int, unnoticed: float) -> FTest:
-    """Test whether columns n ... of the Gram matrix [additive | alternatives | residual] save anything."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    scaled = gram / np.outer(scale, scale)
-    sound = _distinct(scaled[:n, :n], 1e-10)
-    half = sound.T @ scaled[:n, n:]
-    left = scaled[n:, n:] - half.T @ half
-    size = np.sqrt(np.maximum(np.diag(left)[:-1], 1e-300))
-    new = np.flatnonzero(size > 1e-3)  # what is left of an alternative of norm one
-    distinct = _distinct((left[:-1, :-1] / np.outer(size, size))[np.ix_(new, new)], DISTINCT)
-    more = float(np.sum((distinct.T @ (left[:-1, -1] / size)[new]) ** 2))
-    extra = distinct.shape[1]
-    rest = max(float(left[-1, -1]) - more, EXPLAINED)
-    return FTest.of(more, extra, rest, rows - sound.shape[1] - extra, unnoticed)
-
-
-def _rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> RankOne:
-    """Write least squares with the Gram matrix [linear | blocks | y] as a rank-one problem."""
-    n = len(gram) - 1
-    root = root_of_gram(gram, n)
-    if dependent_column(root, n, "gram") is not None:
-        raise RankError(
-            "Filters of functions of the inputs depend on each other: the inputs have too few levels or frequencies.")
-    return RankOne(root[:n, :n], root[:n, n], float(root[n, n] ** 2), blocks, linear)
-
-
-def _rank_test(gram: Array, hypothesis: _Hypothesis, blocks: tuple[tuple[int, int], ...], rows: int,
-               unnoticed: float) -> tuple[FTest, list[float]]:
-    """Test rank one of every block of [1 | blocks | fine | missed | residual]; also second over first singular values.
-
-    The fine functions through the leading filter stay free, and so does what the filters miss: what the blocks miss of
-    f must not pass for a second nonlinearity.
-    """
-    size, n = 1 + sum(p * j for p, j in blocks), hypothesis.theta.size
-    leading = [np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, hypothesis.bs)]
-    filtered = np.asarray(block_diag(1.0, *leading))
-    unit = np.eye(len(gram))
-    finer = _beside(gram, np.pad(filtered, ((0, len(gram) - size), (0, 0))), unit[:, size:n])
-    finer = np.hstack([finer, _beside(gram, unit[:, :n], unit[:, n:-1], whole=True)])
-    linear = 1 + finer.shape[1]
-    change = np.hstack([unit[:, :1], finer, unit[:, 1:size], unit[:, -1:]])
-    problem = _rank_one(change.T @ gram @ change, blocks, linear)
-    coarse = np.concatenate([hypothesis.theta[:1], np.zeros(linear - 1), hypothesis.theta[1:size]])
-    fine = np.concatenate([np.zeros(size), hypothesis.theta[size:], np.zeros(len(gram) - n)])
-    output = problem.target + problem.root @ coarse
-    if fine.any():
-        output = output + np.linalg.solve(problem.root.T, change[:, :-1].T @ (gram @ fine))
-    problem = replace(problem, target=output, scale=float("nan"))
-    free = matrices(np.linalg.solve(problem.root, problem.target)[linear:], blocks)
-    singular = [np.linalg.svd(theta, compute_uv=False) for theta in free]
-    ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
-    extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), max(problem.remainder, EXPLAINED * gram[-1, -1])
-    more = minimise(problem, count=3).value - rest if extra else 0.0
-    return FTest.of(more, extra, rest, rows - len(problem.target), unnoticed), ratios
-
-
-def _beside(gram: Array, coarse: Array, fine: Array, whole: bool = False) -> Array:
-    """Combinations (columns of `gram`) of fine columns that coarse ones do not give: what they add, or as a whole."""
-    fine = fine / np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
-    inner = np.linalg.pinv(coarse.T @ gram @ coarse, rcond=1e-12, hermitian=True)
-    added = fine - coarse @ (inner @ (coarse.T @ gram @ fine))
-    return (fine if whole else added) @ _distinct(added.T @ gram @ added, DISTINCT)
