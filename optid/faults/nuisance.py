@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.data.record import Data, Experiment, as_list
+from optid.arrays import Array, as_list
+from optid.data.record import Data, Experiment
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
 from optid.faults.whitening import Predictor, predictor

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.data.record import Data, as_list
+from optid.arrays import Array, as_list
+from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.monitor.arl import COMMON, Calibration
 from optid.faults.nuisance import ModelUncertainty, sensitivities
