@@ -240,7 +240,7 @@ def _amplitudes(spectrum: Spectrum, frequencies: np.ndarray) -> np.ndarray:
         return np.ones(frequencies.size)
     a = np.asarray(spectrum(frequencies) if callable(spectrum) else spectrum, dtype=float)
     if a.shape != frequencies.shape or not (np.isfinite(a) & (a >= 0)).all() or not a.any():
-        raise StructureError(f"spectrum: give {frequencies.size} nonnegative amplitudes, not all zero.")
+        raise StructureError(f"spectrum: it must be {frequencies.size} amplitudes, not negative and not all zero.")
     return a
 
 

@@ -153,7 +153,7 @@ def positive_real(margin: float = 0.0) -> Rule:
         StructureError: a negative margin.
     """
     if margin < 0:
-        raise StructureError(f"the margin of positive realness must not be negative; got {margin!r}")
+        raise StructureError(f"the margin of positive realness must be nonnegative; got {margin!r}")
 
     def build(view: View) -> Any:
         _needs_realisation(view, "positive_real")
