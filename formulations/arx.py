@@ -31,7 +31,7 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         constraints: builders of CVXPY constraints in the named variables.
         loss: "squares", "huber[:threshold]" or "l1".
         ridge: weight of ``‖b‖²``.
-        prior: of the impulse responses: "none", "tc" (decaying, rough), "dc" (with a correlation of neighbours) or "ss"
+        prior: on the impulse responses: "none", "tc" (decaying, rough), "dc" (with a correlation of neighbours) or "ss"
             (smooth); its hyperparameters maximise the marginal likelihood of the record.
 
     Raises:

@@ -50,7 +50,7 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         loss: "squares", "huber[:threshold in robust standard deviations]" or "l1" (no proof: reweighted passes).
         ridge: weight of ``‖mu‖² ‖b‖²``.
         curvature: weight of ``‖b‖²`` times the integral of ``f''²``.
-        prior: of A and of every row of Theta along the lags: "none", "tc" (decaying, rough), "dc" (with a correlation
+        prior: on A and on every row of Theta along the lags: "none", "tc" (decaying, rough), "dc" (with a correlation
             of neighbours) or "ss" (smooth); its hyperparameters maximise the marginal likelihood of the record.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
 

@@ -45,7 +45,7 @@ def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, ba
         basis: basis of the input nonlinearity, one per input or one for all; linear by default.
         noise: "white" uses past outputs as instruments (less variance; process noise may be present), "coloured" inputs
             alone (consistent under coloured measurement noise).
-        weighting: of the singular values, "moesp", "cva" or "plain" (`optid.identify.subspace.projection`),
+        weighting: weighting of the singular values: "moesp", "cva" or "plain" (`optid.identify.subspace.projection`),
             or "best" for the one whose (A, C) leaves the smallest error on the record.
         offset: estimate a constant; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.

@@ -1,4 +1,4 @@
-"""State-space models with static functions of latent signals, or of what a linear or Hammerstein system gives.
+"""State-space models with static functions of latent signals, or of the outputs of a linear or Hammerstein system.
 
 * `lfr`, linear fractional representation: ``x(k+1) = A x + B f(u) + Ez h(z) + K e``,
   ``y(k) = C x + D f(u) + Fz h(z) + d + e``, ``z = Cz x + Dz u + const`` with z scalar for every h. What is affine in z
@@ -45,11 +45,11 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
 
     Args:
         channels: number of latent signals.
-        latent_basis: basis of every h, on z in [-1, 1]; beyond, polynomials go on as they are, splines straight.
-        latent: what z is made of, "states+inputs" or "states".
-        direct: whether h acts on the outputs, too.
+        latent_basis: basis of every h, on z in [-1, 1]; beyond, polynomials continue, splines go straight on.
+        latent: signals that z combines, "states+inputs" or "states".
+        direct: whether h also acts on the outputs directly.
         criterion: "simulation" (the free run) or "prediction" (K estimated).
-        initial: models to start from besides, without latent signals.
+        initial: models without latent signals as additional starting points.
         seed: of the directions of z that are tried.
         tries: searches for every latent signal, those after the first beside the others; with 1, which is quick,
             a search that seems to have gone astray is not repeated either.
@@ -88,7 +88,7 @@ def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
     Args:
         output_basis: basis of every h, on z in [-1, 1].
         feedthrough: whether the inputs act on z at once.
-        initial: linear models to start from besides.
+        initial: linear models as additional starting points.
     """
     return _fit("wiener_ss.exact", data, nx, output_basis, feedthrough, iterations, block_rows=block_rows,
                 weighting=weighting, stability=stability, initial=initial, constraints=constraints)
@@ -106,7 +106,7 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
 
     Args:
         output_basis: basis of every h, on z in [-1, 1].
-        initial: Hammerstein models to start from besides.
+        initial: Hammerstein models as additional starting points.
     """
     return _fit("hammerstein_wiener_ss.exact", data, nx, output_basis, False, iterations, basis=basis,
                 block_rows=block_rows, weighting=weighting, stability=stability, initial=initial,

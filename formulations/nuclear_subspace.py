@@ -71,7 +71,7 @@ def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None
     """
     one_of("form", form, FORMS)
     if not 0 < hold_out < 1:
-        raise StructureError(f"hold_out={hold_out!r}: a fraction in (0, 1) is needed")
+        raise StructureError(f"hold_out={hold_out!r}: it must be a fraction in (0, 1)")
     plan = planned("subspace.nuclear", data, nx=nx, block_rows=block_rows, basis=basis, feedback_basis=feedback_basis,
                    instruments=form, offset=offset, feedthrough=feedthrough, observer=observer, split=split,
                    stability=stability, constraints=tuple(constraints))
@@ -89,7 +89,7 @@ def _weights(weight: float | str | Sequence[float], noise: float | None) -> tupl
         return WEIGHTS
     found = tuple(float(w) for w in np.atleast_1d(np.asarray(weight, dtype=float)))
     if not found or not all(0 < w < np.inf for w in found):
-        raise StructureError(f"weight={weight!r}: a positive number, several, or 'auto'")
+        raise StructureError(f"weight={weight!r}: give a positive number, several, or 'auto'")
     return found
 
 

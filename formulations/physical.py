@@ -1,4 +1,4 @@
-"""Equations of a plant as its user knows them, with named parameters: one sparse programme for NLP back ends.
+"""State equations given by the user, with named parameters: one sparse programme for NLP back ends.
 
 The states at every sample are variables (direct collocation, Hargraves and Paris 1987), tied by the trapezoidal rule,
 
@@ -47,10 +47,10 @@ def physical(data: Data, *, equations: Equations | str, starts: int = 6, seed: i
 
     Args:
         data: the record. Outputs may be missing; it is cut where inputs are.
-        equations: `optid.Equations`, or where they stand: "plant.py:name".
+        equations: `optid.Equations`, or their place in a file: "plant.py:name".
         starts: how many starts descend, random but for the first; fewer where two agree on a model that explains nine
             tenths of the output.
-        seed: of the random ones.
+        seed: of the random starts.
         constraints: builders such as ``lambda v: v["k1"] <= v["k2"]``.
 
     Raises:

@@ -73,7 +73,7 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
         offset: estimate the constant of the equation; False holds it at zero, for centred data.
         starts: number of starts that are compared. Of output error at most: three suffice where they agree on a model
             that explains nine tenths of the output.
-        seed: of the random ones.
+        seed: of the random starts.
 
     Raises:
         StructureError: impossible orders, unknown gauge, several outputs.

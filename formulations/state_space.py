@@ -88,8 +88,8 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
         stability: "stable" keeps every iterate stable (for prediction, its predictor), with the feedback taken as a
             given signal; "free" lets the poles go where the errors are smallest, for plants that integrate or grow
             over the record.
-        initial: models of the same structure to start from besides.
-        iterations: Gauss-Newton steps per descent at most.
+        initial: models of the same structure as additional starting points.
+        iterations: maximum number of Gauss-Newton steps per descent.
         constraints: rules about poles, builders of CVXPY constraints in the named variables.
 
     Raises:

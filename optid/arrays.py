@@ -121,13 +121,13 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
 def check_probability(value: Any, name: str) -> None:
     """Refuse an argument that is no probability strictly between 0 and 1 (`StructureError`)."""
     if not 0 < value < 1:
-        raise StructureError(f"{name}={value!r}; a probability between 0 and 1 is needed.")
+        raise StructureError(f"{name}={value!r}: it must be a probability between 0 and 1.")
 
 
 def check_weight(value: Any, name: str) -> None:
     """Refuse the weight of a penalty that is not a nonnegative number (`StructureError`)."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 <= value <= LARGEST:
-        raise StructureError(f"{name}={value!r}: a nonnegative number is needed.")
+        raise StructureError(f"{name}={value!r}: it must be a nonnegative number.")
 
 
 def one_of(name: str, value: Any, known: Sequence[str]) -> None:
@@ -206,7 +206,7 @@ def _as_numbers(values: Any, what: str) -> np.ndarray:
         kind = {"b": "truth values", "c": "complex numbers", "O": "objects", "U": "text", "S": "text",
                 "M": "dates", "m": "time differences"}.get(array.dtype.kind, "not numbers")
         raise DataError(
-            f"{what}: the samples are {kind} (dtype {array.dtype}), real numbers are needed. "
+            f"{what}: the samples are {kind} (dtype {array.dtype}); they must be real numbers. "
             "Convert with numpy.asarray(x, dtype=float), with NaN where a sample is missing."
         )
     return array
@@ -215,10 +215,10 @@ def _as_numbers(values: Any, what: str) -> np.ndarray:
 def check_shape(array: np.ndarray, what: str) -> None:
     """Refuse an array that is not (samples, channels), is empty, or has more channels than samples (`DataError`)."""
     if array.ndim != 2:
-        raise DataError(f"{what} has shape {array.shape}; (samples,) or (samples, channels) is needed.")
+        raise DataError(f"{what} has shape {array.shape}; it must be (samples,) or (samples, channels).")
     rows, channels = array.shape
     if array.size == 0:
-        raise DataError(f"{what} is empty (shape {array.shape}); at least one sample of one channel is needed.")
+        raise DataError(f"{what} is empty (shape {array.shape}); it must hold at least one sample of one channel.")
     if channels > rows:
         raise DataError(
             f"{what} has shape {array.shape}: {channels} channels but only {rows} sample(s). "

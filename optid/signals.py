@@ -223,7 +223,7 @@ def _lines(size: int, dt: float, lines: Sequence[int] | np.ndarray | None, band:
     if lines is not None:
         k = np.unique(np.asarray(lines))
         if k.dtype.kind not in "iu" or not k.size or k[0] < 1 or k[-1] > most:
-            raise StructureError(f"lines: integers from 1 to {most} are needed for {size} samples per period.")
+            raise StructureError(f"lines: they must be integers from 1 to {most} for {size} samples per period.")
         return k
     everywhere = np.arange(1, most + 1)
     if band is not None:
@@ -240,7 +240,7 @@ def _amplitudes(spectrum: Spectrum, frequencies: np.ndarray) -> np.ndarray:
         return np.ones(frequencies.size)
     a = np.asarray(spectrum(frequencies) if callable(spectrum) else spectrum, dtype=float)
     if a.shape != frequencies.shape or not (np.isfinite(a) & (a >= 0)).all() or not a.any():
-        raise StructureError(f"spectrum: {frequencies.size} amplitudes are needed, not negative and not all zero.")
+        raise StructureError(f"spectrum: it must be {frequencies.size} amplitudes, not negative and not all zero.")
     return a
 
 

@@ -312,7 +312,7 @@ def test_orders_and_layout():
 
 
 @pytest.mark.parametrize(("changes", "words"),
-                         [({"a": [[1.0]]}, r"\(na,\) is needed"),
+                         [({"a": [[1.0]]}, r"must be \(na,\)"),
                           ({"b": ([[1.0, 2.0]],)}, r"b\[0\]"),
                           ({"b": ([],)}, r"b\[0\]"),
                           ({"b": ()}, "nonlinearities has 1 entries for 0 inputs"),

@@ -110,7 +110,7 @@ def test_a_fit_without_a_point_is_described():
         constraints=[lambda v: {"low": v["a"][0] <= -1}, lambda v: {"high": v["a"][0] >= 1}],
     )
     text = describe(fit)
-    assert fit.model is None and "No model: infeasible" in text and "Is there a point: no" in text
+    assert fit.model is None and "No model: infeasible" in text and "Solution returned: no" in text
     assert max(map(len, text.splitlines())) <= 80
 
 

@@ -133,7 +133,7 @@ def test_a_fit_without_a_model_is_refused():
 
 def test_a_state_space_model_shows_singular_values_noise_and_feedback(pages):
     text = Page(pages["feedback"]).text
-    for words in ("Spectrum of the noise", "measured feedback", "Feedback nonlinearity g", "Measured on the way"):
+    for words in ("Spectrum of the noise", "measured feedback", "Feedback nonlinearity g", "Intermediate results"):
         assert words in text
     assert "Singular values" in text
 

@@ -151,7 +151,7 @@ def test_a_pole_at_one_has_no_static_gain():
     (lambda view: responses.step_response(output="y1")(view), "needs channel="),
     (lambda view: responses.no_effect("u7")(view), "no input 'u7'"),
     (lambda view: responses.positive_real()(view), "one function for each"),
-    (lambda view: responses.positive_real(-1.0), "not negative"),
+    (lambda view: responses.positive_real(-1.0), "must be nonnegative"),
     (lambda view: responses.step_response("up"), "'positive' or 'negative'"),
     (lambda view: responses.impulse_response(horizon=0), "at least one sample"),
     (lambda view: responses.no_effect("u")(View({}, channels=("u",))), "no such step"),

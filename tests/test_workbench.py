@@ -97,7 +97,7 @@ def test_what_cannot_be_read_or_fitted_is_said():
         assert asked(server, body="[]", **head)[0] == 400
         assert asked(server, body="nonsense", **head)[0] == 400
         assert "cannot be read" in asked(server, body=json.dumps({"state": {"inputs": 3}}), **head)[1]
-        assert "which there is not" in asked(server, path="/open", **head)[1]
+        assert "unknown request" in asked(server, path="/open", **head)[1]
         empty = constrained(server.source.start, ("range", {"low": 5.0, "high": 6.0}, "high"),
                             ("range", {"low": -6.0, "high": -5.0}, "low"))
         code, text, _ = asked(server, body=json.dumps({"state": empty}), **head)

@@ -6,7 +6,7 @@ From columns of numbers to a model that you can trust.
 """
 
 # %%
-# A record is inputs, outputs and a sampling time; NaN means missing. Here a tank whose valve saturates.
+# A record consists of inputs, outputs and a sampling time; NaN means missing. Here it is a tank whose valve saturates.
 import numpy as np
 
 import optid
@@ -20,7 +20,7 @@ data = optid.Data(valve, level, 1.0, ["valve"], ["level"], ["-"], ["m"], name="t
 data
 
 # %%
-# Keep the last part for validation, and let optid look for the structure.
+# Keep the last part for validation, and let optid find the structure.
 train, test = data.split(0.7)
 found = optid.identify(train, budget=10, workers=1)
 found

@@ -2,11 +2,11 @@
 Constraints and their price
 ===========================
 
-What is known about a plant makes a model better where data are few; every constraint reports what it costs.
+Prior knowledge of the plant improves the model where data are scarce; every constraint reports what it costs.
 """
 
 # %%
-# The thruster is known to push harder with more current, and not to push without.
+# More current is known to give more thrust, and the characteristic to be odd.
 import optid
 from optid.examples import example
 

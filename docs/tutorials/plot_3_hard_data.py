@@ -2,11 +2,11 @@
 Hard data: missing samples, outliers, several experiments
 =========================================================
 
-Bad records are ordinary data: they are marked, joined, weighted and examined before anything is solved.
+Records with gaps and outliers can be used as they are: optid checks them before it solves anything.
 """
 
 # %%
-# Two experiments of unequal length; some outputs are missing, some are wild.
+# Two experiments of unequal length; some outputs are missing, some are outliers.
 import numpy as np
 
 import optid
@@ -29,7 +29,7 @@ data = optid.Data([u1, u2], [y1, y2], 0.1)
 data
 
 # %%
-# The Huber loss leaves out the rows that hold a wild output, and names them.
+# The Huber loss leaves out the rows that contain an outlier in an output, and names them.
 fit = optid.fit(data, na=1, nb=1, nk=1, basis="polynomial:3", loss="huber")
 print(*fit.findings, sep="\n")
 
@@ -38,4 +38,4 @@ fit.params
 
 # %%
 # Files larger than memory are read in one pass: ``optid.fit(optid.open_stream("big.csv", ...), ...)`` takes the same
-# arguments. The mergeable sums are the same to the last digits on one core and on a cluster.
+# arguments. The accumulated sums agree to the last digits on one core and on a cluster.

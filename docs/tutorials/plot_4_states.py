@@ -27,7 +27,7 @@ study = optid.order(data)
 print("states:", study.nx)
 
 # %%
-# Past inputs and outputs are instruments that stay valid in closed loop.
+# Past inputs and outputs are instruments, which remain valid in closed loop.
 fit = optid.fit(data, "hammerstein_ss.asivid", nx=3, basis="polynomial:3")
 print("free run, fit in %:", fit.simulation_fit.round(1))
 

@@ -88,7 +88,7 @@ def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
 def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
     """Return the inequalities in the P and Q of a shift step; refuse a formulation without (`StructureError`)."""
     if not isinstance(view.poles, tuple):
-        raise StructureError(f"constraint {name!r} speaks about the poles of a state-space model; this step has the "
+        raise StructureError(f"constraint {name!r} applies to the poles of a state-space model; this step has the "
                              "coefficients of a polynomial, for which only 'stable' is available, and up to na = 2 "
                              "'disc'")
     p, q = view.poles
@@ -144,7 +144,7 @@ def sector(angle: float) -> Rule:
         StructureError: an angle outside (0, pi/2], where the region is convex.
     """
     if not 0 < angle <= np.pi / 2 + 1e-12:
-        raise StructureError(f"the angle of a sector lies in (0, pi/2], where it is convex; got {angle!r}")
+        raise StructureError(f"the angle of a sector must lie in (0, pi/2], where it is convex; got {angle!r}")
     return region_rule(f"sector:{angle:g}", [wedge_side(angle + np.pi / 2, -MARGIN)],
                        f"the sector |arg z| <= {angle:g}")
 
@@ -161,7 +161,7 @@ def damped(ratio: float) -> Rule:
         StructureError: a ratio outside (0, 1).
     """
     if not 0 < ratio < 1:
-        raise StructureError(f"the damping ratio lies in (0, 1); got {ratio!r}")
+        raise StructureError(f"the damping ratio must lie in (0, 1); got {ratio!r}")
     rate = float(ratio / np.sqrt(1 - ratio**2))
     return region_rule(f"damped:{ratio:g}", damping_sides(rate), f"the region of damping ratio {ratio:g}")
 
@@ -197,7 +197,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         StructureError: impossible radius, no A to constrain, several outputs, or wrong number of separating points.
     """
     if not 0 < radius <= 1:
-        raise StructureError(f"the pole radius lies in (0, 1]; got {radius!r}")
+        raise StructureError(f"the pole radius must lie in (0, 1]; got {radius!r}")
     points = None if real is None else np.atleast_1d(np.asarray(real, dtype=float))
     name, radius = f"stable:{radius:g}", radius * (1 - MARGIN)
 

@@ -76,7 +76,7 @@ def step_band(low: float | None = None, high: float | None = None, first: float 
     """
     check_bounds("step_band", low, high)
     if not 0 <= first <= last <= LATEST:
-        raise StructureError(f"the samples of step_band are 0 <= first <= last <= {LATEST}; got {first!r}, {last!r}")
+        raise StructureError(f"step_band needs 0 <= first <= last <= {LATEST}; got {first!r}, {last!r}")
     if around is not None and not (hasattr(around, "a") and hasattr(around, "inputs")):
         raise StructureError(f"step_band: around= takes a model with past outputs, such as fit.model; got {around!r}")
     name, count = label("step_band", channel, output), int(last) + 1
@@ -153,7 +153,7 @@ def positive_real(margin: float = 0.0) -> Rule:
         StructureError: a negative margin.
     """
     if margin < 0:
-        raise StructureError(f"the margin of positive realness is not negative; got {margin!r}")
+        raise StructureError(f"the margin of positive realness must be nonnegative; got {margin!r}")
 
     def build(view: View) -> Any:
         _needs_realisation(view, "positive_real")
@@ -203,7 +203,7 @@ def _response(word: str, sign: str, horizon: float, channel: str | None, output:
               summed: bool) -> Rule:
     factor = sign_of("sign", sign, "positive", "negative")
     if horizon < 1:
-        raise StructureError(f"the horizon is at least one sample; got {horizon!r}")
+        raise StructureError(f"the horizon must be at least one sample; got {horizon!r}")
 
     def build(view: View) -> Any:
         _needs_realisation(view, word)

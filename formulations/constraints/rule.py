@@ -72,7 +72,7 @@ def label(word: str, *names: str | None) -> str:
 def sign_of(argument: str, word: str, positive: str, negative: str) -> float:
     """Return 1 or -1 for two words; refuse others (`StructureError`)."""
     if word not in (positive, negative):
-        raise StructureError(f"the {argument} is {positive!r} or {negative!r}; got {word!r}")
+        raise StructureError(f"the {argument} must be {positive!r} or {negative!r}; got {word!r}")
     return 1.0 if word == positive else -1.0
 
 

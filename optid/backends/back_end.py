@@ -41,9 +41,9 @@ class Settings:
 
     def __post_init__(self) -> None:
         if not _is_number(self.accuracy) or not 0 < self.accuracy < 1:
-            raise StructureError(f"accuracy={self.accuracy!r}: a number between 0 and 1 is needed")
+            raise StructureError(f"accuracy={self.accuracy!r}: it must be a number between 0 and 1")
         if self.time_limit is not None and (not _is_number(self.time_limit) or not self.time_limit > 0):
-            raise StructureError(f"time_limit={self.time_limit!r}: a positive number of seconds is needed")
+            raise StructureError(f"time_limit={self.time_limit!r}: it must be a positive number of seconds")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.data.record import Data, as_list
+from optid.arrays import as_list
+from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.whitening import predictor, whiten
 from optid.models.experiments import in_units_of

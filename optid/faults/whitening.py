@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array, compact
-from optid.data.record import Data, as_list, one_or_all
+from optid.arrays import Array, as_list, compact, one_or_all
+from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of

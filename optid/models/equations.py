@@ -59,7 +59,7 @@ class Equations:
             if name in RESERVED:
                 raise StructureError(f"{name!r} is a name of the formulation: take another one")
             if np.ndim(value) or not np.isfinite(value):
-                raise StructureError(f"the start of {name!r} is {value!r}: a finite number is needed")
+                raise StructureError(f"the start of {name!r} is {value!r}: it must be a finite number")
         for name, given in self.bounds.items():
             if name not in values:
                 raise StructureError(f"bounds of {name!r}, which is neither a state nor a parameter. "
@@ -69,7 +69,7 @@ class Equations:
                 raise StructureError(f"{name!r} starts at {values[name]:g}, outside its bounds {tuple(given)}")
         for word, known in (("time", TIMES), ("hold", HOLDS)):
             if getattr(self, word) not in known:
-                raise StructureError(f"{word}={getattr(self, word)!r}: one of {', '.join(known)}")
+                raise StructureError(f"{word}={getattr(self, word)!r}: use one of {', '.join(known)}")
 
     def interval(self, name: str) -> tuple[float, float]:
         """Return the bounds of a state or parameter as numbers, infinite where open."""

@@ -89,20 +89,20 @@ class HammersteinTF(Model):
     def _check(self) -> None:
         l, m = self.offset.size, len(self.b)  # noqa: E741 - the field's letter
         if self.offset.ndim != 1:
-            raise StructureError(f"offset has shape {self.offset.shape}; (l,) is needed.")
+            raise StructureError(f"offset has shape {self.offset.shape}; it must be (l,).")
         if len(self.nonlinearities) != m:
             raise StructureError(f"nonlinearities has {len(self.nonlinearities)} entries for {m} inputs.")
         if self.a.ndim != (1 if l == 1 else 3) or self.a.shape[1:] not in ((), (l, l)):
-            raise StructureError(f"a has shape {self.a.shape}; {'(na,)' if l == 1 else f'(na, {l}, {l})'} is needed.")
+            raise StructureError(f"a has shape {self.a.shape}; it must be {'(na,)' if l == 1 else f'(na, {l}, {l})'}.")
         for c, b in enumerate(self.b):
             if b.ndim != (1 if l == 1 else 2) or not b.size or b.shape[1:] not in ((), (l,)):
-                raise StructureError(f"b[{c}] has shape {b.shape}; {'(nb,)' if l == 1 else f'(nb, {l})'} is needed.")
+                raise StructureError(f"b[{c}] has shape {b.shape}; it must be {'(nb,)' if l == 1 else f'(nb, {l})'}.")
         if any(f.offset is not None for f in self.nonlinearities):
             raise StructureError(
                 "A nonlinearity of a model has offset None: put the constant of the equation in offset=.")
         for name, values in (("c", self.c), ("d", self.d)):
             if values is not None and values.ndim != 1:
-                raise StructureError(f"{name} has shape {values.shape}; (n{name},) is needed.")
+                raise StructureError(f"{name} has shape {values.shape}; it must be (n{name},).")
         if self.l > 1 and self.structure != "arx":
             raise StructureError(f"A model with c or d has one output; this one has {self.l}: it can only be ARX.")
         largest = roots.radius(self.c)
@@ -200,7 +200,7 @@ class HammersteinTF(Model):
         if self.m > 1:
             return "With several inputs one constant cannot be shared out among the nonlinearities."
         if self.nonlinearities[0].is_linear:
-            return "A linear channel has no offset of its own."
+            return "A linear channel has no offset."
         total = self.b[0].sum(axis=0)
         if np.linalg.norm(total) <= TINY_SUM * np.abs(self.b[0]).sum():
             return "The coefficients of B sum to zero: a constant in f has no effect."

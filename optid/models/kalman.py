@@ -35,7 +35,7 @@ class NoiseCovariances:
         for name in ("Q", "R", "S", "innovation"):
             object.__setattr__(self, name, finite(getattr(self, name), name))
         if self.S.ndim != 2:
-            raise StructureError(f"S has shape {self.S.shape}: a matrix is needed.")
+            raise StructureError(f"S has shape {self.S.shape}; it must be a matrix.")
         n, outputs = self.S.shape
         for name, size in (("Q", n), ("R", outputs), ("innovation", outputs)):
             matrix = getattr(self, name)
@@ -101,7 +101,7 @@ def kalman_gain(A: Array, C: Array, Q: Array, R: Array, S: Array | None = None) 
         ("A", A, (n, n)), ("C", C, (outputs, n)), ("Q", Q, (n, n)), ("R", R, (outputs, outputs)), ("S", S, (n, outputs))
     ):
         if matrix.shape != shape:
-            raise StructureError(f"{name} has shape {matrix.shape}; {shape} is needed.")
+            raise StructureError(f"{name} has shape {matrix.shape}; it must be {shape}.")
     if np.linalg.eigvalsh((R + R.T) / 2)[0] <= 0:
         raise StructureError("R is not positive definite: give every output some measurement noise.")
     if n == 0:

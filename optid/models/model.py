@@ -77,7 +77,7 @@ class Model(Ports):
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
-            raise StructureError(f"dt = {self.dt!r}: a positive number.")
+            raise StructureError(f"dt = {self.dt!r}: it must be a positive number.")
         one_of("gauge", self.gauge, self.GAUGES)
 
     @property
@@ -128,7 +128,7 @@ class Model(Ports):
         """Read constant inputs (m,); refuse another number of them (`StructureError`)."""
         points = np.atleast_1d(np.asarray(u0, dtype=float))
         if points.shape != (self.m,):
-            raise StructureError(f"u0 has shape {points.shape}; one operating point per input is needed, ({self.m},).")
+            raise StructureError(f"u0 has shape {points.shape}; it must be ({self.m},), one operating point per input.")
         return points
 
     def __repr__(self) -> str:

@@ -142,7 +142,7 @@ class StateSpace(Model):
                 if f.offset:
                     raise StructureError(f"{kind}[{j}] has an offset: the constants belong to offset_x and offset_y.")
         if self.noise is not None and self.noise.S.shape != shapes["S"]:
-            raise StructureError(f"The noise covariances are those of {self.noise.S.shape}; {shapes['S']} is needed.")
+            raise StructureError(f"The noise covariance S has shape {self.noise.S.shape}; it must be {shapes['S']}.")
 
     @property
     def nx(self) -> int:
@@ -245,9 +245,9 @@ class StateSpace(Model):
         turn, n = np.atleast_2d(np.asarray(T, dtype=float)), self.nx
         turn = turn.reshape(0, 0) if n == 0 and turn.size == 0 else turn
         if turn.shape != (n, n) or not np.all(np.isfinite(turn)):
-            raise StructureError(f"T has shape {turn.shape}; a finite matrix ({n}, {n}) is needed.")
+            raise StructureError(f"T has shape {turn.shape}; it must be a finite matrix ({n}, {n}).")
         if n and np.linalg.cond(turn) > 1e14:
-            raise StructureError("T is singular: a change of states can be undone.")
+            raise StructureError("T is singular; a change of states must be invertible.")
         back = np.linalg.inv(turn)
         noise = None if self.noise is None else self.noise.mapped(turn, np.eye(self.l))
         moved = {name: turn @ getattr(self, name) for name in ("B", "E", "L", "K", "Ez", "offset_x")}
@@ -270,7 +270,7 @@ class StateSpace(Model):
         """
         moved = np.asarray(gain, dtype=float)
         if moved.shape != self.L.shape:
-            raise StructureError(f"The gain has shape {moved.shape}; {self.L.shape} is needed.")
+            raise StructureError(f"The gain has shape {moved.shape}; it must be {self.L.shape}.")
         return replace(
             self, A=self.A - moved @ self.C, B=self.B - moved @ self.D, L=self.L + moved, K=self.K - moved,
             Ez=self.Ez - moved @ self.Fz, offset_x=self.offset_x - moved @ self.offset_y, noise=None, gauge="none")

@@ -55,7 +55,7 @@ def as_state(x0: ArrayLike, order: int) -> Array:
     """Return the initial state as (order,); refuse other shapes, and values that are not finite (`DataError`)."""
     state = np.array(x0, dtype=float)
     if state.shape != (order,) or not np.isfinite(state).all():
-        raise DataError(f"x0 = {x0!r}: {order} finite numbers are needed.")
+        raise DataError(f"x0 = {x0!r}: it must be {order} finite numbers.")
     return state
 
 

@@ -37,7 +37,7 @@ def validated(model: Any, record: Data) -> "Validation":
 
 
 def visited(function: StaticFunction, record: Data | None) -> Array:
-    """Where the argument of a function has been; nowhere where the simulation of a latent one runs away."""
+    """Samples of the argument of a function; none if the simulation of a latent signal diverges."""
     try:
         return np.zeros(0) if record is None else function.samples(record)
     except DataError:
@@ -70,8 +70,8 @@ def record_charts(models: dict[str, Any], data: Data, *, ahead: bool = True, gro
                        for (label, run), colour in zip(runs.items(), COLOURS * len(runs)) if run is not None]
             if predicted is not None:
                 series.append(Series("one step ahead", t, predicted[k][:, o], colour="c1", dash="4 2", width=1.3))
-            charts.append(Chart(f"Output {name}{several}", "Every simulation starts from the initial state that fits "
-                                "best and uses no measured output.", Axis("time"), _unit(name, record.output_units[o]),
+            charts.append(Chart(f"Output {name}{several}", "Every simulation starts from the best-fitting initial "
+                                "state and uses no measured output.", Axis("time"), _unit(name, record.output_units[o]),
                                 series, f"{group}{k}", height=300))
         for c, name in enumerate(record.inputs):
             charts.append(Chart(f"Input {name}{several}", "", Axis("time"), _unit(name, record.input_units[c]),
@@ -102,8 +102,8 @@ def nonlinearity_charts(fit: "Fit") -> list[Chart]:
             counts, edges = np.histogram(here, bins=40, range=(low, high))
             series.append(Series("density of the samples", edges[:-1], counts / counts.max(), "bars", "muted",
                                  aside=True))
-        charts.append(Chart(f"{function.what} {function.word} of {function.name}", "The bars show how many samples lie "
-                            "where: between few samples the function is a guess.", _unit(function.name, function.unit),
+        charts.append(Chart(f"{function.what} {function.word} of {function.name}", "The bars show where the samples "
+                            "lie: the function is uncertain where there are few.", _unit(function.name, function.unit),
                             Axis(f"{function.word}({function.name})"), series))
     return charts
 
@@ -167,7 +167,7 @@ def _correlation(test: Correlation) -> Chart:
     outside = np.abs(values) > band
     what = f"Whiteness of the residuals of {test.output}" if own else (
         f"Independence of the residuals of {test.output} from {test.input}")
-    outcome = "nothing to test" if np.isnan(test.p_value) else (
+    outcome = "not tested" if np.isnan(test.p_value) else (
         f"{'PASS' if test.passed else 'FAIL'} (p = {test.p_value:.2g})")
     reach = 1.15 * float(np.nanmax(np.abs(np.append(values, 1.3 * band)), initial=1e-3))
     series = [Series("99 % band", lags, band, "area", "muted", -band),
@@ -195,7 +195,7 @@ def block_chart(found: "Identification") -> Chart:
                      np.arange(1.0, len(trial.by_block) + 1), trial.by_block, colour=colour,
                      width=2.4 if trial is found.chosen else 1.4)
               for (kind, trial), colour in zip(found.best.items(), COLOURS)]
-    return Chart("Fit by block left out", "Every block of the record is simulated by a model that has not seen it.",
+    return Chart("Fit by block left out", "Every block of the record is simulated by a model not fitted to it.",
                  Axis("block"), Axis("fit (%)", unit="%"), series)
 
 
@@ -205,7 +205,7 @@ def spectrum_chart(name: str, values: Array, rank: int) -> Chart:
     order = np.arange(1.0, values.size + 1)
     series = [Series("kept", order[:rank], relative[:rank], "dots", "c0"),
               Series("left out", order[rank:], relative[rank:], "dots", "muted")]
-    return Chart(name, "Singular values that stand out above the others speak for this order.", Axis("index"),
+    return Chart(name, "Singular values well above the others support this order.", Axis("index"),
                  Axis("relative to the first", log=True), [s for s in series if len(s.xs)])
 
 

@@ -50,7 +50,7 @@ def _test_table(checked: "Validation") -> Table:
 def _verdict(test: Any) -> str:
     """Say in words what a residual test found."""
     if np.isnan(test.p_value):
-        return "nothing to test (constant, or rounding)"
+        return "not tested (constant or rounding error)"
     if test.input is None:
         return "white" if test.passed else "not white"
     return f"independent of {test.input}" if test.passed else f"depends on {test.input}"
@@ -98,7 +98,7 @@ def facts_table(found: "Comparison") -> Table:
          number(float(np.max(np.abs(model.poles), initial=0.0)), 4))
         for name, model in zip(found.names, found.models)
     ]
-    return Table("Models", ("model", "kind", "numbers", "largest pole"), rows)
+    return Table("Models", ("model", "kind", "coefficients", "largest pole"), rows)
 
 
 def search_table(found: "Identification") -> Table:

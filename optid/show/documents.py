@@ -1,4 +1,4 @@
-"""What every result has to say, most important first: the documents that terminal, notebook and page render."""
+"""Documents of every result, most important facts first, which terminal, notebook and page render."""
 
 import textwrap
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ ORDERS = 12
 """Orders listed of a study, where the recommended one is not larger."""
 
 ADVISED = ("poor", "useless")
-"""Verdicts with which a page says what would help; to know it, neighbouring structures are fitted."""
+"""Verdicts for which a page gives advice; finding it requires fits of neighbouring structures."""
 
 
 def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | None" = None, command: str = "",
@@ -50,7 +50,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
             Code(fit.model.equation(), equation=True),
             summary.model_facts(fit),
             Pair([*tables, *([noise] if noise else [])]),
-            *([Heading("Measured on the way"), evidence] if evidence else []),
+            *([Heading("Intermediate results"), evidence] if evidence else []),
             *([Fold("Coefficients of the basis", [coefficients])] if coefficients else []),
         ]),
         *([Section("constraints", "Constraints and their prices", [summary.constraint_table(fit)])]
@@ -76,7 +76,7 @@ def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Se
     failed = [f"{part.name} ({part.value})" for part in judged.failed]
     sentence = f"FAIL: {'; '.join(failed)}." if failed else "All tests of the verdict pass."
     if not failed and judged.word != GOOD:
-        sentence += f" A model is called good from a fit of {GOOD_FIT:g} %, and {GOOD_BLOCK:g} % in its worst block."
+        sentence += f" A good model has a fit of at least {GOOD_FIT:g} %, and {GOOD_BLOCK:g} % in its worst block."
     which = ", lowest output" if fit.model.l > 1 else ""
     fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
     if test is not None:
@@ -98,7 +98,7 @@ def _optimum(fit: "Fit") -> Section:
     cards.append(("time", wording.seconds(fit.seconds)))
     right = [(name, value) for name, value in summary.certificate_facts(fit)
              if name in ("Objective", "Bound", "Relative gap")]
-    right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "In all")]
+    right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "Total")]
     return Section("optimum", "", [Banner(tone, f"Solution: {word}", sentence, tuple(cards)),
                                    Columns(summary.record_facts(fit), right),
                                    *([Notes(fit.findings)] if fit.findings else [])])

@@ -31,7 +31,7 @@ def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:
 
 
 def parameter_tables(fit: "Fit") -> list[Table]:
-    """What was estimated with standard errors and 95 % intervals where there are some, then matrices without."""
+    """Estimates with their standard errors and 95 % intervals if available, then matrices without."""
     known, reason = uncertainty(fit)
     found = []
     if known is not None:
@@ -43,7 +43,7 @@ def parameter_tables(fit: "Fit") -> list[Table]:
             return found
     rows = [(name, number(value)) for name, value in fit.model.coefficients()]
     title, note = ("Parameters", f"No standard errors: {reason.rstrip('.')}.") if known is None else (
-        "Matrices", "They depend on the choice of the states, which no record determines.")
+        "Matrices", "They depend on the choice of state coordinates, which no record determines.")
     if len(rows) <= MOST_ROWS:
         return [*found, Table(title, ("parameter", "estimate"), rows, note)]
     return [*found, Table(title, ("parameter", "estimate") * ABREAST, _abreast(rows), note)]

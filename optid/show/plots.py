@@ -99,7 +99,7 @@ def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | N
     Args:
         fit: the fit.
         data: the record; the estimation record when not given.
-        checked: what `optid.validate` found on it, where that is known.
+        checked: the result of `optid.validate` on it, if available.
 
     Raises:
         DataError: the fit was made from a stream and no record is given.
@@ -140,7 +140,7 @@ def noise(fit: "Fit") -> Figure:
 
 @styled
 def certificate(fit: "Fit") -> Figure:
-    """Draw how far the proof of global optimality went: the ladder of proofs and the gap that is left."""
+    """Draw the steps of the proof of global optimality and the remaining gap."""
     bound = fit.solution.bound
     ladder = rank_one_of(fit.program) is not None and bound is not None and bound.method in RUNGS
     figure = Figure(figsize=(9.0, 2.7 if ladder else 1.9), layout="constrained")
@@ -162,7 +162,7 @@ def certificate(fit: "Fit") -> Figure:
 def singular_values(fit: "Fit") -> Figure:
     """Draw the singular values of Theta of every input, before the rank is forced to one.
 
-    One that stands out speaks for the Hammerstein structure.
+    One dominant singular value supports the Hammerstein structure.
 
     Raises:
         DataError: the formulation has no matrix Theta.
@@ -206,7 +206,7 @@ def _record(fit: "Fit", data: Data | None) -> Data:
 
 
 def _needs_closeup(record: Data, factor: int) -> bool:
-    """Whether a record is one long experiment, in which single samples cannot be told apart."""
+    """Whether a record is one experiment too long to show single samples."""
     return record.n_experiments == 1 and record.n_samples > factor * CLOSEUP
 
 

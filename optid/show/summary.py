@@ -1,4 +1,4 @@
-"""What there is to say about a fit, in words and rows; the printed result and the HTML page both read it here."""
+"""Facts, tables and sentences about a fit, for the printed result and the HTML page."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -23,19 +23,19 @@ MOST = 12
 """Entries of an array among the figures that are printed."""
 
 PRICE_NOTE = (
-    "Multiplier: change of the objective per unit of the bound. Price: points of one-step fit (%) gained when the "
-    "bound is relaxed by 1 % of the range of f, or, where it is not about f, of the size of what it bounds."
+    "Multiplier: change of the objective per unit of the bound. Price: points of one-step fit gained when the bound "
+    "is relaxed by 1 % of the range of f or, if the constraint is not on f, of the size of the bounded quantity."
 )
 
 
 def title(fit: "Fit") -> str:
-    """Say what was identified from what."""
+    """Name the kind of model, its outputs and its inputs."""
     model = fit.model
     return f"{model.title} of {_and(model.outputs)} from {_and(model.inputs)}"
 
 
 def verdict(fit: "Fit") -> tuple[str, str, str]:
-    """Return a tone ("good", "fair", "bad"), the status in words, and one sentence that says what it means."""
+    """Return a tone ("good", "fair", "bad"), the status in words, and one sentence that explains it."""
     solution = fit.solution
     bound, gap = solution.bound, solution.gap
     if solution.proof and solution.status is Status.OPTIMAL and bound is not None:
@@ -47,7 +47,7 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
     reason = (solution.reason or (bound.reason if bound is not None else "") or fit.program.note).rstrip(".")
     because = f": {reason}" if reason else ""
     if solution.status not in (Status.LOCAL, Status.OPTIMAL):
-        return "bad", word, f"The solver stopped early{because}. Read the figures below with care."
+        return "bad", word, f"The solver stopped early{because}. The figures below may be far from optimal."
     if fit.outcome.evidence is not None and because:
         return "fair", word, f"Not proved to be the best model of this structure{because}."
     if gap < 1:
@@ -57,9 +57,9 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
 
 
 def verdict_table(found: "Verdict") -> Table:
-    """What the verdict on a model rests on, part by part."""
+    """The tests behind the verdict on a model, each with its value and outcome."""
     rows = [(part.name, part.value, "PASS" if part.passed else "FAIL") for part in found.parts]
-    return Table("", ("test", "found", "outcome"), rows)
+    return Table("", ("test", "value", "outcome"), rows)
 
 
 def fit_table(fit: "Fit") -> Table:
@@ -94,13 +94,13 @@ def constraint_table(fit: "Fit") -> Table:
 
 
 def certificate_facts(fit: "Fit") -> Facts:
-    """Why the solver stopped, whether there is a point, whether it is proved, and our own measurements."""
+    """Status claimed by the solver, whether it returned a solution, the proof, and the residuals measured by optid."""
     s, r = fit.solution, fit.solution.residuals
-    facts = [("Why it stopped", f"{s.solver} said: {s.claimed}"), ("Is there a point", "yes" if s.has_point else "no")]
+    facts = [("Solver status", f"{s.solver}: {s.claimed}"), ("Solution returned", "yes" if s.has_point else "no")]
     if s.bound is None:
-        facts.append(("Is it proved", "no: " + (fit.program.note or "this programme has no certificate")))
+        facts.append(("Optimality proved", "no: " + (fit.program.note or "this programme has no certificate")))
     else:
-        facts.append(("Is it proved", f"{'yes' if s.proof else 'no'}: {s.bound.reason or s.bound.method}"))
+        facts.append(("Optimality proved", f"{'yes' if s.proof else 'no'}: {s.bound.reason or s.bound.method}"))
         known = np.isfinite(s.bound.value)
         facts.append(("Bound", f"{number(s.bound.value, 10)} ({s.bound.method})" if known else "none"))
     facts.append(("Objective", number(s.objective, 10)))
@@ -135,7 +135,7 @@ def record_facts(fit: "Fit") -> Facts:
 
 
 def evidence_facts(fit: "Fit") -> Facts:
-    """What a procedure measured on its way, in its own words and order."""
+    """Figures that a procedure of several steps reported, under its own names and in its order."""
     return [(name[:1].upper() + name[1:], _measured(value)) for name, value in fit.figures.items() if name not in _ROWS]
 
 
@@ -172,7 +172,7 @@ def theta_singular_values(fit: "Fit") -> dict[str, np.ndarray]:
 
 
 def channel_table(fit: "Fit") -> Table | None:
-    """What every channel looks like; None for a stream."""
+    """Range, mean, spread, levels and missing share of every channel; None for a stream."""
     if not isinstance(fit.data, Data):
         return None
     rows = [
@@ -184,7 +184,7 @@ def channel_table(fit: "Fit") -> Table | None:
 
 
 def solver_facts(fit: "Fit") -> Facts:
-    """Which solver, why, and how long each part took."""
+    """The solver, why it was chosen, and the time of each part."""
     s = fit.solution
     descended = fit.figures.get("programmes") == 1 and not fit.program.user_constraints
     facts = [("Solver", f"descent, {s.solver}" if descended else s.solver)]
@@ -195,7 +195,7 @@ def solver_facts(fit: "Fit") -> Facts:
     if len(fit.steps) > 1:
         facts.append(("Programmes solved", str(len(fit.steps))))
     times = (s.times.build, s.times.solve, s.times.judge, s.times.prove, fit.seconds)
-    return facts + list(zip(("Posing", "Solving", "Judging", "Proving", "In all"), map(seconds, times)))
+    return facts + list(zip(("Building", "Solving", "Verifying", "Proving", "Total"), map(seconds, times)))
 
 
 def call(fit: "Fit") -> str:
@@ -208,7 +208,7 @@ def call(fit: "Fit") -> str:
 
 
 def model_facts(fit: "Fit") -> Facts:
-    """Orders, poles, noise, gauge, what f does outside the range, and why its offset is not identifiable."""
+    """Orders, poles, noise, gauge, extrapolation of f, and why its offset is not identifiable."""
     model = fit.model
     facts = [
         ("Orders", ", ".join(f"{name} {_order(value)}" for name, value in model.orders.items())),
@@ -228,7 +228,7 @@ def model_facts(fit: "Fit") -> Facts:
 
 
 def _gauge(model: Any) -> str:
-    """Say how the scale between f and the linear part is fixed; "" where the word says nothing."""
+    """Say how the scale between f and the linear part is fixed; "" without a gauge."""
     positive = all(b.flat[0] >= 0 for b in getattr(model, "b", ()))
     sign = "its first coefficient positive" if positive else "its sign follows from the constraints"
     known = {
@@ -264,13 +264,13 @@ def noise_table(fit: "Fit") -> Table | None:
         rows.append((label, number(innovation, 4), number(total, 4), word, p_value))
     note = (
         "Standard deviations. Q, R and S (model.noise) are those of the innovation form; others with the same spectrum "
-        "explain the record as well."
+        "explain the record equally well."
     )
     return Table("Noise", ("output", "innovations", "noise at output", "colour", "p value"), rows, note)
 
 
 _ROWS = ("rows", "candidates", "condition", "method")
-"""Figures of the compressed statistics, which `record_facts` tells."""
+"""Figures of the compressed statistics, which `record_facts` reports."""
 
 
 def _measured(value: Any) -> str:

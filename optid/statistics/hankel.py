@@ -138,7 +138,7 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
     records = [np.asarray(record, dtype=float) for record in records]
     for i, record in enumerate(records):
         if record.ndim != 2:
-            raise DataError(f"experiment {i + 1}: an array (N, channels) is needed; got shape {record.shape}.")
+            raise DataError(f"experiment {i + 1} must be an array (N, channels); got shape {record.shape}.")
         if len(record) < rows:
             raise RankError(f"experiment {i + 1} has {len(record)} samples, fewer than a window of {rows}: leave it "
                             "out or use fewer block rows.")

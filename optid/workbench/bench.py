@@ -1,4 +1,4 @@
-"""The bench of one page: a record, the fits that were asked for, and the answers to what the page asks."""
+"""The bench of one page: its record, its fits, and the responses to its requests."""
 
 import threading
 import time
@@ -42,12 +42,12 @@ class Bench:
     moving: tuple[str, Any] = ("", None)  # what a hand that draws a band has reached, by the key without the band
 
     def answer(self, question: str, asked: Mapping[str, Any]) -> Any:
-        """Answer a question of the page; what cannot be fitted is said in its message."""
+        """Respond to a request of the page; the response says why a fit is impossible."""
         known: dict[str, Callable[[Mapping[str, Any]], Any]] = {
             "fit": self._fit, "judge": self._judge, "time": self._time, "export": self._export,
             "diagnose": self._diagnose}
         if question not in known:
-            raise DataError(f"the page asks for {question!r}, which there is not")
+            raise DataError(f"the page sent an unknown request, {question!r}")
         try:
             return known[question](asked)
         except OptidError as error:

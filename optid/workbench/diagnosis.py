@@ -30,7 +30,7 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
 
     model = getattr(source, "model", source)
     if model.structure != "ss" or model.noise is None:
-        raise StructureError("faults are judged with a state-space model that has noise covariances: choose the "
+        raise StructureError("a diagnosis needs a state-space model with noise covariances: choose the "
                              "formulation hammerstein_ss.asivid, or start with optid workbench --model model.json")
     kinds = list(asked.get("kinds", ["bias", "loss", "spike"]))
     if not kinds:
@@ -61,7 +61,7 @@ def _charts(found: Any, first: int) -> list[dict[str, Any]]:
         series = [Series("innovation", *reduced(k, r), colour="muted", width=1.0)]
         if seen.fitted[:, o].any():
             series.append(Series("the best answer", *reduced(k, seen.fitted[:, o]), colour="c1", width=2.0))
-        charts.append(Chart(f"Whitened innovations of {name}", "Mostly within 2 when healthy.", Axis("sample"),
+        charts.append(Chart(f"Whitened innovations of {name}", "Mostly between -2 and 2 when healthy.", Axis("sample"),
                             Axis("standard deviations"), series, "fault", height=220))
     if seen.labels:
         peaks = np.nanmax(np.where(np.isnan(seen.gains), -np.inf, seen.gains), axis=1)

@@ -1,4 +1,4 @@
-"""What a page asks for: channels, a window, a formulation with its arguments, and constraints set by hand."""
+"""A request of a page: channels, a window, a formulation with its arguments, and constraints drawn by hand."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -63,7 +63,7 @@ class Request:
             first, last = map(int, state["window"])
             for key in [*state["arguments"], *(key for c in constraints for key in c.arguments)]:
                 if not key.isidentifier():
-                    raise ValueError(f"{key!r} is the name of no argument")
+                    raise ValueError(f"{key!r} is not the name of an argument")
             arguments = {str(key): value for key, value in state["arguments"].items() if value not in (None, "", [])}
             found = cls(tuple(map(str, state["inputs"])), tuple(map(str, state["outputs"])), (first, last),
                         str(state["formulation"]), arguments, constraints, draft)

@@ -110,7 +110,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             asked = json.loads(self.rfile.read(int(size)))
             if not isinstance(asked, dict):
-                raise DataError("a question is an object")
+                raise DataError("a request must be a JSON object")
             code, answer = 200, bench.answer(self.path.removeprefix("/"), asked)
         except (OptidError, ValueError, TypeError, KeyError) as error:
             code, answer = 400, {"error": f"{type(error).__name__}: {error}"}
