@@ -227,7 +227,7 @@ def test_shapes_that_do_not_agree():
         f = Nonlinearity(Linear(), np.ones(1), offset=1.0)
         HammersteinSS(np.eye(1), np.eye(1), np.eye(1), nonlinearities=(f,))
     refuses(StructureError, "C contains a value that is not finite", replace, linear(), C=np.full((2, 3), np.nan))
-    refuses(StructureError, "noise covariances", replace, linear(n=2), noise=with_feedback().noise)
+    refuses(StructureError, "noise covariance S", replace, linear(n=2), noise=with_feedback().noise)
     refuses(StructureError, "gauge", replace, linear(), gauge="best")
 
 
