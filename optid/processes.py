@@ -2,6 +2,7 @@
 
 import faulthandler
 import os
+import pickle
 import signal
 import warnings
 from collections.abc import Callable
@@ -32,6 +33,7 @@ def run_forked(function: Callable[..., Any], *arguments: Any, seconds: float | N
         warnings.simplefilter("ignore", DeprecationWarning)
         child = os.fork()  # multiprocessing allows none to its own workers
     if not child:
+        receiver.close()  # so that sending fails, and does not wait, where the parent is gone
         _work(sender, function, arguments, memory, quiet)
     sender.close()
     try:
@@ -85,7 +87,10 @@ def _work(sender: Connection, function: Callable[..., Any], arguments: tuple, me
             answer = function(*arguments), None
         except Exception as error:
             answer = None, error
-        sender.send(answer)
+        try:
+            sender.send(answer)
+        except (TypeError, AttributeError, pickle.PicklingError) as error:
+            sender.send((None, RuntimeError(f"the answer of a child process cannot be sent: {error}")))
         code = 0
     finally:
         os._exit(code)

@@ -109,6 +109,17 @@ def test_errors_leave_out_what_is_missing():
     assert measure[0] == pytest.approx(85 * np.nanvar(y))
 
 
+@pytest.mark.parametrize("channel", ["u", "y"])
+def test_an_experiment_without_a_reading_of_a_channel_is_left_out(channel):
+    one, dead, other = plant(200), plant(60, seed=1), plant(200, seed=2)
+    us, ys = [one.u, np.array(dead.u), other.u], [one.y, np.array(dead.y), other.y]
+    (us if channel == "u" else ys)[1][:] = np.nan
+    blocks, model = Blocks.of(optid.Data(us, ys), 4), optid.fit(one, "oe.exact", na=1, nb=1, nk=1).model
+    found = [blocks.errors(model, b) for b in range(4)]
+    assert pooled_fit(*map(np.array, zip(*found))) > 90
+    assert sum(measure for _, measure in found) == pytest.approx(400 * blocks.outputs[0])
+
+
 def test_errors_do_not_depend_on_units():
     data = plant(300)
     other = optid.Data(1e-4 * data.u, 1e5 * data.y)

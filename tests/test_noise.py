@@ -8,7 +8,16 @@ from scipy.signal import csd
 
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
-from optid.identify.noise import _most_likely, _part, colour, noise_spectrum, residuals, whitening_gain, with_noise
+from optid.identify.noise import (
+    _most_likely,
+    _part,
+    _starts,
+    colour,
+    noise_spectrum,
+    residuals,
+    whitening_gain,
+    with_noise,
+)
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import (
     _equations,
@@ -285,3 +294,9 @@ def test_a_stable_gain_whose_run_leaves_the_range_of_numbers_is_refused():
     A, C, rest = np.array([[0.0, 1e200], [0.0, 0.0]]), np.array([[1.0, 1.0]]), [np.ones((20, 1))]
     with pytest.raises(DataError, match="range of numbers"):
         whitened(A, C, np.zeros((2, 1)), rest)
+
+
+def test_a_start_whose_innovations_leave_the_range_of_numbers_is_left_out():
+    """Without a gain the state of a plant of pole 1.5 grows beyond all numbers; with those of observers it does not."""
+    starts = _starts(np.array([[1.5]]), np.array([[1.0]]), [np.random.default_rng(0).normal(size=(3000, 1))])
+    assert starts and all(abs(1.5 - float(gain[0, 0])) < 1 for gain in starts)

@@ -40,7 +40,10 @@ def test_a_death_is_told_with_its_signal_or_code():
         run_forked(die, signal.SIGSEGV)
     with pytest.raises(ChildProcessError, match="exit code 3"):
         run_forked(os._exit, 3)
-    with pytest.raises(ChildProcessError, match="exit code 1"):  # what no pickle holds
+
+
+def test_an_answer_that_no_pickle_holds_is_named():
+    with pytest.raises(RuntimeError, match="cannot be sent"):
         run_forked(lambda: (lambda: None))
 
 

@@ -139,7 +139,7 @@ def in_options(text: str) -> str:
     text = re.sub(rf"(takes no )argument '({word})'(?=\.)", lambda m: m[1] + option_of(m[2]), text)
     text = re.sub(rf"( needs |Known: )((?:{word})(?:, (?:{word}))*)(?=$|\.)", several, text)
     text = re.sub(rf"(?<![\w.-])({word})=(?=['\w\[(.-])", lambda m: option_of(m[1]) + " ", text)
-    return re.sub(rf"^({word})(?=,| must| is | of input| \()", lambda m: option_of(m[1]), text)
+    return re.sub(rf"^({word})(?=,| must| is | has | of input| \()", lambda m: option_of(m[1]), text)
 
 
 def _option(parameter: inspect.Parameter, panel: str, words: str, text: str) -> Any:

@@ -355,7 +355,8 @@ def health(whitened: Any, lags: int = LAGS) -> Health:
                 total += signal[lag:].T @ signal[:-lag]
                 pairs += int(np.sum(there[lag:] & there[:-lag]))
         statistic += float(np.sum(total**2)) / max(pairs, 1)
-    squares = np.nansum([np.nansum(part.innovations**2, axis=0) for part in parts], axis=0)
+    seen = [np.where(part.present, part.innovations, 0.0) for part in parts]
+    squares = np.sum([np.sum(one**2, axis=0) for one in seen], axis=0)
     readings = np.maximum(np.sum([part.present.sum(axis=0) for part in parts], axis=0), 1)
     sizes = np.sqrt(squares / readings / np.diag(parts[0].predictor.covariance)).tolist()
     p_value = float(chdtrc(outputs**2 * lags, statistic))

@@ -97,7 +97,10 @@ class Blocks:
         variance, span = self.outputs
         energy, count = np.zeros(self.data.l), np.zeros(self.data.l)
         for part in self.parts[block]:
-            around = self._around(part)
+            try:
+                around = self._around(part)
+            except DataError:  # no sample of it can be compared
+                continue
             try:  # what runs away is told by its energy
                 runs = as_list(model.simulate(around, x0="fit") if horizon is None else model.predict(around, horizon))
                 # a state fitted to all of a run hides an unstable mode

@@ -180,9 +180,15 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
     for ratio in RATIOS:
         with suppress(StructureError):
             observers.append(observer_gain(A, C, ratio))
-    found = sorted(map(measured, observers), key=itemgetter(0))
+    found = []
+    for gain in observers:
+        with suppress(DataError):  # innovations that leave the range of numbers
+            found.append(measured(gain))
+    if not found:
+        raise DataError("the noise model is not determined: the innovations leave the range of numbers")
+    found.sort(key=itemgetter(0))
     for _, gain, errors in found[:TRIED]:
-        with suppress(StructureError, ValueError):  # too few in a row, or a zero on the unit circle
+        with suppress(StructureError, DataError, ValueError):  # too few in a row, or a zero on the unit circle
             found.append(measured(whitening_gain(A, C, gain, errors)))
     return [gain for _, gain, _ in sorted(found, key=itemgetter(0))]
 

@@ -10,7 +10,7 @@ from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.monitor.arl import COMMON, Calibration
 from optid.faults.nuisance import ModelUncertainty, sensitivities
-from optid.faults.ranges import unsure_since
+from optid.faults.ranges import outside, unsure_since
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
 from optid.models import NoiseCovariances
@@ -72,7 +72,13 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     whole: list[Any] = as_list(whiten(found.model, healthy, scale=steady))
     parts = [replace(part, present=part.present & ~unsure_since(found.model, record.u, steady.settling)[:, None])
              for part, record in zip(whole, healthy.raw().experiments)]
-    judged = health(parts)
+    try:
+        judged = health(parts)
+    except DataError as error:
+        if left := [str(one) for record in healthy.raw().experiments for one in outside(found.model, record.u)]:
+            raise DataError(f"{' '.join(left)} Too little of the healthy record remains ({error}): identify the model "
+                            "over the wider range, or give a record inside it.") from error
+        raise
     if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
         return found, ""
     signals = [np.where(part.present, part.innovations, np.nan) for part in parts]
