@@ -26,12 +26,17 @@ def run_forked(function: Callable[..., Any], *arguments: Any, seconds: float | N
 
     Raises:
         TimeoutError: the child was killed.
-        ChildProcessError: it died by itself, with the signal or the exit code.
+        ChildProcessError: it could not be started, or died by itself, with the signal or the exit code.
     """
     receiver, sender = Pipe(duplex=False)
     with warnings.catch_warnings():  # forking beside threads is deprecated; the child runs one function and ends
         warnings.simplefilter("ignore", DeprecationWarning)
-        child = os.fork()  # multiprocessing allows none to its own workers
+        try:
+            child = os.fork()  # multiprocessing allows none to its own workers
+        except OSError as error:
+            receiver.close()
+            sender.close()
+            raise ChildProcessError(f"no process can be started: {error.strerror}") from error
     if not child:
         receiver.close()  # so that sending fails, and does not wait, where the parent is gone
         _work(sender, function, arguments, memory, quiet)

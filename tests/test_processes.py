@@ -93,3 +93,12 @@ def test_a_mat_file_that_kills_its_reader_is_a_named_error(tmp_path, monkeypatch
     monkeypatch.setattr(matlab, "SECONDS", 0.2)
     with pytest.raises(DataError, match=f"r.mat is damaged, or not a MAT file: .*{words}"):
         read(tmp_path / "r.mat")
+
+
+def test_a_process_that_cannot_be_started_is_named(monkeypatch):
+    def refuse():
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(os, "fork", refuse)
+    with pytest.raises(ChildProcessError, match="no process can be started: Cannot allocate memory"):
+        run_forked(len, "abc")
