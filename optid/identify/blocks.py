@@ -95,6 +95,8 @@ class Blocks:
                 and what surrounds it, `WIDER` in all.
         """
         variance, span = self.outputs
+        if horizon is None and not model.is_stable and self._diverges(model, block):
+            return np.full(self.data.l, np.inf), np.zeros(self.data.l)
         energy, count = np.zeros(self.data.l), np.zeros(self.data.l)
         for part in self.parts[block]:
             try:
@@ -103,11 +105,7 @@ class Blocks:
                 continue
             try:  # what runs away is told by its energy
                 runs = as_list(model.simulate(around, x0="fit") if horizon is None else model.predict(around, horizon))
-                # a state fitted to all of a run hides an unstable mode
-                wild = horizon is None and not model.is_stable and self._diverges(model, block)
             except OptidError:
-                wild, runs = True, []
-            if wild:
                 return np.full(self.data.l, np.inf), np.zeros(self.data.l)
             for e, run in zip(around.experiments, runs):
                 begin = round((e.start - self.data.experiments[part.experiment].start) / self.data.dt)
@@ -131,11 +129,17 @@ class Blocks:
         return between_gaps(joined(self.data, [Part(part.experiment, first, first + length)]), 2).raw()
 
     def _diverges(self, model: Any, block: int) -> bool:
-        """Whether a model that follows the first third of a block leaves the range of the record in the rest of it."""
-        part = between_gaps(joined(self.data, self.parts[block]), 2).raw()
-        states = [model.initial_state(part.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
-                  for i, n in enumerate(e.n_samples for e in part.experiments)]
-        runs = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
+        """Whether a model that follows the first third of a block leaves the range of the record in the rest of it.
+
+        A state fitted to all of a run hides an unstable mode.
+        """
+        try:
+            part = between_gaps(joined(self.data, self.parts[block]), 2).raw()
+            states = [model.initial_state(part.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
+                      for i, n in enumerate(e.n_samples for e in part.experiments)]
+            runs = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
+        except OptidError:
+            return True
         return any(np.any(np.abs(run - e.y) > RUNAWAY * self.outputs[1]) for run, e in zip(runs, part.experiments))
 
     def fit(self, model: Any, horizon: int | None = None) -> float:
@@ -153,4 +157,3 @@ def pooled_fit(energy: Array, measure: Array) -> float:
     if not np.isfinite(energy).all():
         return -np.inf
     return float(100 * np.mean(1 - np.sqrt(energy.sum(axis=0) / np.maximum(measure.sum(axis=0), 1e-300))))
-
