@@ -466,3 +466,10 @@ def test_stability_far_inside_the_poles_of_a_record_ends_at_an_optimum():
         near[unknowns.slices["a"]] = a
         held = np.arange(unknowns.shared) < 3
         assert descend(criterion, near, held=held).value >= fit.solution.objective * (1 - 1e-4)
+
+
+def test_a_pole_that_the_record_does_not_need_leaves_a_flat_valley_and_an_optimum():
+    data = optid.examples.example("thruster").data
+    fit = optid.fit(data, "hammerstein_oe.exact", na=3, nb=3, basis="polynomial:3")
+    assert fit.solution.status is Status.LOCAL
+    assert fit.solution.objective == pytest.approx(6.69024876633, rel=1e-7)  # of 2,000 steps from every start

@@ -22,6 +22,8 @@ EXACT = 1e-24  # sum of squared errors, as a share of the energy of the record, 
 STEPS = 100
 
 CREEPING = 5  # steps over which progress is measured
+# relative gain of a full step, and relative fall over so many steps, below which a descent in a flat valley has arrived
+FLAT, CREPT = 1e-8, 1e-10
 # relative gain of a full step below which a start counts as arrived; only the best of them descends further
 COMPARED = 1e-6
 # damping, relative to the squared sensitivities, beneath which steps need more digits than a Gram matrix has
@@ -152,7 +154,8 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         if gain <= tolerance * at.value and not at.exact:
             at = criterion.linearise(x)
             gain = _gain(at.root[:, free], at)
-        if gain <= tolerance * at.value or at.value <= least:
+        creeps = gain <= FLAT * at.value and len(values) > CREEPING and values[-1 - CREEPING] - at.value <= CREPT * at.value
+        if creeps or gain <= tolerance * at.value or at.value <= least:
             return Descent(x, at, count, True, start=start)
         matrix, errors = at.whole if criterion.bends else (at.root, at.pull)
         scale = np.maximum(scale, np.linalg.norm(matrix[:, moving], axis=0))
