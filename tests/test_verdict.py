@@ -71,7 +71,7 @@ def test_a_wrong_delay_is_useless_whatever_is_proved():
 def test_what_is_wrong_with_a_structure_is_named(plant, formulation, arguments, steps):
     fit = optid.fit(optid.Data(*simulated(**plant)), formulation, **{"na": 2, "nb": 1, "nk": 1, **arguments})
     assert any(step.startswith(steps) for _, step in told(fit))
-    assert any(part.name in ("one step ahead, above that", "simulation fit") for part in fit.verdict.parts)
+    assert any(part.name in ("one-step minus simulation fit", "simulation fit") for part in fit.verdict.parts)
 
 
 def test_a_needless_function_is_named():

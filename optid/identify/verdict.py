@@ -87,12 +87,12 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     by_block = _by_block(raw, runs) if cross_validated is None else np.asarray(cross_validated)
     worst = float(np.min(by_block, initial=np.inf))
     if by_block.size:
-        parts.append(Finding("its worst block", f"{_points(worst)} (median {_points(float(np.median(by_block)))})",
+        parts.append(Finding("worst block", f"{_points(worst)} (median {_points(float(np.median(by_block)))})",
                              worst >= GOOD_BLOCK - (GOOD_FIT - POOR_FIT)))
     if pooled is not None:
-        parts.append(Finding("loss on blocks left out", _points(lost, " points"), lost <= OVERFIT))
+        parts.append(Finding("estimation minus cross-validated fit", _points(lost, " points"), lost <= OVERFIT))
     if np.isfinite(ahead) and np.isfinite(own):
-        parts.append(Finding("one step ahead, above that", _points(ahead - own, " points"), ahead - own <= GAP))
+        parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
     steady = bool(model.is_stable) or (has_feedback(model) and np.isfinite(own))
     parts += [_residuals(raw, predicted), *_delays(model, raw),
               Finding("stability", "stable" if steady else "unstable", steady),
@@ -129,7 +129,7 @@ def _delays(model: Any, data: Data) -> list[Finding]:
         return []
     late = [f"{name} acts after {k} samples" for name, k, first, b in zip(
         data.inputs, np.max(delays, axis=0), model.nk, model.b) if k >= first + len(b)]
-    return [Finding("delay", ", ".join(late) or "within the lags", not late)]
+    return [Finding("delay", ", ".join(late) or "covered by the lags", not late)]
 
 
 def _ranges(model: Any, data: Data) -> list[Finding]:

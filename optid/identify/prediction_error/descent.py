@@ -154,8 +154,9 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
         if gain <= tolerance * at.value and not at.exact:
             at = criterion.linearise(x)
             gain = _gain(at.root[:, free], at)
-        creeps = gain <= FLAT * at.value and len(values) > CREEPING and values[-1 - CREEPING] - at.value <= CREPT * at.value
-        if creeps or gain <= tolerance * at.value or at.value <= least:
+        fall = values[-1 - CREEPING] - at.value if len(values) > CREEPING else np.inf
+        crept = gain <= FLAT * at.value and fall <= CREPT * at.value
+        if crept or gain <= tolerance * at.value or at.value <= least:
             return Descent(x, at, count, True, start=start)
         matrix, errors = at.whole if criterion.bends else (at.root, at.pull)
         scale = np.maximum(scale, np.linalg.norm(matrix[:, moving], axis=0))
