@@ -191,7 +191,7 @@ def test_a_trial_is_given_up_early_and_says_why():
                  blocks, None, {}, (), None, FOREVER)
     assert good.complete and good.score > 95 and len(good.by_block) == 4 and good.parameters == 5
     poor = tried(Candidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, good, {}, (), None, FOREVER)
-    assert not poor.complete and "its rival fits blocks left out" in poor.reason and poor.score == -np.inf
+    assert not poor.complete and "below the cross-validated fit of the best" in poor.reason and poor.score == -np.inf
     late = tried(good.candidate, blocks, good, {}, (), None, time.monotonic() - 1)
     assert late.reason == "out of time"
     refused = tried(Candidate(LINEAR, "arx", {"na": 300, "nb": 300}), blocks, None, {}, (), None, FOREVER)

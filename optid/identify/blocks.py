@@ -1,7 +1,7 @@
 """Blocked cross-validation: contiguous blocks of a record, each left out of the fit once and simulated by it.
 
-Neighbouring samples are not independent, so that single samples left out would test nothing. What is left on both
-sides of a block are experiments of their own. What has been fitted to them runs freely through the block.
+Neighbouring samples are not independent, so that leaving out single samples would test nothing. The parts on both sides
+of a block become experiments of their own; the model fitted to them is simulated over the block.
 """
 
 from collections.abc import Iterable
@@ -16,15 +16,15 @@ from optid.data.record import Data
 from optid.data.stretches import between_gaps
 from optid.errors import DataError, OptidError, RankError
 
-SHORTEST = 10  # samples of a part of an experiment: shorter ones say more of their initial state than of the plant
-NEAR = 0.15  # a border of experiments this near to that of two blocks, as a share of their length, takes its place
-LEAD, LEAST = 0.33, 30  # share of a block that unstable models have to go on from; samples of that part at least
-RUNAWAY = 10.0  # a run diverges where it leaves so many times the range of the outputs
+SHORTEST = 10  # samples of a part of an experiment: the output of shorter ones is mostly that of the initial state
+NEAR = 0.15  # an experiment that ends this near to the border of two blocks, as a share of their length, moves it
+LEAD, LEAST = 0.33, 30  # share of a block that the initial state of unstable models is fitted to; samples at least
+RUNAWAY = 10.0  # a simulation diverges where its error exceeds so many times the range of the outputs
 WIDER = 2
-"""Times its own length that the free run of a block covers, if its experiment is so long, as records to validate on do.
+"""Length of the simulation around a block, as a multiple of that of the block, where the experiment is so long.
 
-A state fitted to the block alone follows slow disturbances as it cannot in a longer record, one fitted to its beginning
-has to foretell plants that integrate from less than any validation gives.
+An initial state fitted to the block alone absorbs slow disturbances, as it cannot on a longer validation record; one
+fitted to the beginning of the block is too inaccurate for plants that integrate.
 """
 
 
@@ -38,14 +38,14 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """A record cut into blocks, each made of parts of experiments."""
+    """A record divided into blocks, each made of parts of experiments."""
 
     data: Data
     parts: tuple[tuple[Part, ...], ...]
 
     @classmethod
     def of(cls, data: Data, count: int = 4) -> "Blocks":
-        """Cut a record into blocks of nearly equal length; one too short for that is a `RankError`."""
+        """Divide a record into blocks of nearly equal length; a `RankError` where it is too short."""
         check_integer(count, "blocks", 2)
         lengths = [e.n_samples for e in data.experiments]
         ends = np.cumsum(lengths)
@@ -68,7 +68,7 @@ class Blocks:
         return len(self.parts)
 
     def without(self, block: int) -> Data:
-        """Return the record without a block; what is left on its two sides are experiments of their own."""
+        """Return the record without a block; the parts on its two sides are experiments of their own."""
         kept = []
         for i, e in enumerate(self.data.experiments):
             cut = [x for part in self.parts[block] if part.experiment == i for x in part[1:]]
@@ -85,14 +85,14 @@ class Blocks:
     def errors(self, model: Any, block: int, horizon: int | None = None) -> tuple[Array, Array]:
         """Return the energy of the errors of a model on a block, and what it is measured by, by output: (l,), (l,).
 
-        The measure is the variance of the output in the whole record times the samples that were compared; the energy
-        is infinite where the model runs away, an unstable one also from a state fitted to a third of the block.
+        The measure is the variance of the output in the whole record times the number of compared samples. The energy
+        is infinite where the simulation diverges, of an unstable model also from a state fitted to a third of the block.
 
         Args:
             model: the model.
             block: number of the block.
-            horizon: samples ahead of the prediction; None for the free run. Its initial state is fitted to the block
-                and what surrounds it, `WIDER` in all.
+            horizon: prediction horizon in samples; None for simulation, with the initial state fitted to the block and
+                its surroundings, see `WIDER`.
         """
         variance, span = self.outputs
         if horizon is None and not model.is_stable and self._diverges(model, block):
@@ -101,9 +101,9 @@ class Blocks:
         for part in self.parts[block]:
             try:
                 around = self._around(part)
-            except DataError:  # no sample of it can be compared
+            except DataError:  # it has no sample to compare
                 continue
-            try:  # what runs away is told by its energy
+            try:  # divergence is an infinite energy
                 runs = as_list(model.simulate(around, x0="fit") if horizon is None else model.predict(around, horizon))
             except OptidError:
                 return np.full(self.data.l, np.inf), np.zeros(self.data.l)
@@ -122,16 +122,16 @@ class Blocks:
         return energy, variance * count
 
     def _around(self, part: Part) -> Data:
-        """Return a part and what surrounds it, cut where an input is missing: a simulation needs every one of them."""
+        """Return a part and its surroundings, split where an input is missing: a simulation needs all inputs."""
         samples = self.data.experiments[part.experiment].n_samples
         length = min(WIDER * (part.last - part.first), samples)
         first = min(max((part.first + part.last - length) // 2, 0), samples - length)
         return between_gaps(joined(self.data, [Part(part.experiment, first, first + length)]), 2).raw()
 
     def _diverges(self, model: Any, block: int) -> bool:
-        """Whether a model that follows the first third of a block leaves the range of the record in the rest of it.
+        """Whether a model with a state fitted to the first third of a block diverges in the rest of it.
 
-        A state fitted to all of a run hides an unstable mode.
+        A state fitted to the whole simulation hides an unstable mode.
         """
         try:
             part = between_gaps(joined(self.data, self.parts[block]), 2).raw()
@@ -143,7 +143,7 @@ class Blocks:
         return any(np.any(np.abs(run - e.y) > RUNAWAY * self.outputs[1]) for run, e in zip(runs, part.experiments))
 
     def fit(self, model: Any, horizon: int | None = None) -> float:
-        """Return the fit in % of one model over all blocks; minus infinity where it runs away in one."""
+        """Return the fit in % of one model over all blocks; minus infinity where it diverges in one."""
         return pooled_fit(*map(np.array, zip(*(self.errors(model, b, horizon) for b in range(len(self))))))
 
 

@@ -102,7 +102,7 @@ def facts_table(found: "Comparison") -> Table:
 
 
 def search_table(found: "Identification") -> Table:
-    """Return the best structure of every class, and the one behind it."""
+    """Return the best structure of every class, and its runner-up."""
     rows = []
     for kind in found.best:
         several = sorted((t for t in found.trials if t.candidate.kind == kind and np.isfinite(t.score)),
@@ -110,10 +110,10 @@ def search_table(found: "Identification") -> Table:
         best = found.best[kind]
         others = [t for t in several if t is not best][:1]
         rows += [_row(kind, best, best is found.chosen), *(_row("  runner-up", t, False) for t in others)]
-    what = "free run" if found.horizon is None else f"{found.horizon} samples ahead"
+    what = "simulation" if found.horizon is None else f"{found.horizon} samples ahead"
     spent = sum(t.seconds for t in found.trials)
-    return Table(f"Search over {len(found.trials)} structures ({what}, {found.blocks} blocks left out, "
-                 f"{seconds(spent)} of computing)", ("structure", "fit %", "worst block", "parameters"), rows)
+    return Table(f"Search over {len(found.trials)} structures ({what}, {found.blocks}-fold cross-validation, "
+                 f"{seconds(spent)} CPU)", ("structure", "cv fit %", "worst block", "parameters"), rows)
 
 
 def _row(word: str, trial: "Trial", chosen: bool) -> tuple[str, ...]:

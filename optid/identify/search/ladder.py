@@ -1,7 +1,7 @@
-"""The structures that a search tries, class after class, from the simple to the rich.
+"""The structures that a search tries, class by class, from the simple to the rich.
 
-Every rung is a generator: it yields candidates together that do not depend on each other, and is told what became of
-them, so that it grows orders only as long as that helps. Later rungs begin where earlier ones have been best.
+Every rung is a generator: it yields independent candidates together and receives their trials, so that it increases
+orders only as long as the fit improves. Later rungs start from the best structures of earlier ones.
 """
 
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -22,27 +22,27 @@ Rung = Generator[list[Candidate], list[Trial], None]
 
 LINEAR, INPUTS, FEEDBACK, LATENT = KINDS = ("linear", "input functions", "feedback", "latent signals")
 """Classes of models, each richer than those before."""
-PATIENCE = 2  # orders in a row that may fail to improve before a ladder ends
+PATIENCE = 2  # successive orders without improvement after which a rung ends
 LARGEST = 10  # largest number of states
-FEW_LEVELS = 5  # levels of an input up to which nothing shows between them how a function would go on
+FEW_LEVELS = 5  # levels of an input up to which a static function is not identifiable between them
 CLEAR = 0.2  # median over the blocks of the log ratio of error energies that a richer class must save
-BEHIND = 3.0  # points of cross-validated fit behind the choice so far, from which on a class is given up
-PATIENT = 12.0  # the same where the class leaves much less of the record itself
-PROMISING = 0.7  # what much less is: the share of the error on the record that it leaves
+BEHIND = 3.0  # points of cross-validated fit below the choice so far, beyond which a class is dropped
+PATIENT = 12.0  # the same where the class fits the estimation data much better
+PROMISING = 0.7  # how much better: the ratio of the errors on the estimation data
 EQUAL = 0.02
-"""Share of the error by which structures of a class may differ and still be as good: the smaller one is taken."""
+"""Relative difference of errors within which structures of a class count as equal: the smaller one is chosen."""
 FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
 
 
 @dataclass
 class Ladder:
-    """What is known of the record, and what has been found so far.
+    """The record, its delays, and all trials so far.
 
     Attributes:
         data: the record.
-        delays: of the inputs, as they are tried together; all zero first.
+        delays: combinations of delays of the inputs; all zero first.
         regressions: orders (na, nb, nk) of the best autoregressions.
-        trials: what has been tried.
+        trials: all trials so far, by key.
     """
 
     data: Data
@@ -57,7 +57,7 @@ class Ladder:
         sums = LagSums(blocks, linear(data))
         found = [(0,) * data.m, sharp_delays(sums)]
         if not few_levels(data):
-            try:  # what acts through an even function shows in no linear model
+            try:  # an even function has no effect in a linear model
                 found.append(sharp_delays(LagSums(blocks, fitted_bases(data, "polynomial:3"), na=4, lags=12)))
             except OptidError:
                 pass
@@ -79,7 +79,7 @@ class Ladder:
                    default=None)
 
     def choice(self) -> Trial | None:
-        """Return what is chosen so far: a richer class has to win clearly."""
+        """Return the choice so far: a richer class must be clearly better."""
         chosen = None
         for best in filter(None, map(self.best, KINDS)):
             if chosen is None or (best.score > chosen.score and gain(chosen, best) > CLEAR):
@@ -87,12 +87,12 @@ class Ladder:
         return chosen
 
     def rival(self, kind: str) -> Trial | None:
-        """Return what a candidate of a class has to beat; linear models are compared among themselves."""
+        """Return the trial to beat for a class; linear models are compared among themselves."""
         found = [self.best(kind), None if kind == LINEAR else self.choice()]
         return max(filter(None, found), key=lambda t: t.score, default=None)
 
     def hopeless(self, kind: str) -> bool:
-        """Whether what has been tried of a class is so far behind that finer choices will not help."""
+        """Whether a class is so far behind the choice that refinements will not help."""
         best, chosen = self.best(kind), self.choice()
         if best is None or chosen is None:
             return best is None
@@ -105,7 +105,7 @@ class Ladder:
         return {} if best is None else best.candidate.arguments
 
     def order(self) -> int:
-        """Return the number of states that has been best in a linear model."""
+        """Return the number of states of the best linear model."""
         return int(self.arguments(LINEAR, "ss.exact", "hammerstein_ss.sid").get("nx", 2))
 
 
@@ -126,7 +126,7 @@ def bases(data: Data, word: str) -> Any:
 
 
 def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
-    """Try one batch after another until two in a row improve nothing."""
+    """Try one batch after another until two in a row bring no improvement."""
     best, failed = -np.inf, 0
     for batch in candidates:
         found = yield batch
@@ -138,7 +138,7 @@ def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
 
 
 def linear_models(ladder: Ladder) -> Rung:
-    """Autoregressions, subspace models of 1, 2, ... states, output-error models, and what refines the best of them."""
+    """Autoregressions, subspace models of 1, 2, ... states, output-error models, and refinements of the best."""
     model = partial(structure, LINEAR)
     yield [model("arx", na=na, nb=nb, nk=list(nk)) for na, nb, nk in ladder.regressions]
     if ladder.single:
@@ -184,7 +184,7 @@ def input_functions(ladder: Ladder) -> Rung:
 
 
 def feedback(ladder: Ladder) -> Rung:
-    """Static functions of the outputs that are fed back, with or without functions of the inputs."""
+    """Static feedback functions of the outputs, with or without functions of the inputs."""
     model = partial(structure, FEEDBACK, "hammerstein_ss.exact")
     best, plain = ladder.best(INPUTS), ladder.best(LINEAR)
     helped = best is not None and (plain is None or best.score > plain.score)
@@ -201,7 +201,7 @@ def feedback(ladder: Ladder) -> Rung:
 
 
 def latent_signals(ladder: Ladder) -> Rung:
-    """Static functions of signals inside, which are combinations of states and inputs."""
+    """Static functions of latent signals, which are combinations of states and inputs."""
     def model(n: int, channels: int, basis: str, direct: bool) -> Candidate:
         return structure(LATENT, "lfr.exact", nx=n, channels=channels, latent_basis=basis, direct=direct)
 

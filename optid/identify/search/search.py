@@ -1,4 +1,4 @@
-"""From a record to a model: structures of every class on trial, the choice among them, and its reasons."""
+"""From a record to a model: structures of every class are compared by cross-validation, and the choice is explained."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -58,7 +58,7 @@ class Identification(Rendered):
 
     @cached_property
     def verdict(self) -> Verdict:
-        """What the model is worth on the record, from the blocks left out."""
+        """The quality of the model on the record, by cross-validation."""
         assert isinstance(self.fit.data, Data)
         return verdict(self.model, self.fit.data, self.chosen.by_block.tolist(), self.chosen.score)
 
@@ -69,10 +69,10 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
              progress: Callable[[str], None] | None = None) -> Identification:
     """Find a structure for a record by blocked cross-validation, and fit it to the whole record.
 
-    Every structure is fitted to the record without one block after another, and runs freely through the block that was
-    left out; its initial state is fitted to the block and as much again around it. Classes of models follow each other
+    Every structure is fitted to the record without one block at a time and simulated over the block left out; the
+    initial state is estimated from the block and as many samples around it. Classes of models are tried
     from the simple to the rich; a richer one is chosen only where the pooled fit improves and the median over the
-    blocks of the log ratio of error energies exceeds 0.2. A model whose run leaves the range of the record in a block
+    blocks of the log ratio of error energies exceeds 0.2. A model whose simulation diverges in a block
     is never chosen. An interrupt (Ctrl-C) ends the search with the best so far.
 
     Args:
@@ -81,17 +81,17 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         horizon: compare predictions so many samples ahead; None compares free runs.
         blocks: number of contiguous blocks.
         classes: of "linear", "input functions", "feedback", "latent signals", those to be tried.
-        constraints: as of `optid.fit`; what cannot obey them is not chosen.
-        solver: the back end's word, for every programme.
-        accuracy: as of `optid.fit`.
-        workers: processes; None for one per processor that is free to use.
-        progress: is told a sentence after every trial; by default the log "optid", and a bar on a terminal.
+        constraints: as in `optid.fit`; every candidate satisfies them.
+        solver: name of the back end, for every programme.
+        accuracy: as in `optid.fit`.
+        workers: number of processes; None for one per available processor.
+        progress: called with a sentence after every trial; default the log "optid" and a progress bar on a terminal.
 
     Raises:
-        DataError: not a record in memory.
-        RankError: a record too short for the blocks.
-        StructureError: arguments that cannot be.
-        SolverFailed: nothing could be fitted; with the most frequent reason.
+        DataError: the record is not in memory.
+        RankError: the record is too short for the blocks.
+        StructureError: invalid arguments.
+        SolverFailed: no structure could be fitted; with the most frequent reason.
     """
     clock = time.monotonic()
     if not isinstance(data, Data):
@@ -102,8 +102,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         one_of("classes", word, KINDS)
     possible = [kind for kind in KINDS if kind in classes and (kind == LINEAR or not few_levels(data))]
     if not possible:
-        raise StructureError("no input has more than five levels: only linear models can be told apart, add 'linear' "
-                             "to the classes")
+        raise StructureError("no input has more than five levels: only linear models can be distinguished, add "
+                             "'linear' to the classes")
     if horizon is not None:
         check_integer(horizon, "horizon")
     rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
@@ -131,8 +131,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
     why = reasons(ladder, best)
     if len(possible) < len(classes):
-        why.append("no input has more than five levels: functions cannot be told from straight lines between them, and "
-                   "only linear models were tried")
+        why.append("no input has more than five levels: static functions cannot be distinguished from straight lines, "
+                   "and only linear models were tried")
     return Identification(found, chosen, best, tuple(ladder.trials.values()), tuple(why), horizon, blocks,
                           stopped, time.monotonic() - clock)
 
@@ -169,7 +169,7 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: 
 
 
 def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
-    """Say of every class why it was taken or left."""
+    """Say of every class why it was selected or not."""
     found: list[str] = []
     current: Trial | None = None
     for kind, trial in best.items():
@@ -179,14 +179,14 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
             continue
         saved = gain(current, trial)
         sentence = f"{kind}: {trial.score:.1f} % against {current.score:.1f} %"
-        median = f"saves {100 * (1 - np.exp(-saved)):.0f} % of the error energy in the median block"
+        median = f"{100 * (1 - np.exp(-saved)):.0f} % less error energy in the median block"
         if trial.score > current.score and saved > CLEAR:
-            found.append(f"{sentence}, and {median}: taken")
+            found.append(f"{sentence}, with {median}: selected")
             current = trial
         elif trial.score > current.score:
-            found.append(f"{sentence}, but {median}, less than {100 * (1 - np.exp(-CLEAR)):.0f} %: left")
+            found.append(f"{sentence}, but {median}, less than {100 * (1 - np.exp(-CLEAR)):.0f} %: not selected")
         else:
-            found.append(f"{sentence}: left")
+            found.append(f"{sentence}: not selected")
     for kind in KINDS:
         several = [t for t in ladder.trials.values() if t.candidate.kind == kind]
         if kind not in best and several:

@@ -1,4 +1,4 @@
-"""One structure on trial: fitted to the whole record, then to the record without every block, and judged there."""
+"""The trial of one structure: a fit to the whole record, and cross-validation over the blocks."""
 
 import time
 import warnings
@@ -15,9 +15,9 @@ from optid.identify.fitting import fit
 from optid.models.functions import free_parameters
 
 WORSE = 1.3
-"""A structure is given up when its errors on the first half of the blocks have so many times the energy of the best."""
-STARTS = 3  # starts of output-error models on trial
-STEPS = 30  # steps of the descents of state-space models on trial
+"""Ratio of its error energy on the first half of the blocks to that of the best, above which a structure is dropped."""
+STARTS = 3  # starts of output-error models in a trial
+STEPS = 30  # iterations of state-space models in a trial
 
 Key = tuple[str, tuple[tuple[str, Any], ...]]
 
@@ -32,12 +32,12 @@ class Candidate:
 
     @property
     def key(self) -> Key:
-        """What tells it from others."""
+        """Its identity."""
         return self.formulation, tuple(sorted((name, str(value)) for name, value in self.arguments.items()))
 
     @property
     def words(self) -> str:
-        """The arguments as one writes them on the command line."""
+        """The arguments as command-line options."""
         texts = {name: " ".join(map(str, value)) if isinstance(value, list | tuple) else value
                  for name, value in self.arguments.items()}
         return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in texts.items())
@@ -45,7 +45,7 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What became of a candidate.
+    """The outcome of a candidate.
 
     Attributes:
         estimation: fit in % over the same blocks of the model of the whole record.
@@ -54,7 +54,7 @@ class Trial:
         parameters: number of parameters of the model.
         seconds: CPU time.
         status: of the solver on the whole record, or "refused".
-        reason: why it was given up, "" where it was tried on every block.
+        reason: why it was dropped, "" where it was tried on every block.
     """
 
     candidate: Candidate
@@ -69,14 +69,14 @@ class Trial:
 
     @property
     def complete(self) -> bool:
-        """Whether it was tried on every block, and its runs stayed finite."""
+        """Whether it was tried on every block without diverging."""
         return not self.reason
 
     @property
     def score(self) -> float:
-        """Cross-validated fit in %, pooled over the blocks; minus infinity where it was given up.
+        """Cross-validated fit in %, pooled over the blocks; minus infinity where it was dropped.
 
-        A model that fits its own record less than its like do blocks they have not seen got stuck, and that counts.
+        It is at most the fit of the estimation data, which a poor local optimum of the whole record lowers.
         """
         if not self.complete or not len(self.energy):
             return -np.inf
@@ -96,7 +96,7 @@ class Trial:
 
 def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
           constraints: Sequence[Any], horizon: int | None, deadline: float) -> Trial:
-    """Fit a candidate, leave out block after block, and stop early where it cannot beat its rival.
+    """Fit a candidate, cross-validate it block by block, and stop early where it cannot beat its rival.
 
     The settings are solver and accuracy, the horizon is as in `Blocks.errors`, the deadline by `time.monotonic`; where
     there is no rival, it takes the time it needs.
@@ -127,7 +127,7 @@ def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Tr
     known = replace(known, status=whole.solution.status.value, parameters=free_parameters(whole.model),
                     estimation=blocks.fit(whole.model, horizon))
     if rival is not None and known.estimation < rival.score:
-        yield replace(known, reason="fits the record itself less than its rival fits blocks left out")
+        yield replace(known, reason="its fit of the estimation data is below the cross-validated fit of the best")
     order: tuple[int, ...] = (*range(0, len(blocks), 2), *range(1, len(blocks), 2))  # every other one first
     known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
     for done, b in enumerate(order, start=1):
@@ -137,11 +137,11 @@ def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Tr
         known = replace(known, energy=np.vstack([known.energy, energy]), measure=np.vstack([known.measure, measure]),
                         order=order[:done])
         if not np.isfinite(energy).all():
-            yield replace(known, reason=f"its run diverges in block {b + 1}")
+            yield replace(known, reason=f"its simulation diverges in block {b + 1}")
         if rival is not None and 2 * done == len(order):
             places = [rival.order.index(one) for one in known.order]
             if _loss(known.energy, known.measure) > WORSE * _loss(rival.energy[places], rival.measure[places]):
-                yield replace(known, reason="falls behind its rival on the first half of the blocks")
+                yield replace(known, reason="worse than the best on the first half of the blocks")
     yield known
 
 
@@ -150,7 +150,7 @@ def _loss(energy: Array, measure: Array) -> float:
 
 
 def spared(candidate: Candidate) -> dict[str, Any]:
-    """Return the arguments that make a trial quicker than the fit of the structure that is chosen."""
+    """Return the arguments that make a trial faster than the final fit."""
     if candidate.formulation.endswith("oe.exact"):
         return {"starts": STARTS}
     if candidate.formulation in ("ss.exact", "hammerstein_ss.exact", "lfr.exact"):
