@@ -86,7 +86,8 @@ class Blocks:
         """Return the energy of the errors of a model on a block, and what it is measured by, by output: (l,), (l,).
 
         The measure is the variance of the output in the whole record times the number of compared samples. The energy
-        is infinite where the simulation diverges, of an unstable model also from a state fitted to a third of the block.
+        is infinite where the simulation diverges; that of an unstable model is also judged from a state fitted to a
+        third of the block.
 
         Args:
             model: the model.
