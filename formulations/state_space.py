@@ -12,7 +12,8 @@ and at the optimum z0, or under constraints, convex programmes in the tangent of
     minimise ‖r‖² + remainder    subject to    r = R (z - z0) + e0,  the user's constraints,
 
 where R (z - z0) + e0 are the errors to first order in the unknowns z, compressed; directions of z that change no output
-are part of R. Constraints on poles are kept by every iterate through the length of the steps.
+are part of R. Constraints on poles are matrix inequalities in A, with P held at that of the iterate: an inner region
+that touches the true one there. Every iterate keeps them.
 
 Named variables: ``A``, ``C``, ``offset``, ``x0`` ((n,), or (n, experiments)), ``K`` with "prediction", per input ``mu``
 (not of a linear channel) and ``b`` (= [B_i; D_i]), per output fed back ``mu feedback`` and ``b feedback``, per latent
@@ -45,6 +46,7 @@ from optid.identify.prediction_error.state_search import complete, entered, quie
 from optid.identify.prediction_error.tangent_fit import TangentFit, refine
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.models import HammersteinSS
+from optid.models.roots import modal_weight
 from optid.program.expressions import tangent_product
 from optid.program.program import Program, Values
 from optid.program.units import energy_unit, inverse, outer_bases
@@ -148,7 +150,9 @@ class StateSpaceFit(TangentFit):
         functions = {f"mu latent[{z}]": one.vectors @ variables[self.criterion.key("c", i)]
                      for i, (z, one) in enumerate(latent.items()) if one.row is None}
         bases = dict(zip(expansion.input_names, outer_bases(expansion.inputs, units)))
-        view = View({**variables, **self._products(variables, values), **functions}, iterate=True, gauge="norm",
+        weight = modal_weight(values["A"])
+        view = View({**variables, "P": cp.Constant(weight), "Q": variables["A"] @ weight, **functions,
+                     **self._products(variables, values)}, iterate=True, gauge="norm",
                     channels=expansion.input_names, outputs=expansion.output_names, reference=values, units=units,
                     bases=bases | {z: one.basis for z, one in latent.items()},
                     spans={z: one.vectors for z, one in latent.items()})
@@ -208,16 +212,16 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
     instruments = "inputs+past" if feedback_basis is None else "simulated"
     if feedback_basis is not None and criterion == "prediction":
         instruments = "simulated+past"
-    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(offset),
-                   instruments=instruments, feedthrough=feedthrough, stability="free",
-                   iterations=2 * (feedback_basis is not None))
-    models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
-    found = {f"start {i}": model.with_transform(inverse(plan.units)) for i, model in enumerate(models, start=1)}
     poles = tuple(rule for rule in constraints if getattr(rule, "about", frozenset()) == frozenset({"poles"}))
     for rule in poles:
         if getattr(rule, "verify", None) is None:
             raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
                                  "use it with hammerstein_ss.asivid")
+    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(offset),
+                   instruments=instruments, feedthrough=feedthrough, stability="free",
+                   iterations=2 * (feedback_basis is not None), constraints=poles)
+    models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
+    found = {f"start {i}": model.with_transform(inverse(plan.units)) for i, model in enumerate(models, start=1)}
 
     def run() -> Procedure:
         # what functions of latent signals are added to needs no more than a first part of a long record
@@ -229,8 +233,7 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
         if extend is not None:
             errors, best, more = extend(replace(errors, data=with_whole_inputs(plan.data, 2 * nx + 1)), best)
             figures = {**figures, **more}
-        others = tuple(rule for rule in constraints if rule not in poles)
-        evidence = yield from (finish or _refined)(plan, errors, others, best, {"order": nx, **figures})
+        evidence = yield from (finish or _refined)(plan, errors, tuple(constraints), best, {"order": nx, **figures})
         return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
 
     return in_record_units(run(), plan)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 from refusals import refuses
+from scipy.signal import lfilter
 from state_systems import by_hand
 from state_systems import linear as linear_system
 
@@ -24,6 +25,7 @@ from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_search import entered
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.kalman import kalman_gain
+from optid.program.solution import Status
 from optid.statistics.expansion import expand
 from optid.statistics.linearised import linearised
 from optid.statistics.state_unknowns import Latent, StateUnknowns, beyond_affine
@@ -231,6 +233,39 @@ def test_poles_obey_their_constraint_at_every_step():
     assert fit.solution.objective > 0
     with pytest.raises(StructureError, match="cannot judge a model"):
         optid.fit(data, linear, nx=2, constraints=[Rule("somewhere", lambda v: [], None, frozenset({"poles"}))])
+
+
+@pytest.mark.parametrize("rule", ["stable:0.7", "disc:0.3,0.45"])
+def test_the_optimum_at_the_border_of_a_region_is_that_of_the_transfer_function(rule):
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, 400)
+    y = lfilter([0.0, 0.5, 0.2], [1.0, -0.78, 0.68], u) + 0.05 * rng.normal(size=400)
+    fit = optid.fit(Data(u, y), linear, nx=2, constraints=[rule])
+    assert fit.solution.status is Status.LOCAL and fit.prices[0].active
+    polynomial = optid.fit(Data(u, y), "oe.exact", na=2, nb=3, constraints=[rule])
+    assert fit.model.poles == pytest.approx(polynomial.model.poles, abs=1e-3)
+    assert y.var() * fit.solution.objective == pytest.approx(polynomial.solution.objective, rel=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+@pytest.mark.parametrize(("rule", "obeys"), [
+    ("strip:0.4,0.6", lambda z: 0.4 <= z.real <= 0.6), ("sector:0.7", lambda z: abs(np.angle(z)) <= 0.7)])
+def test_regions_of_poles_hold_and_no_model_nearby_in_them_is_better(rule, obeys):
+    rng = np.random.default_rng(1)
+    u = rng.uniform(-1, 1, 300)
+    y = lfilter([0.0, 0.5, 0.2], [1.0, -0.6, 0.72], u) + 0.05 * rng.normal(size=300)
+    fit = optid.fit(Data(u, y), linear, nx=2, constraints=[rule])
+    assert fit.solution.status is Status.LOCAL and all(obeys(z) for z in fit.model.poles)
+    errors = []
+    for _ in range(200):
+        pole = fit.model.poles[0] + 0.02 * (rng.normal() + 1j * rng.normal())
+        if obeys(pole):
+            a = np.real(np.poly([pole, np.conj(pole)]))
+            rows = [lfilter(np.eye(3)[i], a, u) for i in range(3)]
+            rows += [lfilter(np.eye(2)[i], a, np.eye(300)[0]) for i in range(2)] + [np.ones(300)]
+            rest = y - np.transpose(rows) @ np.linalg.lstsq(np.transpose(rows), y)[0]
+            errors.append(rest @ rest)
+    assert len(errors) > 20 and y.var() * fit.solution.objective <= min(errors) * (1 + 1e-6)
 
 
 def test_shape_constraints_hold_for_every_input():

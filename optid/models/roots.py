@@ -6,6 +6,8 @@ import numpy as np
 
 from optid.arrays import Array
 
+DEFINITE = 1e-9  # share of the identity in a modal weight
+
 
 def roots_of(coefficients: Array) -> Any:
     """Roots of 1 + c_1 q^-1 + .., complex."""
@@ -20,6 +22,16 @@ def radius(coefficients: Array) -> float:
 def spectral_radius(matrix: Array) -> float:
     """Largest modulus of the eigenvalues of a matrix; zero without rows."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
+def modal_weight(matrix: Array) -> Array:
+    """Return ``P = T T*`` (n, n) of the eigenvectors T of A, which stays definite where T is singular.
+
+    T takes A to a normal matrix, so ``L kron P + M kron (A P) + M' kron (A P)' >= 0`` holds, up to rounding, for every
+    region {L + z M + conj(z) M' >= 0} that contains the eigenvalues of A.
+    """
+    vectors = np.linalg.eig(matrix)[1]
+    return np.real(vectors @ vectors.conj().T) + DEFINITE * np.eye(len(matrix))
 
 
 def largest_first(roots: Any) -> Any:

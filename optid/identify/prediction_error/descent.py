@@ -50,7 +50,6 @@ class Criterion(ABC):
     unit: float = 1.0  # what one unit of the sum of squares is in units of the record
     # whether the errors are nonlinear in the initial states, so that steps of these are damped, too
     bends: bool = False
-    border: str = BORDER  # why a descent ends where every better point is inadmissible
 
     @property
     def errors(self) -> str:
@@ -185,7 +184,7 @@ def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterat
             # at this size of the gain rounding decides whether a step descends
             settled = gain <= 1e3 * tolerance * at.value or at.value <= 1e4 * least
             # what a descent creeps along without arriving is the border of the admissible set, also between refusals
-            reason = criterion.border if blocked and not settled else "no step descends"
+            reason = BORDER if blocked and not settled else "no step descends"
             return Descent(x, at, count, settled, reason, start, not settled)
     return Descent(x, at, iterations, False, f"{iterations} steps did not suffice", start)
 

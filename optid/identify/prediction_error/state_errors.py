@@ -63,13 +63,6 @@ class StateErrors(Criterion):
         """Whether outputs or latent signals of a run act on its states."""
         return self.limits is not None
 
-    @property
-    def border(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Why a descent ends where every better point is inadmissible."""
-        return super().border if not self.checks else (
-            "the errors still fall towards poles that the constraints exclude; better models along the border of the "
-            "region are not ruled out")
-
     @cached_property
     def limits(self) -> tuple[Any, ...] | None:
         """Ranges that runs must not leave, where outputs act on states, or latent signals do."""
