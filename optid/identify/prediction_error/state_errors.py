@@ -85,8 +85,8 @@ class StateErrors(Criterion):
 
         A missing output has a row of zeros.
         """
-        unknowns, point = self.unknowns, self.unknowns.unpack(x)
-        model, covariance = self.at(point), np.linalg.inv(self.weight)
+        unknowns, covariance = self.unknowns, np.linalg.inv(self.weight)
+        point, model = self._placed(x)
         chunk = max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
 
         def rows(index: int) -> Iterator[tuple[Array, int]]:
@@ -131,8 +131,7 @@ class StateErrors(Criterion):
 
     def residuals(self, x: Array) -> list[Array]:
         """Return the errors (N, l) of every experiment, NaN where y is missing; a run out of range: `DataError`."""
-        point = self.unknowns.unpack(x)
-        model = self.at(point)
+        point, model = self._placed(x)
         return [simulation.run(self._job(model, i), point.x0[i]) - e.y for i, e in enumerate(self.data.experiments)]
 
     def visited(self, point: StatePoint) -> list[Array]:
@@ -161,6 +160,19 @@ class StateErrors(Criterion):
     def level(self, x: Array, full: bool = False) -> float:
         """Return the logarithm of what `reweighted` lowers, by which points of different weights are compared."""
         return -float(np.linalg.slogdet(self.reweighted(x, full).weight)[1])
+
+    def _placed(self, x: Array) -> tuple[StatePoint, HammersteinSS]:
+        """Return the point and the model at x; the last ones are kept, since every step asks twice."""
+        key = x.tobytes()
+        if key not in self._last:
+            self._last.clear()
+            point = self.unknowns.unpack(x)
+            self._last[key] = point, self.at(point)
+        return self._last[key]
+
+    @cached_property
+    def _last(self) -> dict[bytes, tuple[StatePoint, HammersteinSS]]:
+        return {}
 
     def at(self, point: StatePoint) -> HammersteinSS:
         """Build the model of a point."""
