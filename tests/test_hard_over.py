@@ -11,8 +11,15 @@ from scipy.stats import chi2
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.faults import Fault, hard_over_test, inject
-from optid.faults.rank.hard_over import HardOver, WindowVerdict
-from optid.faults.rank.window_tests import MARGIN, ZeroTest, coefficients, least_order, zero_test
+from optid.faults.rank.hard_over import (
+    MARGIN,
+    HardOver,
+    WindowVerdict,
+    ZeroTest,
+    coefficients,
+    least_order,
+    zero_test,
+)
 from optid.identify.order.ranks import rank_test
 from optid.plants import two_mode_plant
 from optid.statistics.hankel import hankel_statistics
@@ -110,9 +117,10 @@ def test_a_healthy_record_gives_no_alarm():
 def test_stuck_channels_count_as_dead(fault):
     u = np.random.default_rng(3).normal(size=(N, 2))
     data = Data(u, inject(two_mode_plant(True, 0.1), u, fault, seed=5))
-    found = hard_over_test(data, HEALTHY[True, 0.1], window=N)
-    assert found.candidates == (fault.name,)
-    assert found.windows[0].rows[1].flat == (fault.name == "sensor:y2")
+    for instruments in ("inputs", "inputs+past"):  # a constant output is no instrument
+        found = hard_over_test(data, HEALTHY[True, 0.1], window=N, instruments=instruments)
+        assert found.candidates == (fault.name,)
+        assert found.windows[0].rows[1].flat == (fault.name == "sensor:y2")
 
 
 def test_a_flat_sensor_hides_only_the_actuators_that_it_alone_shows():
@@ -214,12 +222,12 @@ def test_statistic_against_a_dense_regression():
     at = statistics.at
     others = np.r_[0, at([1], range(alpha + 1)), at([2, 3], range(alpha))]
     tests = at([0], range(alpha + 1)), others, at([2, 3], [alpha])
-    found, theta = zero_test(statistics, *tests, rows=2 * alpha, level=0.01)
+    found = zero_test(statistics, *tests, rows=2 * alpha, level=0.01)
     windows = windows_of(np.hstack([data.u, data.y]), 3 * alpha).reshape(len(data.u) - 3 * alpha + 1, -1)
     dense = np.hstack([np.ones((len(windows), 1)), windows])
     t, o, y = (dense[:, part] for part in tests)
     coefficients = np.linalg.lstsq(np.hstack([o, t]), y, rcond=None)[0]
-    assert theta == pytest.approx(coefficients[o.shape[1] :], rel=1e-6, abs=1e-9)
+    assert found.coefficients == pytest.approx(coefficients[o.shape[1] :], rel=1e-6, abs=1e-9)
     e = y - np.hstack([o, t]) @ coefficients
     left = t - o @ np.linalg.lstsq(o, t, rcond=None)[0]
     j = len(e)
@@ -334,7 +342,7 @@ def test_bad_input_is_refused_by_name():
             dict(instruments="past"), dict(block_rows=1), dict(level=0.0), dict(window=100), dict(hop=0))),
         (RankError, "No experiment has the 5000 samples", data, healthy, dict(window=5000)),
         (DataError, "must be the same", Data(data.u, data.y, outputs=("a", "b")), healthy, {}),
-        (RankError, "u2 does not move", data, Data(still, healthy.y), {}),
+        (RankError, "u2 is constant", data, Data(still, healthy.y), {}),
         (RankError, "do not excite", data, Data(sines, healthy.y), {}),
     ):
         with pytest.raises(error, match=words):
