@@ -1,4 +1,4 @@
-"""Covariances of a window by lag, and what more noise at a place adds to them."""
+"""Covariances of a window by lag, and their signatures of added noise."""
 
 from dataclasses import dataclass
 
@@ -13,31 +13,18 @@ from optid.faults.whitening import Predictor, Whitened, check_window
 
 @dataclass(frozen=True, eq=False)
 class CovarianceProblem:
-    """Lagged covariances of a window less those of a healthy plant, in units of their standard deviations.
+    """Lagged covariances of a window less those of a healthy plant, in units of their standard deviations."""
 
-    Attributes:
-        labels: the C places.
-        target: (M,).
-        signatures: (M, C) what unit variances add.
-        by_process: (M, n n) what the entries of the covariance of added process noise add, column by column.
-        by_sensor: (M, l l) the same for sensor noise.
-        nx: number of states n.
-        l: number of outputs.
-        state_units: (n,) variances of the process noise of the model, the units of Q.
-        output_units: (l,) variances of its sensor noise.
-        lags: largest lag.
-    """
-
-    labels: tuple[str, ...]
-    target: Array
-    signatures: Array
-    by_process: Array
-    by_sensor: Array
-    nx: int
-    l: int  # noqa: E741
-    state_units: Array
-    output_units: Array
-    lags: int
+    labels: tuple[str, ...]  # the C places
+    target: Array  # (M,)
+    signatures: Array  # (M, C) for unit variances
+    by_process: Array  # (M, n n) for the entries of the covariance of added process noise, column by column
+    by_sensor: Array  # (M, l l) the same for sensor noise
+    nx: int  # number of states n
+    l: int  # noqa: E741 - number of outputs
+    state_units: Array  # (n,) variances of the process noise of the model, the units of Q
+    output_units: Array  # (l,) variances of its sensor noise
+    lags: int  # largest lag
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +41,7 @@ class CovarianceMatch:
         gap: relative duality gap.
         certified: whether it is proved optimal.
         lags: largest lag.
-        status: why not, where it is not certified.
+        status: the reason where it is not certified.
     """
 
     labels: tuple[str, ...]
@@ -70,13 +57,9 @@ class CovarianceMatch:
 
     @property
     def best(self) -> str:
-        """The place that explains most.
-
-        Raises:
-            StructureError: full covariances name no place.
-        """
+        """The place with the largest gain; `StructureError` with full covariances, which have no places."""
         if np.isnan(self.gains).all():
-            raise StructureError("Full covariances name no place: match the candidates (form='places').")
+            raise StructureError("Full covariances have no place: match the candidates (form='places').")
         return self.labels[int(np.nanargmax(self.gains))]
 
     def __str__(self) -> str:
@@ -113,10 +96,10 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
     if lags is None:
         lags = min(whitened.predictor.settling, max(1, used // 10))
     if lags != int(lags) or not 0 <= lags < used:
-        raise StructureError(f"lags={lags!r}; a whole number from 0 to {used - 1} is needed.")
+        raise StructureError(f"lags={lags!r} must be an integer from 0 to {used - 1}.")
     places = noise_places(found)
     if not places:
-        raise StructureError("The dictionary has no place where noise may grow.")
+        raise StructureError("The dictionary has no place where noise may increase.")
     r, complete = whitened.r[onset:], np.asarray(whitened.present[onset:].all(axis=1))
     target, weights = [], []
     upper = np.triu_indices(l)
@@ -144,7 +127,7 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
 
 
 def _entries(steady: Predictor, into_state: Array, into_output: Array, lags: int) -> Array:
-    """What the entries of a covariance (d, d) of white noise at a place add to the covariances, (M, d d)."""
+    """Signatures (M, d d) of the entries of the covariance (d, d) of white noise at a place."""
     n, d = into_state.shape
     l, length = len(into_output), lags + 2 * steady.settling + 2  # noqa: E741
     state, output = np.zeros((length, n, d)), np.zeros((length, l, d))

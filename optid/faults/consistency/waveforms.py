@@ -1,8 +1,8 @@
-"""Can a fault of any course at one place explain the window? The test that keeps its promise whatever the course (F7).
+"""Test for a fault of any course at one place, with a known probability of rejecting the true place (F7).
 
-The signatures of impulses at all samples of a window span what an arbitrary waveform at a place can leave. What is left
-of the window after projecting on that space is chi-square distributed if the fault is at that place, whatever its
-course was. All places that pass are the consistent set. The response to an unknown initial state is projected out, too.
+The signatures of impulses at all samples of a window span the signatures of all waveforms at a place. The residual of
+the window after projection on that space is chi-square distributed if the fault is at that place, whatever its course.
+All places that pass are the consistent set. The response to an unknown initial state is projected out, too.
 """
 
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
 
 RANK = 1e-10
-"""Singular values below this share of the largest are none."""
+"""Singular values below this share of the largest count as zero."""
 
 FULL = 1e-7
 """Ratio of the diagonal of a triangular factor above which no singular value is anywhere near `RANK`."""
@@ -34,11 +34,11 @@ class Consistency(NamedTuple):
     Attributes:
         name: of the place, as in `Fault`.
         labels: of the candidates there.
-        energy: what is left of the window, chi-square distributed with `freedom` if the fault is there.
+        energy: of the residual, chi-square distributed with `freedom` if the fault is there.
         freedom: degrees of freedom.
         limit: the quantile.
         p_value: probability of more than this energy if the fault is there.
-        course: (N, d) the waveform that explains most; NaN in samples that no reading sees.
+        course: (N, d) the estimated waveform; NaN in samples without effect on a reading.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Consistency(NamedTuple):
 
     @property
     def consistent(self) -> bool:
-        """Whether the place is not ruled out."""
+        """Whether the place is not rejected."""
         return self.energy <= self.limit
 
 
@@ -61,11 +61,11 @@ class WaveformTest:
 
     Attributes:
         places: the results, most probable first.
-        probability: with which the set holds the true place.
-        healthy: the window as it is: energy of a plant without a fault.
+        probability: with which the set contains the true place.
+        healthy: the test of a plant without a fault.
         onset: first sample that the fault can change.
-        untested: {label: why} of the candidates that may explain anything or are of noise.
-        flat: sensors that repeat one reading to the bit, where the record was given.
+        untested: {label: reason} of the candidates with as many directions as outputs, or of noise.
+        flat: sensors with identical readings, where the record was given.
     """
 
     places: tuple[Consistency, ...]
@@ -77,28 +77,20 @@ class WaveformTest:
 
     @property
     def consistent(self) -> tuple[str, ...]:
-        """Places that are not ruled out, most probable first; a frozen sensor alone where one repeats its reading."""
+        """Places that are not rejected, most probable first; only the frozen sensors where there are some."""
         if self.flat:
             return tuple(dict.fromkeys(line.name for line in self.flat))
         return tuple(place.name for place in self.places if place.consistent)
 
     @property
     def best(self) -> str:
-        """The most probable place.
-
-        Raises:
-            StructureError: nothing was tested.
-        """
+        """The most probable place; `StructureError` where nothing was tested."""
         if not self.flat and not self.places:
             raise StructureError("No place was tested.")
         return self.consistent[0] if self.flat else self.places[0].name
 
     def __getitem__(self, name: str) -> Consistency:
-        """Return the result of a place or of a candidate there.
-
-        Raises:
-            LookupFailed: not tested, with the reason.
-        """
+        """Return the result of a place or of a candidate there; `LookupFailed` with the reason where not tested."""
         for place in self.places:
             if name == place.name or name in place.labels:
                 return place
@@ -107,7 +99,7 @@ class WaveformTest:
         raise LookupFailed(f"{name!r} was not tested. {nearest(name, [place.name for place in self.places])}")
 
     def __str__(self) -> str:
-        """Print the places, and who is consistent."""
+        """Print the places and which are consistent."""
         lines = [f"a fault of any course from sample {self.onset} on; set with probability {self.probability:g}",
                  f"  {'place':<34}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
         for place in (*self.places, self.healthy):
@@ -128,9 +120,9 @@ def waveform_test(
     Args:
         found: the candidates.
         whitened: the window; one experiment.
-        probability: with which the set is to hold the true place.
-        onset: first sample that the fault can change; a later one makes the test sharper.
-        free_start: whether the state at the start of the window may be wrong (as when it was fitted to the window).
+        probability: with which the set is to contain the true place.
+        onset: first sample that the fault can change; a later one makes the test more powerful.
+        free_start: whether the initial state of the window is unknown (as when it was fitted to the window).
         data: the record of the window, for the flat-line test of frozen sensors.
 
     Raises:
@@ -142,8 +134,7 @@ def waveform_test(
     if found.model.l < 2:
         raise StructureError(
             "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
-            "(bias, drift, loss) can be told apart by the exact search."
-        )
+            "(bias, drift, loss) are isolable by the exact search.")
     start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
     columns: dict[str, list[Candidate]] = {}
     untested: dict[str, str] = {}
@@ -168,14 +159,10 @@ def waveform_test(
 
 def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened, onset: int = 0,
                     u: ArrayLike | None = None) -> Array:
-    """Return what unit impulses at every sample from the onset on leave in the window, (N l, (N - onset) d).
+    """Return the signatures of unit impulses at every sample from the onset on, (N l, (N - onset) d).
 
-    Args:
-        found: the dictionary.
-        candidate: whose place it is; the impulses are in units of a bias there, whatever its kind.
-        whitened: the window.
-        onset: first sample.
-        u: (N, m) inputs; with them the impulses of a loss are in units of the share lost.
+    The impulses are in units of a bias at the place of the candidate; with the inputs u (N, m) those of a loss are in
+    units of the share lost.
     """
     count = len(whitened.r)
     state, output = (np.broadcast_to(part, (count, *part.shape)) for part in
@@ -191,7 +178,7 @@ def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened,
 
 
 def start_matrix(whitened: Whitened) -> Array:
-    """Return what an error of the state at the start leaves in the window, (N l, n)."""
+    """Return the signatures of the initial state, (N l, n)."""
     return whitened.seen(whitened.predictor.jumps(0, whitened.present)).reshape(whitened.r.size, -1)
 
 
@@ -209,14 +196,14 @@ def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probabil
     freedom = readings - rank
     if freedom < 1:
         raise DataError(
-            f"{name}: {readings} readings leave nothing to test a waveform of {rank} values with: use a longer window.")
+            f"{name}: {readings} readings are too few to test a waveform of {rank} values: use a longer window.")
     energy = float(rest @ rest)
     return Consistency(name, (), energy, freedom, float(chdtri(freedom, 1 - probability)),
                        float(chdtrc(freedom, energy)), course[: matrix.shape[1]].reshape(-1, d))
 
 
 def _projected(columns: Array, r: Array) -> tuple[Array, Array]:
-    """Return orthonormal axes of the span of columns and the coefficients of least squares."""
+    """Return orthonormal axes of the span of columns, and the least-squares coefficients."""
     from scipy.linalg import solve_triangular
 
     if columns.shape[1] <= columns.shape[0]:
