@@ -77,21 +77,13 @@ class BoundedWindow:
 
 @dataclass(frozen=True, eq=False)
 class ParityProof:
-    """A proof that the noise exceeds its bounds by a factor, to be checked by adding up.
+    """A proof that the noise exceeds its bounds by a factor, to be checked by adding up."""
 
-    Attributes:
-        weights: (N, l) parity vector p, zero where a reading is missing.
-        state_weights: (N, n) q.
-        residual: sum p e.
-        limit: sum |p| v̄ + sum |q| w̄, the largest |sum p e| with noise within its bounds.
-        rounding: bound of the rounding of the residual.
-    """
-
-    weights: Array
-    state_weights: Array = field(repr=False)
-    residual: float
-    limit: float
-    rounding: float
+    weights: Array  # (N, l) parity vector p, zero where a reading is missing
+    state_weights: Array = field(repr=False)  # (N, n) q
+    residual: float  # sum p e
+    limit: float  # sum |p| v̄ + sum |q| w̄, the largest |sum p e| with noise within its bounds
+    rounding: float  # bound of the rounding of the residual
 
     @property
     def factor(self) -> float:

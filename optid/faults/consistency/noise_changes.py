@@ -111,23 +111,14 @@ class NoiseSearch:
 
 @dataclass(frozen=True, eq=False)
 class NoiseChange:
-    """More noise at one place.
+    """More noise at one place."""
 
-    Attributes:
-        label: of the place and the noise.
-        name: of the place, as in `Fault`.
-        variance: of the added noise, in the units of the place.
-        interval: its 95 % interval by the likelihood ratio.
-        gain: log-likelihood above that of a healthy plant.
-        scale: factor of the standard deviation of the noise that was there; NaN where the model has none.
-    """
-
-    label: str
-    name: str
-    variance: float
-    interval: tuple[float, float]
-    gain: float
-    scale: float
+    label: str  # of the place and the noise
+    name: str  # of the place, as in `Fault`
+    variance: float  # of the added noise, in the units of the place
+    interval: tuple[float, float]  # its 95 % interval by the likelihood ratio
+    gain: float  # log-likelihood above that of a healthy plant
+    scale: float  # factor of the standard deviation of the noise that was there; NaN where the model has none
 
     @property
     def std(self) -> float:

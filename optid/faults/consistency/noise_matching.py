@@ -29,31 +29,18 @@ class CovarianceProblem:
 
 @dataclass(frozen=True, eq=False)
 class CovarianceMatch:
-    """The variances or covariances that match those of a window.
+    """The variances or covariances that match those of a window."""
 
-    Attributes:
-        labels: the C places.
-        rho: (C,) variance of the added noise in every place; NaN with full covariances.
-        gains: (C,) size of the covariances explained, in standard deviations.
-        Q: (n, n) covariance of the added process noise; None with places.
-        R: (l, l) covariance of the added sensor noise; None with places.
-        objective: half the squares left.
-        gap: relative duality gap.
-        certified: whether it is proved optimal.
-        lags: largest lag.
-        status: the reason where it is not certified.
-    """
-
-    labels: tuple[str, ...]
-    rho: Array
-    gains: Array
-    Q: Array | None
-    R: Array | None
-    objective: float
-    gap: float
-    certified: bool
-    lags: int
-    status: str = ""
+    labels: tuple[str, ...]  # the C places
+    rho: Array  # (C,) variance of the added noise in every place; NaN with full covariances
+    gains: Array  # (C,) size of the covariances explained, in standard deviations
+    Q: Array | None  # (n, n) covariance of the added process noise; None with places
+    R: Array | None  # (l, l) covariance of the added sensor noise; None with places
+    objective: float  # half the squares left
+    gap: float  # relative duality gap
+    certified: bool  # whether it is proved optimal
+    lags: int  # largest lag
+    status: str = ""  # the reason where it is not certified
 
     @property
     def best(self) -> str:

@@ -29,25 +29,15 @@ LONGEST = 6000
 
 
 class Consistency(NamedTuple):
-    """Whether a fault of any course at a place explains the window.
+    """Whether a fault of any course at a place explains the window."""
 
-    Attributes:
-        name: of the place, as in `Fault`.
-        labels: of the candidates there.
-        energy: of the residual, chi-square distributed with `freedom` if the fault is there.
-        freedom: degrees of freedom.
-        limit: the quantile.
-        p_value: probability of more than this energy if the fault is there.
-        course: (N, d) the estimated waveform; NaN in samples without effect on a reading.
-    """
-
-    name: str
-    labels: tuple[str, ...]
-    energy: float
-    freedom: int
-    limit: float
-    p_value: float
-    course: Array
+    name: str  # of the place, as in `Fault`
+    labels: tuple[str, ...]  # of the candidates there
+    energy: float  # of the residual, chi-square distributed with `freedom` if the fault is there
+    freedom: int  # degrees of freedom
+    limit: float  # the quantile
+    p_value: float  # probability of more than this energy if the fault is there
+    course: Array  # (N, d) the estimated waveform; NaN in samples without effect on a reading
 
     @property
     def consistent(self) -> bool:

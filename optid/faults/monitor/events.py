@@ -48,17 +48,11 @@ class Event:
 
 @dataclass(frozen=True)
 class Carried:
-    """An isolated fault whose effect is compensated.
+    """An isolated fault whose effect is compensated."""
 
-    Attributes:
-        label: the candidate.
-        size: its magnitudes.
-        deviation: their standard deviations; zero once they are held and no longer estimated.
-    """
-
-    label: str
-    size: tuple[float, ...]
-    deviation: tuple[float, ...]
+    label: str  # the candidate
+    size: tuple[float, ...]  # its magnitudes
+    deviation: tuple[float, ...]  # their standard deviations; zero once they are held and no longer estimated
 
     def __str__(self) -> str:
         """Return the fault in one line."""

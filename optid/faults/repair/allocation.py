@@ -31,32 +31,21 @@ ACTIVE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The steady state nearest to a reference.
+    """The steady state nearest to a reference."""
 
-    Attributes:
-        reference: (l,) desired outputs.
-        y: (l,) steady outputs.
-        u: (m,) inputs.
-        v: (r,) their f.
-        x: (n,) steady state.
-        distance: weighted distance of y from the reference.
-        reachable: whether it is negligible.
-        limiting: {actuator: reduction of the distance per unit of v (of u on the NLP route) by which its bound is
-            relaxed}, the most limiting first; empty where the reference is reached.
-        solution: of the programme behind it; None where no actuator has an effect.
-        idle: the reason where no actuator has an effect; "" otherwise.
-    """
-
-    reference: Array
-    y: Array
-    u: Array
-    v: Array
-    x: Array
-    distance: float
-    reachable: bool
+    reference: Array  # (l,) desired outputs
+    y: Array  # (l,) steady outputs
+    u: Array  # (m,) inputs
+    v: Array  # (r,) their f
+    x: Array  # (n,) steady state
+    distance: float  # weighted distance of y from the reference
+    reachable: bool  # whether it is negligible
+    # {actuator: reduction of the distance per unit of v (of u on the NLP route) by which its bound is relaxed},
+    # the most limiting first; empty where the reference is reached
     limiting: dict[str, float]
+    # of the programme behind it; None where no actuator has an effect
     solution: "Solution | None" = field(default=None, repr=False)
-    idle: str = ""
+    idle: str = ""  # the reason where no actuator has an effect; "" otherwise
 
     def __str__(self) -> str:
         """Return whether the reference is reached, the distance, and the limiting actuators."""

@@ -38,21 +38,13 @@ ROUNDS = 100
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """An input that isolates explanations.
+    """An input that isolates explanations."""
 
-    Attributes:
-        u: (L, m) inputs, within their bounds.
-        separation: smallest distance of two members in the whitened innovations over the probe.
-        ordinary: the same of an input with random levels, median of several.
-        bound: upper bound of the separation of the worst pair by any input within the bounds.
-        pair: the two members with the smallest distance.
-    """
-
-    u: Array
-    separation: float
-    ordinary: float
-    bound: float
-    pair: tuple[str, str]
+    u: Array  # (L, m) inputs, within their bounds
+    separation: float  # smallest distance of two members in the whitened innovations over the probe
+    ordinary: float  # the same of an input with random levels, median of several
+    bound: float  # upper bound of the separation of the worst pair by any input within the bounds
+    pair: tuple[str, str]  # the two members with the smallest distance
 
     def __str__(self) -> str:
         """Return the length, the separation and its bound."""
@@ -64,25 +56,15 @@ class Probe:
 
 @dataclass(frozen=True, eq=False)
 class Ambiguity:
-    """Advice while several explanations are left.
+    """Advice while several explanations are left."""
 
-    Attributes:
-        action: "wait", "probe" or "robust".
-        reason: of the action.
-        labels: of the members, the most probable first.
-        posteriors: their probabilities.
-        wait: samples after which the ordinary input isolates the closest pair; inf where it never does.
-        robust: control for all of them; None where there is none, see `reason`.
-        probe: an input that isolates them; None where no input does.
-    """
-
-    action: str
-    reason: str
-    labels: tuple[str, ...]
-    posteriors: tuple[float, ...]
-    wait: float
-    robust: Allocation | None = field(repr=False)
-    probe: Probe | None = field(repr=False)
+    action: str  # "wait", "probe" or "robust"
+    reason: str  # of the action
+    labels: tuple[str, ...]  # of the members, the most probable first
+    posteriors: tuple[float, ...]  # their probabilities
+    wait: float  # samples after which the ordinary input isolates the closest pair; inf where it never does
+    robust: Allocation | None = field(repr=False)  # control for all of them; None where there is none, see `reason`
+    probe: Probe | None = field(repr=False)  # an input that isolates them; None where no input does
 
     def __str__(self) -> str:
         """Return the members, the action and its reason."""

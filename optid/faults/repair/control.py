@@ -24,21 +24,13 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """The move of a controller at one sample.
+    """The move of a controller at one sample."""
 
-    Attributes:
-        u: (m,) inputs, within their bounds.
-        v: (r,) their f.
-        reachable: whether the reference can be held.
-        route: "qp" (own solver), "program" (in v, by a back end) or "nlp" (in u, by a back end).
-        residual: of the optimality conditions, relative; NaN with a back end.
-    """
-
-    u: Array
-    v: Array
-    reachable: bool
-    route: str
-    residual: float
+    u: Array  # (m,) inputs, within their bounds
+    v: Array  # (r,) their f
+    reachable: bool  # whether the reference can be held
+    route: str  # "qp" (own solver), "program" (in v, by a back end) or "nlp" (in u, by a back end)
+    residual: float  # of the optimality conditions, relative; NaN with a back end
 
 
 class Controller:

@@ -27,29 +27,18 @@ EXACT = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """u = f^-1(v) for v between the least and the largest value of f.
+    """u = f^-1(v) for v between the least and the largest value of f."""
 
-    Attributes:
-        f: the nonlinearity.
-        low: least input.
-        high: largest input.
-        v_low: least value of f there.
-        v_high: largest value.
-        refused: intervals of the input on which f is flat or turns back, so that there is no inverse.
-        turns: whether f turns back on one of them; else it is only flat there.
-        points: (T,) inputs of a table.
-        values: (T,) of f.
-    """
-
-    f: Nonlinearity
-    low: float
-    high: float
-    v_low: float
-    v_high: float
+    f: Nonlinearity  # the nonlinearity
+    low: float  # least input
+    high: float  # largest input
+    v_low: float  # least value of f there
+    v_high: float  # largest value
+    # intervals of the input on which f is flat or turns back, so that there is no inverse
     refused: tuple[tuple[float, float], ...]
-    turns: bool
-    points: Array = field(repr=False)
-    values: Array = field(repr=False)
+    turns: bool  # whether f turns back on one of them; else it is only flat there
+    points: Array = field(repr=False)  # (T,) inputs of a table
+    values: Array = field(repr=False)  # (T,) of f
 
     @property
     def dead(self) -> bool:

@@ -49,23 +49,14 @@ WITHOUT_ANSWER = {
 
 @dataclass(frozen=True, eq=False)
 class MemberModel:
-    """The plant under one explanation.
+    """The plant under one explanation."""
 
-    Attributes:
-        damage: the explanation.
-        model: the plant under it.
-        observer: filter on the remaining sensors.
-        allocation: control by the remaining actuators; None where `notes` say why.
-        schedule: how the model was refitted; None where the plant itself is unchanged.
-        notes: remarks.
-    """
-
-    damage: Damage
-    model: "HammersteinSS"
-    observer: Observer
-    allocation: Allocation | None
-    schedule: Schedule | None
-    notes: tuple[str, ...]
+    damage: Damage  # the explanation
+    model: "HammersteinSS"  # the plant under it
+    observer: Observer  # filter on the remaining sensors
+    allocation: Allocation | None  # control by the remaining actuators; None where `notes` say why
+    schedule: Schedule | None  # how the model was refitted; None where the plant itself is unchanged
+    notes: tuple[str, ...]  # remarks
 
     @property
     def label(self) -> str:

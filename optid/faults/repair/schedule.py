@@ -37,31 +37,20 @@ STAGES = ("affected only", "all with prior")
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """How the model was refitted.
+    """How the model was refitted."""
 
-    Attributes:
-        stage: "prior" (too few samples), "affected only" or "all with prior".
-        samples: samples after the fault.
-        least: fewest samples for a refit.
-        held_out: {stage: mean squared whitened innovation of the samples held out}; empty where only one was tried.
-        values: the damaged nonlinearities.
-        offsets: {fault: estimated size}.
-        fit_interval: 90 % interval of the simulation fit (%) from the uncertainty of the refit; NaN without one.
-        active: constraints that bind.
-        solution: of the last programme; None without one.
-        reason: why this stage.
-    """
-
-    stage: str
-    samples: int
-    least: int
+    stage: str  # "prior" (too few samples), "affected only" or "all with prior"
+    samples: int  # samples after the fault
+    least: int  # fewest samples for a refit
+    # {stage: mean squared whitened innovation of the samples held out}; empty where only one was tried
     held_out: dict[str, float]
-    values: tuple[Curve, ...]
-    offsets: dict[str, Array]
+    values: tuple[Curve, ...]  # the damaged nonlinearities
+    offsets: dict[str, Array]  # {fault: estimated size}
+    # 90 % interval of the simulation fit (%) from the uncertainty of the refit; NaN without one
     fit_interval: tuple[float, float]
-    active: tuple[str, ...]
-    solution: "Solution | None" = field(default=None, repr=False)
-    reason: str = ""
+    active: tuple[str, ...]  # constraints that bind
+    solution: "Solution | None" = field(default=None, repr=False)  # of the last programme; None without one
+    reason: str = ""  # why this stage
 
     def __str__(self) -> str:
         """Return the stage, the reason, the fit expected and the values."""

@@ -170,25 +170,15 @@ def _names(model: "HammersteinSS", lost: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class LearntSensor:
-    """A lost output as a linear function of the last readings of the others and of the last inputs.
+    """A lost output as a linear function of the last readings of the others and of the last inputs."""
 
-    Attributes:
-        model: gives the nonlinearities of the inputs and the names.
-        lost: names of the outputs that are estimated.
-        method: "conditional mean" or "subspace".
-        lags: samples of the past, the present one included.
-        weights: (features, lost) acting on [other readings; f(u)] of every lag, the newest first.
-        constant: (lost,).
-        residual: (lost,) standard deviation of its error on the healthy record, the noise of the sensor included.
-    """
-
-    model: "HammersteinSS"
-    lost: tuple[str, ...]
-    method: str
-    lags: int
-    weights: Array
-    constant: Array
-    residual: Array
+    model: "HammersteinSS"  # gives the nonlinearities of the inputs and the names
+    lost: tuple[str, ...]  # names of the outputs that are estimated
+    method: str  # "conditional mean" or "subspace"
+    lags: int  # samples of the past, the present one included
+    weights: Array  # (features, lost) acting on [other readings; f(u)] of every lag, the newest first
+    constant: Array  # (lost,)
+    residual: Array  # (lost,) standard deviation of its error on the healthy record, the noise of the sensor included
 
     @cached_property
     def rmse(self) -> dict[str, float]:
