@@ -342,7 +342,7 @@ def test_refusals_name_what_is_wrong(tmp_path):
         with pytest.raises(DataError, match=f"sample {monitor.samples}: .* 2 and 2 numbers are needed"):
             monitor.step(u, y)
     assert "thresholds as given" in str(monitor) and max(map(len, str(monitor).splitlines())) <= 80
-    with pytest.raises(DataError, match="infinite"):
+    with pytest.raises(DataError, match="channel 'y1': sample 1 is inf"):
         monitor.step([0, 0], [np.inf, 0])
     with pytest.warns(DataWarning, match="sensor:y1 frozen is not monitored"):
         with_frozen = dictionary(model, kinds=["bias", "frozen"], sensors=["y1"], actuators=[])

@@ -15,7 +15,7 @@ import numpy as np
 
 from optid.arrays import Array, check_probability
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.consistency.waveforms import LONGEST, RANK, same_place, start_matrix, waveform_matrix
+from optid.faults.consistency.waveforms import LONGEST, RANK, by_place, start_matrix, waveform_matrix
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
 
@@ -252,10 +252,8 @@ def noise_test(
 def noise_places(found: Dictionary) -> list[tuple[str, Candidate]]:
     """Return the label and the candidate of every place where noise may increase."""
     named = [c for c in found.candidates if c.kind == "noise"]
-    chosen: list[Candidate] = []
-    for candidate in named or [c for c in found.candidates if not c.name.startswith("state")]:
-        if not any(same_place(candidate, other) for other in chosen):
-            chosen.append(candidate)
+    places = by_place(named or [c for c in found.candidates if not c.name.startswith("state")])
+    chosen = [candidates[0] for candidates in places.values()]
     return [(c.label if c.kind == "noise" else " | ".join(f"{place} noise" for place in c.places), c) for c in chosen]
 
 

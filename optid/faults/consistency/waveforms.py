@@ -5,6 +5,7 @@ the window after projection on that space is chi-square distributed if the fault
 All places that pass are the consistent set. The response to an unknown initial state is projected out, too.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -126,18 +127,16 @@ def waveform_test(
             "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
             "(bias, drift, loss) are isolable by the exact search.")
     start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
-    columns: dict[str, list[Candidate]] = {}
-    untested: dict[str, str] = {}
+    tested, untested = [], {}
     for candidate in found.candidates:
         if candidate.kind == "noise":
             untested[candidate.label] = "noise has no course (see noise_test)"
         elif candidate.into_state.shape[1] >= found.model.l:
             untested[candidate.label] = "as many directions as outputs explain anything"
         else:
-            place = next((name for name, others in columns.items() if same_place(others[0], candidate)), None)
-            columns.setdefault(place or " | ".join(candidate.places), []).append(candidate)
+            tested.append(candidate)
     places = []
-    for name, here in columns.items():
+    for name, here in by_place(tested).items():
         matrix = waveform_matrix(found, here[0], whitened, onset)
         fitted = _fitted(name, matrix, start, whitened, probability, here[0].into_state.shape[1])
         places.append(fitted._replace(labels=tuple(c.label for c in here)))
@@ -207,7 +206,12 @@ def _projected(columns: Array, r: Array) -> tuple[Array, Array]:
     return axes, right[kept].T @ ((axes.T @ r) / values[kept])
 
 
-def same_place(first: Candidate, second: Candidate) -> bool:
-    """Whether two candidates are in one place: waveforms of both are the same."""
-    parts = [np.vstack([c.into_state, c.into_output]) for c in (first, second)]
-    return parts[0].shape == parts[1].shape and bool(np.allclose(*parts, rtol=1e-12, atol=0))
+def by_place(candidates: Iterable[Candidate]) -> dict[str, list[Candidate]]:
+    """Return candidates by the name of their place: those whose waveforms are the same are in one."""
+    found: dict[str, list[tuple[Array, Candidate]]] = {}
+    for candidate in candidates:
+        enters = np.vstack([candidate.into_state, candidate.into_output])
+        place = next((name for name, here in found.items() if enters.shape == here[0][0].shape
+                      and np.allclose(enters, here[0][0], rtol=1e-12, atol=0)), " | ".join(candidate.places))
+        found.setdefault(place, []).append((enters, candidate))
+    return {name: [candidate for _, candidate in here] for name, here in found.items()}

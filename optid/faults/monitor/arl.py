@@ -151,17 +151,13 @@ def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
     few = goal * len(largest) < 0.9 * FEWEST  # too few to count: this level is conservative
     for _ in range(30):
         q = np.array([tail(column, level) for column in largest.T])
-        alarms, quiet = onsets(np.any(largest > q, axis=1))
-        share = alarms / max(quiet, 1)
+        above = np.any(largest > q, axis=1)
+        alarms, quiet = int(np.sum(above[1:] & ~above[:-1])), int(np.sum(~above[:-1]))
+        share = alarms / max(quiet, 1)  # of the blocks that follow a block without an alarm
         if few or not alarms or abs(share / goal - 1) < 0.005:
             break
         level *= goal / share
     return q, alarms
-
-
-def onsets(above: Any) -> tuple[int, int]:
-    """Return how many blocks begin an alarm, and how many follow a block without one."""
-    return int(np.sum(above[1:] & ~above[:-1])), int(np.sum(~above[:-1]))
 
 
 def tail(column: Array, level: float) -> float:

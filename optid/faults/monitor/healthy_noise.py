@@ -42,18 +42,13 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
         by_parameter, _ = sensitivities(known.model, known.predictor, here, x0, there, known.root)
-        effects.append(_recoloured_effect(by_parameter.reshape(*here.y.shape, -1), known.predictor, steady))
+        raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
+        effect, taps = raw_effect.copy(), steady.C[:, known.model.nx :]  # the last states are past innovations
+        for lag in range(1, taps.shape[1] // here.y.shape[1] + 1):
+            effect[lag:] -= taps[:, (lag - 1) * len(taps) : lag * len(taps)] @ raw_effect[:-lag]
+        effects.append(steady.root @ effect)
         inputs.append(known.model.expanded(here.u))
     return np.concatenate(effects), np.nan_to_num(np.concatenate(inputs))
-
-
-def _recoloured_effect(effect: Array, before: Predictor, steady: Predictor) -> Array:
-    """Whiten (T, l, q) by a predictor whose last states are the past innovations of another one."""
-    raw, taps = np.linalg.pinv(before.root) @ effect, steady.C[:, len(before.A) :]
-    left = raw.copy()
-    for lag, tap in enumerate(np.split(taps, taps.shape[1] // len(raw[0]), axis=1) if taps.size else [], start=1):
-        left[lag:] -= tap @ raw[:-lag]
-    return steady.root @ left
 
 
 def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:

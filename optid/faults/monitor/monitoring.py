@@ -209,13 +209,11 @@ class Monitor:
         """
         model = self.dictionary.model
         try:
-            rows = np.array(u, dtype=float).reshape(1, model.m), np.array(y, dtype=float).reshape(1, model.l)
+            rows = [np.array(part, dtype=float).reshape(1, size) for part, size in ((u, model.m), (y, model.l))]
         except (ValueError, TypeError):
             raise DataError(f"sample {self.samples}: u = {u!r} and y = {y!r}; {model.m} and {model.l} numbers are "
                             "needed, NaN for a missing one.") from None
-        if np.isinf(rows[0]).any() or np.isinf(rows[1]).any():
-            raise DataError(f"sample {self.samples}: an infinite value; use NaN for a missing one.")
-        return self._take_in(*rows)
+        return self.run(*rows)
 
     def run(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
         """Process a block of inputs (N, m) and readings (N, l), with the same result as `step` for each sample.

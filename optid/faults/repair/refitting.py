@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array, compact
+from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.stretches import interpolated
@@ -235,57 +235,46 @@ class Refitting:
 
     def linearised(self, theta: Array) -> tuple[Array, Array]:
         """Return the whitened innovations (M,) at a point and their sensitivities (M, q), those present."""
-        model, values = self.model_at(theta), self.unpack(theta)
-        parts = [self._window(model, values, number) for number in range(len(self.windows))]
+        parts = [self._window(theta, number) for number in range(len(self.windows))]
         return np.concatenate([r for r, _ in parts]), np.vstack([s for _, s in parts])
 
-    def _window(self, model: "HammersteinSS", values: dict[str, Array], number: int) -> tuple[Array, Array]:
-        w = self.windows[number]
-        f = model.expanded(w.u)
-        drive, direct = f @ model.B.T + model.offset_x + w.fed, f @ model.D.T + model.offset_y
-        for c in self.offsets:
-            course = course_of(c.kind, w.since)
-            drive[:-1] += np.outer(course[1:], c.into_state @ values[f"size[{c.label}]"])
-            direct += np.outer(course, c.into_output @ values[f"size[{c.label}]"])
+    def _window(self, theta: Array, number: int) -> tuple[Array, Array]:
+        w, model, values, q = self.windows[number], self.model_at(theta), self.unpack(theta), theta.size
+        (count, l), n = w.y.shape, model.nx  # noqa: E741
+        drive, direct = self._signals(theta, w, np.zeros((count, n)))
+        drive[0] += self.steady.K @ w.e0
         shown = w.present.copy()
         shown[: int(w.held)] = False  # an innovation that is given does not depend on the parameters
-        drive[0] += self.steady.K @ w.e0
         x = values["x0"][number] if "x0" in values else w.x0
         steady = replace(self.steady, A=model.A, C=model.C, L=np.zeros_like(model.L))
         moved, seen = -np.vstack([x, drive[:-1]])[:, :, None], np.nan_to_num(w.y - direct)[:, :, None]
         innovations = np.where(shown, steady.respond(moved, seen, shown)[..., 0], 0.0)
-        for curve in self.curves:  # its constant went to those of the model
-            f[:, curve.column] += values[f"constant[{curve.name}]"]
-        states = _states(steady, drive, innovations, x) if self.whole else np.zeros((0, model.nx))
-        into_state, into_output = self._additions(model, w, f, states)
+        still = replace(steady, C=np.eye(n), K=np.zeros((n, n)), L=np.zeros((n, n)))  # its outputs are the states
+        entered = np.vstack([x, (drive + innovations @ steady.K.T)[:-1]])[:, :, None]
+        states = still.respond(entered, np.zeros((count, n, 1)))[..., 0]
+        here = self._signals(theta, w, states)
+        into_state, into_output = np.zeros((count, n, q)), np.zeros((count, l, q))
+        for j, unit in enumerate(np.eye(q)):  # exact: the signals are linear in every single unknown
+            there = self._signals(theta + unit, w, states)
+            into_state[1:, :, j], into_output[:, :, j] = (there[0] - here[0])[:-1], there[1] - here[1]
         if "x0" in self.slices:
-            first = self.slices["x0"].start + number * model.nx
-            into_state[0, :, first : first + model.nx] = np.eye(model.nx)
+            first = self.slices["x0"].start + number * n
+            into_state[0, :, first : first + n] = np.eye(n)
         response: Any = steady.whitened(steady.respond(into_state, into_output, shown), shown)
         white: Any = steady.whitened(innovations, shown)
         return white[shown], -response[shown]
 
-    def _additions(self, model: "HammersteinSS", w: Window, f: Array, states: Array) -> tuple[Array, Array]:
-        """Additions of one unit of every unknown to the states (N, n, q) and to the outputs (N, l, q)."""
-        count, n, l = len(w.u), model.nx, model.l  # noqa: E741
-        into_state, into_output = np.zeros((count, n, self.start.size)), np.zeros((count, l, self.start.size))
-        damaged = [(self.part(curve), curve.column) for curve in self.curves]
-        for part, i in [*damaged, *((self.slices[f"mu {i + 1}"], i) for i in self.others if self.whole)]:
-            signal = model.nonlinearities[i].basis.values(w.u[:, model.input_of[i]])
-            signal = np.column_stack([signal, np.ones((count, part.stop - part.start - signal.shape[1]))])
-            into_state[1:, :, part] = signal[:-1, None, :] * model.B[:, [i]]
-            into_output[:, :, part] = signal[:, None, :] * model.D[:, [i]]
+    def _signals(self, theta: Array, w: Window, states: Array) -> tuple[Array, Array]:
+        """Return the next states (N, n) and the outputs (N, l) of the model along states (N, n)."""
+        model, values = self.model_at(theta), self.unpack(theta)
+        f = model.expanded(w.u)
+        later = states @ model.A.T + f @ model.B.T + model.offset_x + w.fed
+        outputs = states @ model.C.T + f @ model.D.T + model.offset_y
         for c in self.offsets:
-            course, part = course_of(c.kind, w.since)[:, None, None], self.slices[f"size[{c.label}]"]
-            into_state[1:, :, part], into_output[:, :, part] = course[1:] * c.into_state, course * c.into_output
-        for name, signal in zip(MATRICES, (states, f, states, f)) if self.whole else ():
-            rows = np.einsum("ij,nk->nijk", np.eye(n if name in "AB" else l), signal)
-            rows = rows.reshape(count, len(rows[0]), -1)
-            if name in "AB":
-                into_state[1:, :, self.slices[name]] = rows[:-1]
-            else:
-                into_output[:, :, self.slices[name]] = rows
-        return into_state, into_output
+            course, size = course_of(c.kind, w.since), values[f"size[{c.label}]"]
+            later[:-1] += np.outer(course[1:], c.into_state @ size)
+            outputs += np.outer(course, c.into_output @ size)
+        return later, outputs
 
 
 def refitting(
@@ -358,16 +347,3 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
         x0, e0 = white.states[-1], np.nan_to_num(white.innovations[-1])
     after = slice(start if held else onset, None)
     return Window(u[after], y[after], ~np.isnan(y[after]), fed[after], x0, e0, held)
-
-
-def _states(steady: Predictor, drive: Array, innovations: Array, x0: Array) -> Array:
-    """States (N, n) of a predictor from its innovations."""
-    from optid.faults.kernels import predict
-
-    count, outputs = innovations.shape
-    states, nothing = np.empty(drive.shape), np.zeros((count - 1, outputs))
-    states[0] = x0
-    entered = drive + innovations @ steady.K.T  # nothing else corrects the states
-    predict(compact(steady.A), compact(steady.C), np.zeros(steady.K.shape), compact(steady.root), entered[:-1],
-            nothing, nothing, states, np.empty(nothing.shape))
-    return states
