@@ -1,40 +1,34 @@
 """Complete loss of a sensor or an actuator by rank deficiency (dissertation, chapter 7): sliding windows, three tests.
 
-Order: the number of states that the instruments show changes. It drops only where the lost channel was the only access
-to some mode. Past outputs among the instruments hide the loss of an actuator as soon as process noise reaches the same
-modes; hence past and future inputs alone are the instruments by default.
+Order: the number of observed states changes. It drops only where the lost channel was the only access to some mode.
+Past outputs among the instruments hide the loss of an actuator where process noise reaches the same modes; hence past
+and future inputs alone are the instruments by default.
 Rows: the outputs of a dead sensor depend on no input. Columns: no output depends on the input of a dead actuator, given
 past outputs and the other inputs. Both regress rows y of a Hankel matrix on rows o and t. With z the part of t that o
 does not explain and e the residuals of y, both normalised, zero coefficients of t make T = |(1/j) sum_k e_k z_k^T|_F^2
 nearly g chi2_h / j, g and h from the covariances of e and z at every lag at which windows overlap
 (`optid.identify.order.ranks`). Coefficients Theta add |C_z^(1/2) Theta C_e^(-1/2)|^2.
 
-Every verdict is compared with what a healthy plant would show on the same window, so that neither a weakly excited mode
-nor an input at rest counts as a failure. A window that straddles the failure keeps the nominal rank: the alarm comes
-about one window after the failure, as confirmation of faster detectors. Open loop is assumed: under feedback inputs
-depend on sensor noise, and rows of dead sensors are not zero.
+Every verdict is compared with that of a healthy plant on the same window: neither a weakly excited mode nor an input
+at rest counts as a failure. A window that straddles the failure keeps the nominal rank, so that the alarm comes about
+one window later. Open loop is assumed: under feedback inputs depend on sensor noise, and no row is zero.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from optid.arrays import Array, check_integer, check_probability, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum, rank_test
+from optid.identify.order.ranks import Positions, RankTest, lagged_covariances, moments_of_sum, rank_test
 from optid.statistics.hankel import HankelStatistics, hankel_statistics
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS
 
-Positions = Sequence[int] | NDArray[np.intp]
-
-INSTRUMENTS = ("inputs", "inputs+past")
 BLOCK_ROWS = 6
 LONG = 20  # windows have at least this many samples per future row of outputs
 LEVEL = 1e-3  # probability that a dead channel is not recognised, or a true order rejected, on one window
@@ -98,14 +92,10 @@ class WindowVerdict:
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """Channels that may be dead, the likeliest first.
-
-        Where a dead actuator would explain it too, a sensor that still moves by itself is not among them.
-        """
+        """Channels that may be dead, the likeliest first; no autocorrelated sensor where an actuator explains it."""
         actuators = [test for test in self.columns if test.zero]
         sensors = [test for test in self.rows if test.zero and not (actuators and test.name in self.moving)]
-        found = [*sensors, *actuators]
-        return tuple(test.name for test in sorted(found, key=lambda test: test.ratio))
+        return tuple(test.name for test in sorted([*sensors, *actuators], key=lambda test: test.ratio))
 
     @property
     def untestable(self) -> tuple[str, ...]:
@@ -115,36 +105,22 @@ class WindowVerdict:
 
 @dataclass(frozen=True, eq=False)
 class HardOver:
-    """The test of a record.
+    """The test of a record."""
 
-    Attributes:
-        windows: verdicts in time.
-        nominal_order: order of the healthy record.
-        window: samples of a window.
-        hop: samples between windows.
-        block_rows: future block rows.
-        instruments: "inputs" or "inputs+past".
-        name: of the record.
-    """
-
-    windows: tuple[WindowVerdict, ...]
-    nominal_order: int
-    window: int
-    hop: int
-    block_rows: int
-    instruments: str
-    name: str = ""
+    windows: tuple[WindowVerdict, ...]  # verdicts in time
+    nominal_order: int  # order of the healthy record
+    window: int  # samples of a window
+    hop: int  # samples between windows
+    block_rows: int  # future block rows
+    instruments: str  # "inputs" or "inputs+past"
+    name: str = ""  # of the record
 
     @property
     def alarm(self) -> WindowVerdict | None:
         """The first window with a dead row or column, or the second in a row of an order no healthy plant shows."""
-        before = None
-        for verdict in self.windows:
-            changed = verdict.changed(self.nominal_order)
-            if verdict.dead or changed and before == verdict.experiment:
-                return verdict
-            before = verdict.experiment if changed else None
-        return None
+        changed = [verdict.experiment if verdict.changed(self.nominal_order) else None for verdict in self.windows]
+        return next((verdict for verdict, now, before in zip(self.windows, changed, [None, *changed])
+                     if verdict.dead or now is not None and now == before), None)
 
     @property
     def detected(self) -> bool:
@@ -215,22 +191,22 @@ def hard_over_test(
     Args:
         data: the record to be judged; NaN = missing. Windows never cross from one experiment to the next.
         healthy: a record without failure: nominal order, sizes and what healthy channels show.
-        model: its input nonlinearities turn u into f(u); None takes the inputs as they are. No output feedback.
+        model: its nonlinearities turn u into f(u), without output feedback; None takes the inputs as they are.
         order: nominal order; that of the healthy record when not given.
         window: samples of a window; at least, and by default, 20 per block row and output.
         hop: samples between windows; a quarter of a window when not given.
         block_rows: future block rows alpha, larger than order / outputs; the past has as many.
         instruments: "inputs", or "inputs+past" to see what process noise hides.
         level: probability that a dead channel is not recognised, or the true order rejected, on one window.
-        white_sensors: whether the noise of the sensors is white: an output with a memory then still sees the plant, and
-            where its sensor or the only actuator that it shows may be dead, it is the actuator. False keeps both.
+        white_sensors: whether the noise of the sensors is white. The sensor of an autocorrelated output is then alive,
+            and the only actuator that acts on it is the dead one. False keeps both.
 
     Raises:
         StructureError: arguments out of range, or a model with feedback.
         DataError: records with other channels.
         RankError: a record shorter than a window, or a healthy record that does not excite the inputs.
     """
-    one_of("instruments", instruments, INSTRUMENTS)
+    one_of("instruments", instruments, ("inputs", "inputs+past"))
     check_integer(block_rows, "block_rows", 2)
     check_probability(level, "level")
     data, healthy = data.raw(), healthy.raw()
@@ -262,8 +238,8 @@ class _Tests:
             raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
         self.model, self.alpha, self.level, self.white_sensors = model, alpha, level, white_sensors
         self.input_of = range(healthy.m) if model is None else model.input_of
-        self.u = range(len(self.input_of))
-        self.y = range(len(self.u), len(self.u) + healthy.l)
+        places: list[Any] = np.split(np.arange(len(self.input_of) + healthy.l), [len(self.input_of)])
+        self.u, self.y = places
         self.sensors, self.actuators = ([f"{place}:{c}" for c in names] for place, names in
                                         (("sensor", healthy.outputs), ("actuator", healthy.inputs)))
         statistics = hankel_statistics(self.signals(healthy), 3 * alpha, centre="mean")
@@ -341,10 +317,9 @@ class _Tests:
             if not seen:
                 columns.append(ZeroTest(name, healthy=0.0))
                 continue
-            group, others = ([c for c in self.u if (self.input_of[c] == j) == own] for own in (True, False))
-            healthy = self.healthy[name][:, seen] if self.healthy else None
-            columns.append(test(at(group, until), np.r_[0, at(others, until), at(self.y, past)],
-                                at([self.y[i] for i in seen], now), name, healthy))
+            mine, healthy = np.equal(self.input_of, j), self.healthy[name][:, seen] if self.healthy else None
+            columns.append(test(at(self.u[mine], until), np.r_[0, at(self.u[~mine], until), at(self.y, past)],
+                                at(self.y[seen], now), name, healthy))
         return tuple(rows), tuple(columns), frozenset(moving)
 
 

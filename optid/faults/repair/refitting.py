@@ -74,7 +74,7 @@ class Window(NamedTuple):
     held: bool  # whether the first sample is before the fault: its innovation belongs to the healthy plant
 
     @property
-    def since(self) -> Array:
+    def since(self) -> np.ndarray:
         """(N,) samples since the onset."""
         return np.arange(len(self.u)) - int(self.held)
 
