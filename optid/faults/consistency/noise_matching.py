@@ -8,7 +8,7 @@ from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.noise_changes import noise_places
 from optid.faults.signatures import Dictionary
-from optid.faults.whitening import Predictor, Whitened, check_window
+from optid.faults.whitening import Whitened, check_window
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,26 +102,20 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
     weights[0] /= np.sqrt(np.where(upper[0] == upper[1], 2.0, 1.0))  # a variance scatters twice as much
     weight = np.concatenate(weights)[:, None]
     n, steady, noise = found.model.nx, whitened.predictor, found.model.noise
-    by_process = weight * _entries(steady, np.eye(n), np.zeros((l, n)), int(lags))
-    by_sensor = weight * _entries(steady, np.zeros((n, l)), np.eye(l), int(lags))
-    columns = [_entries(steady, c.into_state, c.into_output, int(lags)) @ np.eye(c.into_state.shape[1]).ravel()
-               for _, c in places]
+    length, d = int(lags) + 2 * steady.settling + 2, n + l
+    state, output = np.zeros((length, n, d)), np.zeros((length, l, d))
+    state[0, :, :n], output[0, :, n:] = np.eye(n), np.eye(l)
+    h = steady.whitened(steady.respond(state, output))
+    blocks = [np.einsum("kia,kjb->ijab", h[lag:], h[: length - lag]) for lag in range(int(lags) + 1)]
+    entries = np.concatenate([blocks[0][upper], *(block.reshape(l * l, d, d) for block in blocks[1:])])
+    entries = weight[:, :, None] * entries  # of the entries of a covariance of noise in states and outputs
+    columns = []
+    for _, candidate in places:
+        enters = np.vstack([candidate.into_state, candidate.into_output])
+        columns.append(np.einsum("mab,ac,bc->m", entries, enters, enters))
     assert noise is not None
     units = [np.maximum(np.diag(c), 1e-6 * max(float(np.trace(c)), 1e-300)) for c in (noise.Q, noise.R)]
     return CovarianceProblem(
-        tuple(label for label, _ in places), weight[:, 0] * np.concatenate(target), weight * np.stack(columns, axis=1),
-        by_process, by_sensor, n, l, units[0], units[1], int(lags))
-
-
-def _entries(steady: Predictor, into_state: Array, into_output: Array, lags: int) -> Array:
-    """Signatures (M, d d) of the entries of the covariance (d, d) of white noise at a place."""
-    n, d = into_state.shape
-    l, length = len(into_output), lags + 2 * steady.settling + 2  # noqa: E741
-    state, output = np.zeros((length, n, d)), np.zeros((length, l, d))
-    state[0], output[0] = into_state, into_output
-    h = steady.whitened(steady.respond(state, output))
-    upper, rows = np.triu_indices(l), []
-    for lag in range(lags + 1):
-        both = np.einsum("kia,kjb->ijab", h[lag:], h[: length - lag]).reshape(l, l, d * d)
-        rows.append(both[upper] if lag == 0 else both.reshape(l * l, d * d))
-    return np.concatenate(rows)
+        tuple(label for label, _ in places), weight[:, 0] * np.concatenate(target), np.stack(columns, axis=1),
+        entries[:, :n, :n].reshape(-1, n * n), entries[:, n:, n:].reshape(-1, l * l), n, l, units[0], units[1],
+        int(lags))
