@@ -200,11 +200,12 @@ def parity_proof(window: BoundedWindow, p: Array, unseen: Array) -> ParityProof:
 
     No digit of the solver is trusted; the columns are those of `BoundedWindow.unseen`.
     """
+    from scipy.linalg import orth
+
     flat = np.where(window.present, np.nan_to_num(p), 0.0).ravel()
     sizes = np.linalg.norm(unseen, axis=0)
     kept = sizes > 0
-    left, values, _ = np.linalg.svd(unseen[:, kept] / sizes[kept], full_matrices=False)
-    basis = left[:, values > CERTAIN * max(float(values.max(initial=0.0)), 1e-300)]
+    basis = orth(unseen[:, kept] / sizes[kept], rcond=CERTAIN)
     for _ in range(2):  # twice is enough to lose only rounding
         flat = flat - basis @ (basis.T @ flat)
     p = flat.reshape(window.e.shape)

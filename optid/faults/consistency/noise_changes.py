@@ -190,9 +190,9 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
         DataError, StructureError: as `check_window`; noise in none of the places reaches a reading.
     """
     check_window(found.model, whitened, "The noise test", onset, LONGEST)
-    start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
-    left, sizes, _ = np.linalg.svd(start, full_matrices=False)
-    start = left[:, sizes > 1e-8 * max(float(sizes.max(initial=0.0)), 1e-300)]
+    from scipy.linalg import orth
+
+    start = orth(start_matrix(whitened), rcond=1e-8) if free_start else np.zeros((whitened.r.size, 0))
     places = []
     for label, candidate in noise_places(found):
         matrix = waveform_matrix(found, candidate, whitened, onset)

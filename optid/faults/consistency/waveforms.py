@@ -22,9 +22,6 @@ from optid.faults.whitening import Whitened, check_window
 RANK = 1e-10
 """Singular values below this share of the largest count as zero."""
 
-FULL = 1e-7
-"""Ratio of the diagonal of a triangular factor above which no singular value is anywhere near `RANK`."""
-
 LONGEST = 6000
 """Readings of a window at most: the cost grows with their cube."""
 
@@ -172,6 +169,7 @@ def start_matrix(whitened: Whitened) -> Array:
 
 
 def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probability: float, d: int) -> Consistency:
+    from scipy.linalg import lstsq
     from scipy.special import chdtrc, chdtri
 
     whole, r, readings = np.hstack([matrix, start]), whitened.r.ravel(), int(whitened.present.sum())
@@ -179,9 +177,9 @@ def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probabil
     seen = sizes > RANK * max(float(sizes.max(initial=0.0)), 1e-300)
     course, rank, rest = np.full(whole.shape[1], np.nan), 0, r
     if seen.any():
-        axes, solved = _projected(whole[:, seen] / sizes[seen], r)
-        rank, rest = axes.shape[1], r - axes @ (axes.T @ r)
-        course[seen] = solved / sizes[seen]
+        columns = whole[:, seen] / sizes[seen]
+        solved, _, rank, _ = lstsq(columns, r, cond=RANK, lapack_driver="gelsy")
+        rest, course[seen] = r - columns @ solved, solved / sizes[seen]
     freedom = readings - rank
     if freedom < 1:
         raise DataError(
@@ -189,21 +187,6 @@ def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probabil
     energy = float(rest @ rest)
     return Consistency(name, (), energy, freedom, float(chdtri(freedom, 1 - probability)),
                        float(chdtrc(freedom, energy)), course[: matrix.shape[1]].reshape(-1, d))
-
-
-def _projected(columns: Array, r: Array) -> tuple[Array, Array]:
-    """Return orthonormal axes of the span of columns, and the least-squares coefficients."""
-    from scipy.linalg import solve_triangular
-
-    if columns.shape[1] <= columns.shape[0]:
-        axes, triangle = np.linalg.qr(columns)
-        diagonal = np.abs(np.diag(triangle))
-        if diagonal.min() > FULL * diagonal.max():
-            return axes, np.asarray(solve_triangular(triangle, axes.T @ r))
-    left, values, right = np.linalg.svd(columns, full_matrices=False)
-    kept = values > RANK * values[0]
-    axes = left[:, kept]
-    return axes, right[kept].T @ ((axes.T @ r) / values[kept])
 
 
 def by_place(candidates: Iterable[Candidate]) -> dict[str, list[Candidate]]:
