@@ -187,9 +187,9 @@ def advise(
         if wait <= PATIENCE:
             action, reason = "wait", waiting
         elif probe is not None and probe.separation >= APART and probe.separation > 1.2 * probe.ordinary:
-            action, reason = "probe", f"{waiting}; {len(probe.u)} samples of the probe do"
+            action, reason = "probe", f"{waiting}; {len(probe.u)} samples of the probe isolate one"
         elif robust is not None:
-            action, reason = "robust", f"{waiting}, and no short probe does"
+            action, reason = "robust", f"{waiting}, nor does a short probe"
         else:
             action, reason = "wait", f"{waiting}; no robust control: {why_not}"
     return Ambiguity(action, reason, tuple(one.label for one in members), tuple(one.posterior for one in members), wait,

@@ -1,7 +1,8 @@
 """The damaged plant that an answer of a diagnosis describes: open parameters, lost channels, additions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,10 +78,8 @@ class Damage:
 
 def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
     """Return one explanation of an answer, or one for each part of a group that is not isolable."""
-    variants: list[list[tuple[str, Estimate]]] = [[]]
-    for fault in answer.faults:
-        places = fault.candidate.places or (fault.name,)
-        variants = [[*before, (place, fault)] for before in variants for place in places]
+    parts = [[(place, fault) for place in fault.candidate.places or (fault.name,)] for fault in answer.faults]
+    variants = list(product(*parts))
     return [_damage(model, parts, answer.posterior / len(variants)) for parts in variants]
 
 
@@ -90,18 +89,15 @@ def merged(broken: list[Damage]) -> list[Damage]:
     The most probable one is kept, with the sum of their probabilities.
     """
     groups: dict[Any, list[Damage]] = {}
-    for one in broken:
+    for one in sorted(broken, key=lambda one: -one.posterior):
         key = (frozenset(one.columns), frozenset(one.sensors), frozenset(c.label for c in one.offsets),
                frozenset(one.louder_sensors), bool(one.louder_states.any()))
         groups.setdefault(key, []).append(one)
-    found = []
-    for group in groups.values():
-        best = max(group, key=lambda one: one.posterior)
-        found.append(replace(best, posterior=sum(one.posterior for one in group)))
+    found = [replace(group[0], posterior=sum(one.posterior for one in group)) for group in groups.values()]
     return sorted(found, key=lambda one: -one.posterior)
 
 
-def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posterior: float) -> Damage:
+def _damage(model: "HammersteinSS", parts: Sequence[tuple[str, "Estimate"]], posterior: float) -> Damage:
     """Collect the damage of faults at some places."""
     r, n = len(model.nonlinearities), model.nx
     found: dict[str, list[Any]] = {"columns": [], "dead": [], "sensors": [], "offsets": [], "notes": []}

@@ -11,7 +11,6 @@ from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, plain, shorten, s
 
 if TYPE_CHECKING:
     from optid.faults.repair.reformulation import MemberModel, Reformulation
-    from optid.models import HammersteinSS
 
 COLOURS = (ORANGE, GREEN, BLUE)
 
@@ -47,14 +46,6 @@ def _shown(found: "Reformulation") -> "list[tuple[MemberModel, str, str]]":
             for member, colour in zip(found.members, COLOURS)]
 
 
-def _values(model: "HammersteinSS", healthy: "HammersteinSS", column: int, u: np.ndarray) -> np.ndarray:
-    """Return f of one column with the constant that a refit has put into the offsets of the model."""
-    b = np.concatenate([healthy.B[:, column], healthy.D[:, column]])
-    moved = np.concatenate([model.offset_x - healthy.offset_x, model.offset_y - healthy.offset_y])
-    constant = float(b @ moved / (b @ b)) if b.any() and np.array_equal(model.B, healthy.B) else 0.0
-    return np.asarray(model.nonlinearities[column](u)) + constant
-
-
 def _input(ax: Axes, found: "Reformulation", c: int) -> None:
     """One input: its nonlinearities before and now, with the standard errors of a refit."""
     columns, healthy = [i for i, of in enumerate(found.healthy.input_of) if of == c], found.healthy.nonlinearities
@@ -71,7 +62,7 @@ def _input(ax: Axes, found: "Reformulation", c: int) -> None:
             curves = () if member.schedule is None else member.schedule.values
             one = next((curve for curve in curves if curve.column == i), None)
             if one is None:
-                ax.plot(u, _values(member.model, found.healthy, i, u), color=colour, label=name)
+                ax.plot(u, member.damage.gains[i] * values + member.damage.constants[i], color=colour, label=name)
                 continue
             at, now, unseen = one.nodes, one.values, one.prior_only
             ax.plot(at, now, color=colour, label=name)
