@@ -7,7 +7,7 @@ All places that pass are the consistent set. The response to an unknown initial 
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -178,7 +178,8 @@ def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probabil
     course, rank, rest = np.full(whole.shape[1], np.nan), 0, r
     if seen.any():
         columns = whole[:, seen] / sizes[seen]
-        solved, _, rank, _ = lstsq(columns, r, cond=RANK, lapack_driver="gelsy")
+        found: Any = lstsq(columns, r, cond=RANK, lapack_driver="gelsy")
+        solved, rank = found[0], int(found[2])
         rest, course[seen] = r - columns @ solved, solved / sizes[seen]
     freedom = readings - rank
     if freedom < 1:
