@@ -7,7 +7,7 @@ from test_monitor import everything, plant
 
 from optid.errors import DataError, StructureError
 from optid.faults import Monitor, cusum_arl, dictionary, inject
-from optid.faults.monitor.arl import Calibration, equalised, onsets, tail
+from optid.faults.monitor.arl import Calibration, equalised, tail
 
 
 @pytest.mark.parametrize("shift, arl", [(0.0, 465.4), (0.5, 38.0), (1.0, 10.38), (2.0, 4.01)])
@@ -38,7 +38,6 @@ def test_equalised_thresholds_have_the_rate_asked_for():
     single = [np.mean(column > value) for column, value in zip(blocks.T, q)]
     assert single == pytest.approx([50 / 20_000 / 3] * 3, rel=0.05)
     assert tail(blocks[:, 0], 1e-4) == pytest.approx(15.14, rel=0.05)  # chi2 with one degree of freedom
-    assert onsets(np.array([True, True, False, True, False, False, True])) == (2, 3)
     frequent, _ = equalised(blocks, 50, 150.0)  # where alarms in neighbouring blocks are common
     assert np.mean(np.any(blocks > frequent, axis=1)) == pytest.approx(1 - np.exp(-50 / 150), rel=0.02)
 

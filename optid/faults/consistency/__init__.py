@@ -1,1 +1,1 @@
-"""Tests that ask whether a hypothesis can be true at all: any course, more noise, bounded noise, what is left."""
+"""Tests whether a hypothesis is possible at all: any course, more noise, bounded noise, the residual of an answer."""

@@ -1,7 +1,7 @@
-"""Whether an answer explains the record: is what it leaves the noise of a healthy plant?
+"""Whether an answer explains the record: tests of its residual against the noise of a healthy plant.
 
-Three tests that know nothing of the dictionary (energy, a line in the spectrum, a burst in time) and one that searches
-the rest for a further fault of it.
+Three tests are independent of the dictionary (energy, a line in the spectrum, a burst in time); the fourth searches the
+residual for a further fault of it.
 """
 
 import numpy as np
@@ -11,20 +11,20 @@ from optid.faults.diagnosis.answers import Remaining
 from optid.faults.whitening import Whitened
 
 UNFIT = 1e-3
-"""An answer whose rest is less probable than this does not explain the record."""
+"""p-value of the residual below which an answer does not explain the record."""
 
 BURSTS = 1, 3, 10, 30
-"""Lengths of the stretches that are searched for a burst."""
+"""Lengths, in samples, of the bursts searched for."""
 
 
 def left_over(whitened: Whitened, rest: Array, magnitudes: int, further: float = 1.0) -> Remaining:
-    """Judge what is left of a window.
+    """Return the tests of the residual of a window.
 
     Args:
         whitened: the window.
-        rest: (N, l) whitened innovations less what the answer explains.
-        magnitudes: numbers that were estimated from the window, the initial state among them.
-        further: p-value of the search of the rest for a further fault.
+        rest: (N, l) whitened innovations less the signature of the answer.
+        magnitudes: number of parameters estimated from the window, the initial state among them.
+        further: p-value of the search of the residual for a further fault.
     """
     from scipy.special import chdtrc
 
@@ -42,16 +42,16 @@ def left_over(whitened: Whitened, rest: Array, magnitudes: int, further: float =
 
 
 def alarm_probability(gain: float, false_alarm: float) -> float:
-    """Return the probability that a healthy window exceeds its thresholds, of this false-alarm rate, by as much.
+    """Return the probability that a healthy window exceeds its thresholds, of this false-alarm rate, by a gain.
 
-    The maximum of many statistics with exponential tails exp(-x / 2) has a Gumbel law; its place follows from the
-    false-alarm rate of the thresholds. Below p = 0.1 it is exact to a tenth, above it errs on the side of larger ones.
+    The maximum of many statistics with exponential tails exp(-x / 2) has a Gumbel law, located by the false-alarm rate.
+    Below p = 0.1 it is exact to a tenth, above it is conservative.
     """
     return float(-np.expm1(np.log1p(-false_alarm) * np.exp(-gain / 2)))
 
 
 def further_fault(gains: Array, false_alarm: float) -> float:
-    """Return the p-value of the largest gain (C, N) of a search of the rest."""
+    """Return the p-value of the largest gain (C, N) of a search of the residual."""
     return 1.0 if np.isnan(gains).all() else alarm_probability(float(np.nanmax(gains)), false_alarm)
 
 
@@ -65,7 +65,7 @@ def _spectrum(rest: Array, present: np.ndarray) -> tuple[float, float, float]:
     if count < 4 or not power.any():
         return 0.0, 0.0, 1.0
     largest = int(np.argmax(power))
-    twice = np.full(power.size, 2.0)  # every line but the first and, for an even length, the last stands for two
+    twice = np.full(power.size, 2.0)  # every line but the first and, for an even length, the last counts twice
     twice[0] = 1.0
     twice[-1] -= float(count % 2 == 0)
     near = slice(max(largest - 1, 0), largest + 2)
@@ -78,7 +78,7 @@ def _spectrum(rest: Array, present: np.ndarray) -> tuple[float, float, float]:
 
 
 def _burst(rest: Array, present: np.ndarray) -> float:
-    """Bound of the p-value of the largest energy in any stretch of a few samples."""
+    """Bound of the p-value of the largest energy of any burst."""
     from scipy.special import chdtrc
 
     energy = np.concatenate([[0.0], np.cumsum(np.sum(rest**2, axis=1))])
@@ -96,7 +96,7 @@ def _burst(rest: Array, present: np.ndarray) -> float:
 
 
 def _direction(whitened: Whitened, rest: Array) -> Array:
-    """Unit vector in units of the outputs along which most of the rest lies, its largest part positive."""
+    """Principal direction of the residual, a unit vector in units of the outputs, its largest entry positive."""
     _, _, axes = np.linalg.svd(rest, full_matrices=False)
     vector = np.linalg.pinv(whitened.predictor.root, rcond=1e-12) @ axes[0]
     vector = vector / np.linalg.norm(vector)

@@ -1,4 +1,4 @@
-"""Has the noise grown, and where? The exact likelihood of more white noise at one place, for every place (F8).
+"""Tests for increased noise: the exact likelihood of more white noise at one place, for every place (F8).
 
 White noise of variance rho at a place adds rho H H' to the covariance of the whitened innovations, H being the
 responses to impulses there at all samples of the window. With the eigenvalues s of H H' and the coordinates z of the
@@ -6,7 +6,7 @@ window along its eigenvectors the log-likelihood is a function of one number,
 
     l(rho) = -1/2 sum( log(1 + rho s_i) + z_i² / (1 + rho s_i) ),
 
-which is maximised for every place; the largest gain names the place, and those within three nats are the set.
+which is maximised for every place; the largest gain is the estimate, and places within three nats of it are the set.
 """
 
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ import numpy as np
 
 from optid.arrays import Array, check_probability
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.consistency.waveforms import LONGEST, RANK, same_place, start_matrix, waveform_matrix
+from optid.faults.consistency.waveforms import LONGEST, RANK, by_place, start_matrix, waveform_matrix
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
 
@@ -23,41 +23,28 @@ NATS = 3.0
 """Places whose log-likelihood is at most this much below the best are in the set."""
 
 GRID = np.concatenate([[0.0], np.geomspace(1e-3, 1e6, 91)])
-"""Variances at which the likelihood is looked at first, over the inverse mean eigenvalue."""
+"""Variances of the first search of the likelihood, over the inverse mean eigenvalue."""
 
 STEPS = 25
 
 WIDE = 1.9207
-"""Half the 95 % quantile of chi-square with one degree of freedom: how far the likelihood falls over an interval."""
+"""Half the 95 % quantile of chi-square with one degree of freedom: decrease of the likelihood over an interval."""
 
 
 @dataclass(frozen=True, eq=False)
 class NoisePlace:
-    """One place where noise may have grown, ready for windows of one length.
-
-    Attributes:
-        label: what an answer calls it.
-        name: of the place, as in `Fault`.
-        axes: (N l, q) eigenvectors of H H'.
-        s: (q,) its eigenvalues.
-        present: variance of the noise that the model has there; zero where it has none.
-    """
+    """One place where noise may have increased, prepared for windows of one length."""
 
     label: str
-    name: str
-    axes: Array = field(repr=False)
-    s: Array = field(repr=False)
-    present: float
+    name: str  # of the place, as in `Fault`
+    axes: Array  # (N l, q) eigenvectors of H H'
+    s: Array  # (q,) its eigenvalues
+    present: float  # variance of the noise that the model has there; zero where it has none
 
     def likelihood(self, rho: Array, z2: Array) -> Array:
-        """Return l(rho) - l(0) for squared coordinates z2 (M, q).
+        """Return l(rho) - l(0), (M, K) or (M,), for squared coordinates z2 (M, q).
 
-        Args:
-            rho: (K,) variances, tried in all windows, or (M, 1), one for each.
-            z2: (M, q).
-
-        Returns:
-            (M, K), or (M,).
+        The variances rho are (K,), tried in all windows, or (M, 1), one for each.
         """
         grown = 1 + rho.reshape(-1, 1) * self.s
         energy = z2 @ (1 / grown - 1).T if rho.ndim == 1 else np.einsum("mq,mq->m", z2, 1 / grown - 1)
@@ -97,21 +84,19 @@ class NoisePlace:
 
 @dataclass(frozen=True, eq=False)
 class NoiseSearch:
-    """All places where noise may have grown, ready for windows of one length; `noise_search` makes it.
-
-    Attributes:
-        places: the places.
-        start: (N l, n') orthonormal: what an error of the initial state leaves, which is taken out of windows.
-        count: readings of a window.
-    """
+    """All places where noise may have increased, prepared for windows of one length; `noise_search` makes it."""
 
     places: tuple[NoisePlace, ...]
-    start: Array = field(repr=False)
-    count: int
+    start: Array = field(repr=False)  # (N l, n') orthonormal responses to the initial state, projected out of windows
+    count: int  # readings of a window
+
+    def cleaned(self, windows: Array) -> Array:
+        """Return windows (M, N l) without their responses to the initial state."""
+        return windows - (windows @ self.start) @ self.start.T
 
     def gains(self, windows: Array) -> tuple[Array, Array]:
         """Return variances (M, C) and gains in log-likelihood (M, C) of windows (M, N l)."""
-        clean = windows - (windows @ self.start) @ self.start.T
+        clean = self.cleaned(windows)
         found = [place.maximise(clean) for place in self.places]
         return np.stack([rho for rho, _ in found], axis=1), np.stack([gain for _, gain in found], axis=1)
 
@@ -126,23 +111,14 @@ class NoiseSearch:
 
 @dataclass(frozen=True, eq=False)
 class NoiseChange:
-    """More noise at one place.
+    """More noise at one place."""
 
-    Attributes:
-        label: what it is called.
-        name: of the place, as in `Fault`.
-        variance: of the added noise, in the units of the place.
-        interval: its 95 % interval by the likelihood ratio.
-        gain: log-likelihood above that of a healthy plant.
-        scale: factor of the standard deviation of the noise that was there; NaN where the model has none.
-    """
-
-    label: str
-    name: str
-    variance: float
-    interval: tuple[float, float]
-    gain: float
-    scale: float
+    label: str  # of the place and the noise
+    name: str  # of the place, as in `Fault`
+    variance: float  # of the added noise, in the units of the place
+    interval: tuple[float, float]  # its 95 % interval by the likelihood ratio
+    gain: float  # log-likelihood above that of a healthy plant
+    scale: float  # factor of the standard deviation of the noise that was there; NaN where the model has none
 
     @property
     def std(self) -> float:
@@ -159,7 +135,7 @@ class NoiseTest:
         p_value: probability of so large a gain when healthy, by simulation; NaN without one.
         false_alarm: probability of an alarm of a healthy plant.
         draws: simulated healthy windows.
-        onset: sample from which the noise is supposed to have grown.
+        onset: sample from which the noise has increased.
     """
 
     changes: tuple[NoiseChange, ...]
@@ -170,7 +146,7 @@ class NoiseTest:
 
     @property
     def detected(self) -> bool:
-        """Whether the noise has grown somewhere."""
+        """Whether the noise has increased somewhere."""
         return self.p_value <= self.false_alarm
 
     @property
@@ -184,11 +160,7 @@ class NoiseTest:
         return tuple(change.label for change in self.changes if change.gain >= self.changes[0].gain - NATS)
 
     def __getitem__(self, name: str) -> NoiseChange:
-        """Return the result of a place.
-
-        Raises:
-            LookupFailed: not tested.
-        """
+        """Return the result of a place; `LookupFailed` where it was not tested."""
         for change in self.changes:
             if name in (change.label, change.name):
                 return change
@@ -211,16 +183,16 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
     Args:
         found: the candidates: those of kind "noise", or, where there are none, every place of the others.
         whitened: the window; one experiment.
-        onset: sample from which the noise is supposed to have grown.
-        free_start: whether the state at the start of the window may be wrong (as when it was fitted to the window).
+        onset: sample from which the noise has increased.
+        free_start: whether the initial state of the window is unknown (as when it was fitted to the window).
 
     Raises:
-        DataError, StructureError: as `check_window`; no reading sees noise in any of the places.
+        DataError, StructureError: as `check_window`; noise in none of the places reaches a reading.
     """
     check_window(found.model, whitened, "The noise test", onset, LONGEST)
-    start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
-    left, sizes, _ = np.linalg.svd(start, full_matrices=False)
-    start = left[:, sizes > 1e-8 * max(float(sizes.max(initial=0.0)), 1e-300)]
+    from scipy.linalg import orth
+
+    start = orth(start_matrix(whitened), rcond=1e-8) if free_start else np.zeros((whitened.r.size, 0))
     places = []
     for label, candidate in noise_places(found):
         matrix = waveform_matrix(found, candidate, whitened, onset)
@@ -231,7 +203,7 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
             places.append(NoisePlace(label, " | ".join(candidate.places), axes[:, kept], values[kept] ** 2,
                                      _variance(found, candidate)))
     if not places:
-        raise StructureError("No reading of the window sees noise in any of the places.")
+        raise StructureError("Noise in none of the places reaches a reading of the window.")
     return NoiseSearch(tuple(places), start, int(whitened.present.sum()))
 
 
@@ -244,13 +216,13 @@ def noise_test(
     Args:
         found: the candidates, as in `noise_search`.
         whitened: the window; one experiment.
-        onset: sample from which the noise is supposed to have grown.
+        onset: sample from which the noise has increased.
         false_alarm: probability of an alarm of a healthy plant.
         draws: simulated healthy windows behind the p-value.
         seed: of the simulation.
         free_start: as in `noise_search`.
-        search: what `noise_search` returned for a window like this one.
-        healthy: what its `healthy` returned, instead of a simulation.
+        search: from `noise_search` for a window like this one.
+        healthy: from its `healthy`, instead of a simulation.
 
     Raises:
         DataError: innovations that are not finite, or too few draws for so rare an alarm.
@@ -266,7 +238,7 @@ def noise_test(
     levels = prepared.healthy(draws, seed) if healthy is None else healthy
     window = whitened.r.reshape(1, -1)
     rho, gains = prepared.gains(window)
-    clean = (window - (window @ prepared.start) @ prepared.start.T)[0]
+    clean = prepared.cleaned(window)[0]
     changes = [
         NoiseChange(place.label, place.name, float(variance), place.interval(clean, float(variance), float(gain)),
                     float(gain), float(np.sqrt(1 + variance / place.present)) if place.present > 0 else float("nan"))
@@ -278,12 +250,10 @@ def noise_test(
 
 
 def noise_places(found: Dictionary) -> list[tuple[str, Candidate]]:
-    """Return the places where noise may grow, and what an answer calls it there."""
+    """Return the label and the candidate of every place where noise may increase."""
     named = [c for c in found.candidates if c.kind == "noise"]
-    chosen: list[Candidate] = []
-    for candidate in named or [c for c in found.candidates if not c.name.startswith("state")]:
-        if not any(same_place(candidate, other) for other in chosen):
-            chosen.append(candidate)
+    places = by_place(named or [c for c in found.candidates if not c.name.startswith("state")])
+    chosen = [candidates[0] for candidates in places.values()]
     return [(c.label if c.kind == "noise" else " | ".join(f"{place} noise" for place in c.places), c) for c in chosen]
 
 

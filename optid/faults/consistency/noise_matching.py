@@ -1,4 +1,4 @@
-"""Covariances of a window by lag, and what more noise at a place adds to them."""
+"""Covariances of a window by lag, and their signatures of added noise."""
 
 from dataclasses import dataclass
 
@@ -8,75 +8,45 @@ from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.faults.consistency.noise_changes import noise_places
 from optid.faults.signatures import Dictionary
-from optid.faults.whitening import Predictor, Whitened, check_window
+from optid.faults.whitening import Whitened, check_window
 
 
 @dataclass(frozen=True, eq=False)
 class CovarianceProblem:
-    """Lagged covariances of a window less those of a healthy plant, in units of their standard deviations.
+    """Lagged covariances of a window less those of a healthy plant, in units of their standard deviations."""
 
-    Attributes:
-        labels: the C places.
-        target: (M,).
-        signatures: (M, C) what unit variances add.
-        by_process: (M, n n) what the entries of the covariance of added process noise add, column by column.
-        by_sensor: (M, l l) the same for sensor noise.
-        nx: number of states n.
-        l: number of outputs.
-        state_units: (n,) variances of the process noise of the model, the units of Q.
-        output_units: (l,) variances of its sensor noise.
-        lags: largest lag.
-    """
-
-    labels: tuple[str, ...]
-    target: Array
-    signatures: Array
-    by_process: Array
-    by_sensor: Array
-    nx: int
-    l: int  # noqa: E741
-    state_units: Array
-    output_units: Array
-    lags: int
+    labels: tuple[str, ...]  # the C places
+    target: Array  # (M,)
+    signatures: Array  # (M, C) for unit variances
+    by_process: Array  # (M, n n) for the entries of the covariance of added process noise, column by column
+    by_sensor: Array  # (M, l l) the same for sensor noise
+    nx: int  # number of states n
+    l: int  # noqa: E741 - number of outputs
+    state_units: Array  # (n,) variances of the process noise of the model, the units of Q
+    output_units: Array  # (l,) variances of its sensor noise
+    lags: int  # largest lag
 
 
 @dataclass(frozen=True, eq=False)
 class CovarianceMatch:
-    """The variances or covariances that match those of a window.
+    """The variances or covariances that match those of a window."""
 
-    Attributes:
-        labels: the C places.
-        rho: (C,) variance of the added noise in every place; NaN with full covariances.
-        gains: (C,) size of the covariances explained, in standard deviations.
-        Q: (n, n) covariance of the added process noise; None with places.
-        R: (l, l) covariance of the added sensor noise; None with places.
-        objective: half the squares left.
-        gap: relative duality gap.
-        certified: whether it is proved optimal.
-        lags: largest lag.
-        status: why not, where it is not certified.
-    """
-
-    labels: tuple[str, ...]
-    rho: Array
-    gains: Array
-    Q: Array | None
-    R: Array | None
-    objective: float
-    gap: float
-    certified: bool
-    lags: int
-    status: str = ""
+    labels: tuple[str, ...]  # the C places
+    rho: Array  # (C,) variance of the added noise in every place; NaN with full covariances
+    gains: Array  # (C,) size of the covariances explained, in standard deviations
+    Q: Array | None  # (n, n) covariance of the added process noise; None with places
+    R: Array | None  # (l, l) covariance of the added sensor noise; None with places
+    objective: float  # half the squares left
+    gap: float  # relative duality gap
+    certified: bool  # whether it is proved optimal
+    lags: int  # largest lag
+    status: str = ""  # the reason where it is not certified
 
     @property
     def best(self) -> str:
-        """The place that explains most.
-
-        Raises:
-            StructureError: full covariances name no place.
-        """
+        """The place with the largest gain; `StructureError` with full covariances, which have no places."""
         if np.isnan(self.gains).all():
-            raise StructureError("Full covariances name no place: match the candidates (form='places').")
+            raise StructureError("Full covariances have no place: match the candidates (form='places').")
         return self.labels[int(np.nanargmax(self.gains))]
 
     def __str__(self) -> str:
@@ -113,10 +83,10 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
     if lags is None:
         lags = min(whitened.predictor.settling, max(1, used // 10))
     if lags != int(lags) or not 0 <= lags < used:
-        raise StructureError(f"lags={lags!r}; a whole number from 0 to {used - 1} is needed.")
+        raise StructureError(f"lags={lags!r} must be an integer from 0 to {used - 1}.")
     places = noise_places(found)
     if not places:
-        raise StructureError("The dictionary has no place where noise may grow.")
+        raise StructureError("The dictionary has no place where noise may increase.")
     r, complete = whitened.r[onset:], np.asarray(whitened.present[onset:].all(axis=1))
     target, weights = [], []
     upper = np.triu_indices(l)
@@ -132,26 +102,20 @@ def covariance_problem(found: Dictionary, whitened: Whitened, *, lags: int | Non
     weights[0] /= np.sqrt(np.where(upper[0] == upper[1], 2.0, 1.0))  # a variance scatters twice as much
     weight = np.concatenate(weights)[:, None]
     n, steady, noise = found.model.nx, whitened.predictor, found.model.noise
-    by_process = weight * _entries(steady, np.eye(n), np.zeros((l, n)), int(lags))
-    by_sensor = weight * _entries(steady, np.zeros((n, l)), np.eye(l), int(lags))
-    columns = [_entries(steady, c.into_state, c.into_output, int(lags)) @ np.eye(c.into_state.shape[1]).ravel()
-               for _, c in places]
+    length, d = int(lags) + 2 * steady.settling + 2, n + l
+    state, output = np.zeros((length, n, d)), np.zeros((length, l, d))
+    state[0, :, :n], output[0, :, n:] = np.eye(n), np.eye(l)
+    h = steady.whitened(steady.respond(state, output))
+    blocks = [np.einsum("kia,kjb->ijab", h[lag:], h[: length - lag]) for lag in range(int(lags) + 1)]
+    entries = np.concatenate([blocks[0][upper], *(block.reshape(l * l, d, d) for block in blocks[1:])])
+    entries = weight[:, :, None] * entries  # of the entries of a covariance of noise in states and outputs
+    columns = []
+    for _, candidate in places:
+        enters = np.vstack([candidate.into_state, candidate.into_output])
+        columns.append(np.einsum("mab,ac,bc->m", entries, enters, enters))
     assert noise is not None
     units = [np.maximum(np.diag(c), 1e-6 * max(float(np.trace(c)), 1e-300)) for c in (noise.Q, noise.R)]
     return CovarianceProblem(
-        tuple(label for label, _ in places), weight[:, 0] * np.concatenate(target), weight * np.stack(columns, axis=1),
-        by_process, by_sensor, n, l, units[0], units[1], int(lags))
-
-
-def _entries(steady: Predictor, into_state: Array, into_output: Array, lags: int) -> Array:
-    """What the entries of a covariance (d, d) of white noise at a place add to the covariances, (M, d d)."""
-    n, d = into_state.shape
-    l, length = len(into_output), lags + 2 * steady.settling + 2  # noqa: E741
-    state, output = np.zeros((length, n, d)), np.zeros((length, l, d))
-    state[0], output[0] = into_state, into_output
-    h = steady.whitened(steady.respond(state, output))
-    upper, rows = np.triu_indices(l), []
-    for lag in range(lags + 1):
-        both = np.einsum("kia,kjb->ijab", h[lag:], h[: length - lag]).reshape(l, l, d * d)
-        rows.append(both[upper] if lag == 0 else both.reshape(l * l, d * d))
-    return np.concatenate(rows)
+        tuple(label for label, _ in places), weight[:, 0] * np.concatenate(target), np.stack(columns, axis=1),
+        entries[:, :n, :n].reshape(-1, n * n), entries[:, n:, n:].reshape(-1, l * l), n, l, units[0], units[1],
+        int(lags))

@@ -1,4 +1,4 @@
-"""The course of one fault over time, and how it was chosen."""
+"""The course of one fault over time: result, and the regression it is estimated from."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ PRIORS = {
     "trend": "ramps: straight between bends",
     "smooth": "a random walk",
 }
-"""What is believed of the course."""
+"""Priors of the course."""
 
 EACH = 2
 """Degrees of freedom of a change: its size and its place."""
@@ -39,12 +39,12 @@ class Profile:
         std: (N,) standard deviation of the course, given where it changes.
         prior: "tv", "trend" or "smooth".
         changes: {sample: step of the course, or of its slope}; empty for "smooth".
-        bic: {prior: smallest value of the Bayesian information criterion}, of those that were tried.
+        bic: {prior: smallest value of the Bayesian information criterion}.
         freedom: degrees of freedom of the course.
         gap: largest relative duality gap among the programmes behind it.
         certified: whether all of them were solved with a proof.
-        constraints: names of the constraints it obeys.
-        status: why not, where it is not certified.
+        constraints: names of its constraints.
+        status: the reason where it is not certified.
     """
 
     label: str
@@ -74,19 +74,12 @@ class Profile:
 
 @dataclass(frozen=True, eq=False)
 class CourseProblem:
-    """What a window says of the course of one fault; `course_problem` makes it.
+    """Regression of a window on the course of one fault; `course_problem` makes it."""
 
-    Attributes:
-        label: of the candidate.
-        matrix: (N l, N) what unit courses in single samples leave in the window.
-        r: (N l,) the window.
-        readings: number of readings.
-    """
-
-    label: str
-    matrix: Array
-    r: Array
-    readings: int
+    label: str  # of the candidate
+    matrix: Array  # (N l, N) signatures of unit courses in single samples
+    r: Array  # (N l,) the window
+    readings: int  # number of readings
 
     @property
     def count(self) -> int:
@@ -94,12 +87,12 @@ class CourseProblem:
         return self.matrix.shape[1]
 
     def shapes(self, prior: str) -> Array:
-        """Return the courses (N, N) that a unit change at every sample makes: steps, or ramps over the window."""
+        """Return the courses (N, N) of a unit change at every sample: steps, or ramps over the window."""
         steps = np.tril(np.ones((self.count, self.count)))
         return steps if prior == "tv" else steps @ steps / self.count
 
     def refitted(self, columns: Array) -> tuple[Array, float]:
-        """Return the least-squares coefficients of columns (N l, K) and the energy left."""
+        """Return the least-squares coefficients of columns (N l, K) and the residual energy."""
         solved = np.linalg.lstsq(columns, self.r, rcond=1e-10)[0]
         rest = self.r - columns @ solved
         return np.asarray(solved, dtype=float), float(rest @ rest)
@@ -109,9 +102,9 @@ class CourseProblem:
         return energy + freedom * float(np.log(self.readings))
 
     def pruned(self, columns: Array, support: np.ndarray) -> np.ndarray:
-        """Drop changes one by one as long as the criterion falls: neighbours that share one change become one.
+        """Return the changes left of a support by backward elimination as long as the criterion falls.
 
-        The columns (N l, N) are those of all changes; the support is where they are to begin with.
+        The columns (N l, N) are those of all changes.
         """
         kept = list(support)
         best = self.criterion(self.refitted(columns[:, kept])[1], EACH * len(kept)) if kept else np.inf
@@ -119,11 +112,11 @@ class CourseProblem:
             q, triangle = np.linalg.qr(columns[:, kept])
             try:
                 inverse = np.linalg.inv(triangle)
-            except np.linalg.LinAlgError:  # two changes that the window cannot tell apart: either will do
+            except np.linalg.LinAlgError:  # two indistinguishable changes: drop either
                 kept.pop(int(np.argmin(np.abs(np.diag(triangle)))))
                 continue
             solved = inverse @ (q.T @ self.r)
-            loss = solved**2 / np.sum(inverse**2, axis=1)  # by which the energy rises without each of them
+            loss = solved**2 / np.sum(inverse**2, axis=1)  # increase of the energy without each of them
             weakest = int(np.argmin(loss))
             trial = kept[:weakest] + kept[weakest + 1 :]
             value = self.criterion(self.refitted(columns[:, trial])[1], EACH * len(trial))
@@ -133,7 +126,7 @@ class CourseProblem:
         return np.array(kept, dtype=int)
 
     def moved(self, columns: Array, kept: np.ndarray) -> np.ndarray:
-        """Move every change to the sample where it explains most beside the others, until none moves; as `pruned`."""
+        """Move every change to its best sample beside the others, until none moves; arguments as of `pruned`."""
         sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         each = Atoms("change", np.arange(self.count), (columns / sizes).T[:, :, None], np.ones((self.count, 1, 1)), 0.0)
         _, found = exchanged([each], self.r, [("change", int(k)) for k in kept], -1.0)
@@ -141,14 +134,10 @@ class CourseProblem:
 
 
 def course_problem(found: "Scan", label: str) -> CourseProblem:
-    """Return what a window says of the course of one candidate.
-
-    Args:
-        found: the search of the window.
-        label: of a candidate with one magnitude.
+    """Return the regression of the course of one candidate with one magnitude, from the search of the window.
 
     Raises:
-        DataError: the window sees nothing of it.
+        DataError: it has no effect in the window.
         StructureError: a candidate with several magnitudes or of noise, a window that is too long.
     """
     candidate: Candidate = found.dictionary[label]
@@ -165,5 +154,5 @@ def course_problem(found: "Scan", label: str) -> CourseProblem:
         raise StructureError(f"{candidate.label}: its course depends on the input: scan the window with u.")
     matrix = waveform_matrix(found.dictionary, candidate, found.whitened, u=found.u)
     if not np.abs(matrix).max(initial=0.0) > 0:
-        raise DataError(f"{candidate.label}: untestable, nothing in this window would show it.")
+        raise DataError(f"{candidate.label}: untestable, it has no effect in this window.")
     return CourseProblem(candidate.label, matrix, found.whitened.r.ravel(), int(found.whitened.present.sum()))

@@ -1,12 +1,13 @@
-"""Can a fault of any course at one place explain the window? The test that keeps its promise whatever the course (F7).
+"""Test for a fault of any course at one place, with a known probability of rejecting the true place (F7).
 
-The signatures of impulses at all samples of a window span what an arbitrary waveform at a place can leave. What is left
-of the window after projecting on that space is chi-square distributed if the fault is at that place, whatever its
-course was. All places that pass are the consistent set. The response to an unknown initial state is projected out, too.
+The signatures of impulses at all samples of a window span the signatures of all waveforms at a place. The residual of
+the window after projection on that space is chi-square distributed if the fault is at that place, whatever its course.
+All places that pass are the consistent set. The response to an unknown initial state is projected out, too.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,39 +20,26 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
 
 RANK = 1e-10
-"""Singular values below this share of the largest are none."""
-
-FULL = 1e-7
-"""Ratio of the diagonal of a triangular factor above which no singular value is anywhere near `RANK`."""
+"""Singular values below this share of the largest count as zero."""
 
 LONGEST = 6000
 """Readings of a window at most: the cost grows with their cube."""
 
 
 class Consistency(NamedTuple):
-    """Whether a fault of any course at a place explains the window.
+    """Whether a fault of any course at a place explains the window."""
 
-    Attributes:
-        name: of the place, as in `Fault`.
-        labels: of the candidates there.
-        energy: what is left of the window, chi-square distributed with `freedom` if the fault is there.
-        freedom: degrees of freedom.
-        limit: the quantile.
-        p_value: probability of more than this energy if the fault is there.
-        course: (N, d) the waveform that explains most; NaN in samples that no reading sees.
-    """
-
-    name: str
-    labels: tuple[str, ...]
-    energy: float
-    freedom: int
-    limit: float
-    p_value: float
-    course: Array
+    name: str  # of the place, as in `Fault`
+    labels: tuple[str, ...]  # of the candidates there
+    energy: float  # of the residual, chi-square distributed with `freedom` if the fault is there
+    freedom: int  # degrees of freedom
+    limit: float  # the quantile
+    p_value: float  # probability of more than this energy if the fault is there
+    course: Array  # (N, d) the estimated waveform; NaN in samples without effect on a reading
 
     @property
     def consistent(self) -> bool:
-        """Whether the place is not ruled out."""
+        """Whether the place is not rejected."""
         return self.energy <= self.limit
 
 
@@ -61,11 +49,11 @@ class WaveformTest:
 
     Attributes:
         places: the results, most probable first.
-        probability: with which the set holds the true place.
-        healthy: the window as it is: energy of a plant without a fault.
+        probability: with which the set contains the true place.
+        healthy: the test of a plant without a fault.
         onset: first sample that the fault can change.
-        untested: {label: why} of the candidates that may explain anything or are of noise.
-        flat: sensors that repeat one reading to the bit, where the record was given.
+        untested: {label: reason} of the candidates with as many directions as outputs, or of noise.
+        flat: sensors with identical readings, where the record was given.
     """
 
     places: tuple[Consistency, ...]
@@ -77,28 +65,20 @@ class WaveformTest:
 
     @property
     def consistent(self) -> tuple[str, ...]:
-        """Places that are not ruled out, most probable first; a frozen sensor alone where one repeats its reading."""
+        """Places that are not rejected, most probable first; only the frozen sensors where there are some."""
         if self.flat:
             return tuple(dict.fromkeys(line.name for line in self.flat))
         return tuple(place.name for place in self.places if place.consistent)
 
     @property
     def best(self) -> str:
-        """The most probable place.
-
-        Raises:
-            StructureError: nothing was tested.
-        """
+        """The most probable place; `StructureError` where nothing was tested."""
         if not self.flat and not self.places:
             raise StructureError("No place was tested.")
         return self.consistent[0] if self.flat else self.places[0].name
 
     def __getitem__(self, name: str) -> Consistency:
-        """Return the result of a place or of a candidate there.
-
-        Raises:
-            LookupFailed: not tested, with the reason.
-        """
+        """Return the result of a place or of a candidate there; `LookupFailed` with the reason where not tested."""
         for place in self.places:
             if name == place.name or name in place.labels:
                 return place
@@ -107,7 +87,7 @@ class WaveformTest:
         raise LookupFailed(f"{name!r} was not tested. {nearest(name, [place.name for place in self.places])}")
 
     def __str__(self) -> str:
-        """Print the places, and who is consistent."""
+        """Print the places and which are consistent."""
         lines = [f"a fault of any course from sample {self.onset} on; set with probability {self.probability:g}",
                  f"  {'place':<34}{'energy left':>12}{'limit':>9}{'p-value':>10}"]
         for place in (*self.places, self.healthy):
@@ -128,9 +108,9 @@ def waveform_test(
     Args:
         found: the candidates.
         whitened: the window; one experiment.
-        probability: with which the set is to hold the true place.
-        onset: first sample that the fault can change; a later one makes the test sharper.
-        free_start: whether the state at the start of the window may be wrong (as when it was fitted to the window).
+        probability: with which the set is to contain the true place.
+        onset: first sample that the fault can change; a later one makes the test more powerful.
+        free_start: whether the initial state of the window is unknown (as when it was fitted to the window).
         data: the record of the window, for the flat-line test of frozen sensors.
 
     Raises:
@@ -142,21 +122,18 @@ def waveform_test(
     if found.model.l < 2:
         raise StructureError(
             "Not isolable with one output: a fault of any course in any place explains it. Faults of a known course "
-            "(bias, drift, loss) can be told apart by the exact search."
-        )
+            "(bias, drift, loss) are isolable by the exact search.")
     start = start_matrix(whitened) if free_start else np.zeros((whitened.r.size, 0))
-    columns: dict[str, list[Candidate]] = {}
-    untested: dict[str, str] = {}
+    tested, untested = [], {}
     for candidate in found.candidates:
         if candidate.kind == "noise":
             untested[candidate.label] = "noise has no course (see noise_test)"
         elif candidate.into_state.shape[1] >= found.model.l:
             untested[candidate.label] = "as many directions as outputs explain anything"
         else:
-            place = next((name for name, others in columns.items() if same_place(others[0], candidate)), None)
-            columns.setdefault(place or " | ".join(candidate.places), []).append(candidate)
+            tested.append(candidate)
     places = []
-    for name, here in columns.items():
+    for name, here in by_place(tested).items():
         matrix = waveform_matrix(found, here[0], whitened, onset)
         fitted = _fitted(name, matrix, start, whitened, probability, here[0].into_state.shape[1])
         places.append(fitted._replace(labels=tuple(c.label for c in here)))
@@ -168,14 +145,10 @@ def waveform_test(
 
 def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened, onset: int = 0,
                     u: ArrayLike | None = None) -> Array:
-    """Return what unit impulses at every sample from the onset on leave in the window, (N l, (N - onset) d).
+    """Return the signatures of unit impulses at every sample from the onset on, (N l, (N - onset) d).
 
-    Args:
-        found: the dictionary.
-        candidate: whose place it is; the impulses are in units of a bias there, whatever its kind.
-        whitened: the window.
-        onset: first sample.
-        u: (N, m) inputs; with them the impulses of a loss are in units of the share lost.
+    The impulses are in units of a bias at the place of the candidate; with the inputs u (N, m) those of a loss are in
+    units of the share lost.
     """
     count = len(whitened.r)
     state, output = (np.broadcast_to(part, (count, *part.shape)) for part in
@@ -191,11 +164,12 @@ def waveform_matrix(found: Dictionary, candidate: Candidate, whitened: Whitened,
 
 
 def start_matrix(whitened: Whitened) -> Array:
-    """Return what an error of the state at the start leaves in the window, (N l, n)."""
+    """Return the signatures of the initial state, (N l, n)."""
     return whitened.seen(whitened.predictor.jumps(0, whitened.present)).reshape(whitened.r.size, -1)
 
 
 def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probability: float, d: int) -> Consistency:
+    from scipy.linalg import lstsq
     from scipy.special import chdtrc, chdtri
 
     whole, r, readings = np.hstack([matrix, start]), whitened.r.ravel(), int(whitened.present.sum())
@@ -203,34 +177,25 @@ def _fitted(name: str, matrix: Array, start: Array, whitened: Whitened, probabil
     seen = sizes > RANK * max(float(sizes.max(initial=0.0)), 1e-300)
     course, rank, rest = np.full(whole.shape[1], np.nan), 0, r
     if seen.any():
-        axes, solved = _projected(whole[:, seen] / sizes[seen], r)
-        rank, rest = axes.shape[1], r - axes @ (axes.T @ r)
-        course[seen] = solved / sizes[seen]
+        columns = whole[:, seen] / sizes[seen]
+        found: Any = lstsq(columns, r, cond=RANK, lapack_driver="gelsy")
+        solved, rank = found[0], int(found[2])
+        rest, course[seen] = r - columns @ solved, solved / sizes[seen]
     freedom = readings - rank
     if freedom < 1:
         raise DataError(
-            f"{name}: {readings} readings leave nothing to test a waveform of {rank} values with: use a longer window.")
+            f"{name}: {readings} readings are too few to test a waveform of {rank} values: use a longer window.")
     energy = float(rest @ rest)
     return Consistency(name, (), energy, freedom, float(chdtri(freedom, 1 - probability)),
                        float(chdtrc(freedom, energy)), course[: matrix.shape[1]].reshape(-1, d))
 
 
-def _projected(columns: Array, r: Array) -> tuple[Array, Array]:
-    """Return orthonormal axes of the span of columns and the coefficients of least squares."""
-    from scipy.linalg import solve_triangular
-
-    if columns.shape[1] <= columns.shape[0]:
-        axes, triangle = np.linalg.qr(columns)
-        diagonal = np.abs(np.diag(triangle))
-        if diagonal.min() > FULL * diagonal.max():
-            return axes, np.asarray(solve_triangular(triangle, axes.T @ r))
-    left, values, right = np.linalg.svd(columns, full_matrices=False)
-    kept = values > RANK * values[0]
-    axes = left[:, kept]
-    return axes, right[kept].T @ ((axes.T @ r) / values[kept])
-
-
-def same_place(first: Candidate, second: Candidate) -> bool:
-    """Whether two candidates are in one place: waveforms of both are the same."""
-    parts = [np.vstack([c.into_state, c.into_output]) for c in (first, second)]
-    return parts[0].shape == parts[1].shape and bool(np.allclose(*parts, rtol=1e-12, atol=0))
+def by_place(candidates: Iterable[Candidate]) -> dict[str, list[Candidate]]:
+    """Return candidates by the name of their place: those whose waveforms are the same are in one."""
+    found: dict[str, list[tuple[Array, Candidate]]] = {}
+    for candidate in candidates:
+        enters = np.vstack([candidate.into_state, candidate.into_output])
+        place = next((name for name, here in found.items() if enters.shape == here[0][0].shape
+                      and np.allclose(enters, here[0][0], rtol=1e-12, atol=0)), " | ".join(candidate.places))
+        found.setdefault(place, []).append((enters, candidate))
+    return {name: [candidate for _, candidate in here] for name, here in found.items()}

@@ -1,13 +1,13 @@
-"""Thresholds of a running search from the mean time between false alarms that is asked for, by simulation.
+"""Thresholds of a running search from the mean time between false alarms (ARL0), by simulation.
 
-The whitened innovations of a healthy plant are white with unit covariance, so that the search itself can be run on
-random numbers, without the plant; what an uncertain model leaves in them is added. The largest statistics of blocks as
-long as the window are kept. An alarm is a block that exceeds a threshold after one that did not, and the rate of alarms
+The whitened innovations of a healthy plant are white with unit covariance, so that the search itself runs on random
+numbers, without the plant; the effect of an uncertain model on them is added. The largest statistics of blocks as long
+as the window are kept. An alarm is a block that exceeds a threshold after one that did not, and the rate of alarms
 while there is none is
 
     1 / ARL0 = -log(1 - alarms / blocks without an alarm before) / length of a block.
 
-Every candidate gets the same rate of its own, which is found such that all of them together have the rate asked for.
+All candidates have the same rate, such that together they have the rate 1 / ARL0.
 """
 
 import os
@@ -23,40 +23,40 @@ from optid.faults.monitor.columns import Columns, Window
 from optid.faults.whitening import Predictor
 
 ALARMS = 60
-"""False alarms that a simulation must see, so that their rate is known to 13 %."""
+"""False alarms of a simulation by default: their rate is then known to 13 %."""
 
 FEWEST = 50
 """With fewer alarms than this the threshold is extrapolated, or refused."""
 
 LONGEST = 1_000_000
-"""Samples simulated at most, unless more are asked for."""
+"""Samples simulated at most by default."""
 
 CHUNK = 20_000
-"""Samples simulated at a time; every one of them has random numbers of its own."""
+"""Samples simulated at a time."""
 
 RUNS = 4
-"""Simulations that may run at the same time; the result does not depend on how many do."""
+"""Simulations that may run in parallel; the result does not depend on how many do."""
 
 COMMON = 0.1
 """Share of blocks by whose energies a healthy record is compared with the simulation."""
 
 NODES = 80
-"""Nodes of the quadrature; the run lengths of the usual charts are right to ten digits."""
+"""Nodes of the quadrature, for ten digits of the run lengths of the usual charts."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Thresholds and what they rest on.
+    """Thresholds and their basis.
 
     Attributes:
         labels: the candidates.
         q: (C,) their thresholds.
-        arl0: samples between false alarms, asked for.
+        arl0: requested mean number of samples between false alarms.
         window: samples of the window.
         samples: samples simulated.
         alarms: false alarms among them at these thresholds.
         seed: of the simulation.
-        extrapolated: whether the simulation was too short for so rare an alarm and the tail was extrapolated.
+        extrapolated: whether the simulation was too short for this ARL0 and the tail was extrapolated.
         common: largest energy over its threshold that a tenth of the simulated blocks reach; NaN without a simulation.
     """
 
@@ -71,7 +71,7 @@ class Calibration:
     common: float = float("nan")
 
     def __str__(self) -> str:
-        """Say what the thresholds rest on."""
+        """Return the thresholds and the simulation behind them."""
         tail = ", the tail extrapolated" if self.extrapolated else ""
         lines = [f"false alarm every {self.arl0:g} samples: {self.alarms} alarms in {self.samples} simulated{tail}"]
         if not self.samples:
@@ -84,7 +84,7 @@ class Calibration:
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> "Calibration":
-        """Build what `to_dict` described."""
+        """Return the calibration of a description by `to_dict`."""
         return cls(**{**content, "labels": tuple(content["labels"]), "q": np.array(content["q"], dtype=float)})
 
 
@@ -92,7 +92,7 @@ def calibrate(
     columns: Columns, steady: Predictor, window: int, f: Array, arl0: float, *, samples: int | None = None,
     seed: int | None = 0, extrapolate: bool = False, effect: Array | None = None,
 ) -> Calibration:
-    """Find the thresholds of a search.
+    """Return the thresholds of a search; errors as of `Monitor`.
 
     Args:
         columns: of its candidates.
@@ -103,24 +103,17 @@ def calibrate(
         samples: samples to simulate; enough for `ALARMS` false alarms by default, `LONGEST` at most.
         seed: of the simulation.
         extrapolate: whether the tail may be extrapolated where the simulation is too short.
-        effect: (T, l, q) what uncertain parameters of unit variance leave in the innovations along f.
-
-    Raises:
-        StructureError: an ARL0 below the length of the window.
-        DataError: a simulation that cannot support so rare an alarm.
+        effect: (T, l, q) signatures of uncertain parameters of unit variance in the innovations along f.
     """
     if not (np.isfinite(arl0) and arl0 >= window):
-        raise StructureError(
-            f"arl0={arl0!r}: a mean time between false alarms of at least the window, {window} samples, is needed."
-        )
+        raise StructureError(f"arl0={arl0!r}: it must be at least the window, {window} samples.")
     wanted = int(min(max(ALARMS * arl0, 200 * window), LONGEST)) if samples is None else int(samples)
     extrapolated = wanted < FEWEST * arl0
     if extrapolated and not extrapolate:
         raise DataError(
             f"{wanted} simulated samples cannot support a false alarm every {arl0:g}: {FEWEST} alarms are needed. "
-            f"Simulate {int(np.ceil(FEWEST * arl0))} samples (samples=), ask for a lower arl0, or let the tail be "
-            "extrapolated (extrapolate=True)."
-        )
+            f"Simulate {int(np.ceil(FEWEST * arl0))} samples (samples=), use a lower arl0, or extrapolate the tail "
+            "(extrapolate=True).")
     l, period = len(steady.C), max(len(f), 1)  # noqa: E741
     length = max(min(CHUNK, wanted) // window, 1) * window
     count = max(1, -(-wanted // (RUNS * length)))
@@ -134,7 +127,9 @@ def calibrate(
             if effect is not None:  # every stretch has a model of its own
                 r += effect[rows[1:]] @ rng.standard_normal(effect.shape[2])
             inputs = f[rows] if len(f) else np.zeros((len(rows), f.shape[1]))
-            found.append(block_maxima(columns, steady, window, inputs, r)[1:])
+            _, statistic, _ = Window(columns, window, len(steady.A), steady).advance(
+                columns.signals(inputs[:-1], inputs[1:]), r, np.full(len(columns.size), np.inf))
+            found.append(statistic.reshape(-1, window, len(columns.size)).max(axis=1)[1:])
             place = int(rows[-1]) + 1
         return np.vstack(found)
 
@@ -146,39 +141,23 @@ def calibrate(
     return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated, common)
 
 
-def block_maxima(columns: Columns, steady: Predictor, window: int, f: Array, r: Array) -> Array:
-    """Return the largest statistics (B, C) of blocks of W samples along whitened innovations r (T, l).
-
-    The functions f (T + 1, r) of the inputs begin one sample earlier; what is left over at the end does not count.
-    """
-    kept = Window(columns, window, len(steady.A), steady)
-    _, statistic, _ = kept.advance(columns.signals(f[:-1], f[1:]), np.ascontiguousarray(r),
-                                   np.full(len(columns.size), np.inf))
-    count = len(statistic) // window
-    return statistic[: count * window].reshape(count, window, -1).max(axis=1)
-
-
 def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:
-    """Return thresholds (C,) at one rate of their own, all together at the rate 1 / ARL0, and the alarms counted.
+    """Return thresholds (C,) of equal rates, together 1 / ARL0, and the number of alarms.
 
-    They belong to the largest statistics (B, C) of blocks of `length` samples.
+    The largest statistics (B, C) are those of blocks of `length` samples.
     """
     goal = -np.expm1(-length / arl0)
-    level = goal / largest.shape[1]  # as if the candidates had nothing in common
-    few = goal * len(largest) < 0.9 * FEWEST  # too few to count: this level is on the safe side
+    level = goal / largest.shape[1]  # for independent candidates
+    few = goal * len(largest) < 0.9 * FEWEST  # too few to count: this level is conservative
     for _ in range(30):
         q = np.array([tail(column, level) for column in largest.T])
-        alarms, quiet = onsets(np.any(largest > q, axis=1))
-        share = alarms / max(quiet, 1)
+        above = np.any(largest > q, axis=1)
+        alarms, quiet = int(np.sum(above[1:] & ~above[:-1])), int(np.sum(~above[:-1]))
+        share = alarms / max(quiet, 1)  # of the blocks that follow a block without an alarm
         if few or not alarms or abs(share / goal - 1) < 0.005:
             break
         level *= goal / share
     return q, alarms
-
-
-def onsets(above: Any) -> tuple[int, int]:
-    """Return how many blocks begin an alarm, and how many follow one without."""
-    return int(np.sum(above[1:] & ~above[:-1])), int(np.sum(~above[:-1]))
 
 
 def tail(column: Array, level: float) -> float:
@@ -210,12 +189,9 @@ def cusum_arl(shift: float, k: float = 0.5, h: float = 5.0, *, two_sided: bool =
         StructureError: a threshold that is not positive.
     """
     if not (np.isfinite(h) and h > 0 and np.isfinite(k) and np.isfinite(shift)):
-        raise StructureError(f"shift={shift!r}, k={k!r}, h={h!r}: finite numbers and a positive threshold are needed.")
-    rate = 1 / _one_sided(shift, k, h)
-    return 1 / (rate + 1 / _one_sided(-shift, k, h)) if two_sided else 1 / rate
-
-
-def _one_sided(shift: float, k: float, h: float) -> float:
+        raise StructureError(f"shift={shift!r}, k={k!r}, h={h!r}: they must be finite, and h positive.")
+    if two_sided:
+        return 1 / sum(1 / cusum_arl(mean, k, h, two_sided=False) for mean in (shift, -shift))
     from scipy.special import ndtr
 
     nodes, weights = np.polynomial.legendre.leggauss(NODES)

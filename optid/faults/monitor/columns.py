@@ -1,4 +1,4 @@
-"""The columns of the candidates of a monitor, as arrays, and the window that the search keeps of them."""
+"""The columns of the candidates of a monitor, as arrays, and the window of the search."""
 
 from dataclasses import dataclass
 
@@ -16,46 +16,33 @@ COURSES = {"bias": LASTING, "drift": DRIFT, "jump": JUMP, "spike": JUMP, "loss":
 """The course of the columns of a kind; the loss of a stuck actuator, its last column, is driven."""
 
 SPARE = 8
-"""Carried directions for which the search has room, beside twice the widest candidate."""
+"""Carried directions that the search has room for, beside twice the widest candidate."""
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """D columns of C candidates; a stuck actuator has its constants first and the loss last.
+    """D columns of C candidates; a stuck actuator has its constants first and the loss last."""
 
-    Attributes:
-        candidates: (C,).
-        losses: per loss (n, r) and (l, r), what the functions of the inputs add to state and output.
-        into_state: (D, n) what a column adds to the state, per unit of its course.
-        into_output: (D, l) what it adds to the output.
-        course: (D,) of `search_kernel`.
-        driven: (D,) number of the loss, -1 for the others.
-        moving: (D,) whether the column belongs to a candidate with a loss.
-        first: (C,) first column of a candidate.
-        size: (C,) its columns.
-        least: (C,) samples that it needs.
-    """
-
-    candidates: tuple[Candidate, ...]
-    losses: tuple[tuple[Array, Array], ...]
-    into_state: Array
-    into_output: Array
-    course: np.ndarray
-    driven: np.ndarray
-    moving: np.ndarray
-    first: np.ndarray
-    size: np.ndarray
-    least: np.ndarray
+    candidates: tuple[Candidate, ...]  # (C,)
+    losses: tuple[tuple[Array, Array], ...]  # per loss (n, r) and (l, r), from the functions of the inputs
+    into_state: Array  # (D, n) what a column adds to the state, per unit of its course
+    into_output: Array  # (D, l) what it adds to the output
+    course: np.ndarray  # (D,) of `search_kernel`
+    driven: np.ndarray  # (D,) number of the loss, -1 for the others
+    moving: np.ndarray  # (D,) whether the column belongs to a candidate with a loss
+    first: np.ndarray  # (C,) first column of a candidate
+    size: np.ndarray  # (C,) number of its columns
+    least: np.ndarray  # (C,) fewest samples since its onset
 
     @property
     def arrays(self) -> tuple[np.ndarray, ...]:
-        """What the search needs of them."""
+        """The arguments of the search."""
         return (self.into_state, self.into_output, self.course, self.driven, self.moving, self.first, self.size,
                 self.least)
 
     @property
     def pairs(self) -> np.ndarray:
-        """(C,) products of the columns of a candidate with one another; the kernel keeps them in this order."""
+        """(C,) number of products of the columns of a candidate with one another, in the order of the kernel."""
         return self.size * (self.size + 1) // 2
 
     def of(self, number: int) -> slice:
@@ -65,9 +52,7 @@ class Columns:
     def signals(self, before: Array, f: Array) -> tuple[Array, Array]:
         """Return what losses add to the state (T, M, n) and to the output (T, M, l).
 
-        Args:
-            before: (T, r) functions of the inputs one sample earlier.
-            f: (T, r) functions of the inputs.
+        The functions (T, r) of the inputs are those one sample earlier, for the state, and those of the sample.
         """
         state, output = (np.empty((len(f), len(self.losses), part.shape[1]))
                          for part in (self.into_state, self.into_output))
@@ -78,10 +63,9 @@ class Columns:
 
     def units(self, before: Array, f: Array) -> tuple[Array, Array]:
         """Return what each column adds to the state (D, n) and output (D, l) at one sample, per unit of its course."""
-        into_state, into_output = self.into_state.copy(), self.into_output.copy()
-        for j in np.flatnonzero(self.driven >= 0):
-            into_state[j] = self.losses[self.driven[j]][0] @ before
-            into_output[j] = self.losses[self.driven[j]][1] @ f
+        into_state, into_output, lost = self.into_state.copy(), self.into_output.copy(), self.driven >= 0
+        for part, signal in zip((into_state, into_output), self.signals(before[None], f[None])):
+            part[lost] = signal[0, self.driven[lost]]
         return into_state, into_output
 
     def in_order(self, number: int, sizes: Array) -> tuple[float, ...]:
@@ -113,12 +97,10 @@ def columns_of(model: HammersteinSS, candidates: tuple[Candidate, ...]) -> Colum
 
 
 class Window:
-    """What the search keeps of the last W samples; see `search_kernel.search`.
+    """The memory of the search over the last W samples; see `search_kernel.search`.
 
     Attributes:
-        columns: the candidates.
-        length: samples W.
-        steady: the predictor.
+        columns, length, steady: the candidates, the samples W, the predictor.
         xi, b, gram, grown, clock: memory of the search.
         clean: (1,) samples searched by the steady predictor since another one was used.
         whitened: (W, l) innovations, by sample.
@@ -129,7 +111,7 @@ class Window:
     KEPT = "xi", "b", "grown", "gram", "whitened", "readings", "statistic", "peak", "weight", "clock", "clean"
 
     def __init__(self, columns: Columns, length: int, room: int, steady: Predictor) -> None:
-        """Set up an empty window; room is the largest number of states, carried faults included."""
+        """Set up an empty window with room for so many states, carried faults included."""
         self.columns, self.length, self.steady = columns, length, steady
         D, C, l = len(columns.course), len(columns.size), len(steady.C)  # noqa: E741
         pairs = int(columns.pairs.sum())
@@ -147,7 +129,7 @@ class Window:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all onsets before the next sample."""
+        """Discard all onsets before the next sample."""
         self.clock[0] = self.clean[0] = 0
         self.statistic, self.weight = np.zeros(len(self.peak)), np.full(len(self.peak), -1.0)
         self.peak[:] = 0
@@ -160,7 +142,7 @@ class Window:
         return done, statistic[:done], weight[:done]
 
     def _leave_tables(self) -> None:
-        """Write what the tables stand for to the deviations and products that are followed."""
+        """Copy the tables to the deviations and products that are followed."""
         still, shift = ~self.columns.moving, self.length - 1 - int(self.clock[0] - 1) % self.length
         at = (shift + np.arange(self.length)) % self.length
         self.xi[still] = 0.0
@@ -176,7 +158,7 @@ class Window:
             signals: of the losses.
             r: (T, l) whitened innovations.
             limit: (C,).
-            matrices: transition, output, gain and root of one sample that the steady predictor does not describe.
+            matrices: transition, output, gain and root of one sample without the steady predictor.
             shown: readings of that sample.
         """
         start = int(self.clock[0])
@@ -215,6 +197,6 @@ class Window:
         return self.whitened[(self.clock[0] - 1 - np.arange(count)) % self.length]
 
     def drop(self, row: int) -> None:
-        """Take a carried direction out of the deviations."""
+        """Remove a carried direction from the deviations."""
         self.xi[:, row:-1] = self.xi[:, row + 1 :].copy()
         self.xi[:, -1] = 0.0

@@ -1,7 +1,7 @@
-"""The decisions of a monitor: alarm, name, carry, clear."""
+"""The decisions of a monitor: raise an alarm, isolate, carry and clear a fault."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,67 +17,41 @@ RULES = {
 }
 """Numbers of the decisions.
 
-A fault is named once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
-samples with all statistics below `release` of their thresholds. A named fault is carried `settle` samples later.
-A transient is over when what is left of it has this energy (`faded`). A carried fault is no longer estimated when
-the error of its size has this energy in a window (`learned`), and is gone when its significance falls below this share
-of the threshold (`forgiven`). Nothing explains an alarm when the energy that is left is so many standard deviations too
-large (`odd`).
+A fault is isolated once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
+samples with all statistics below `release` of their thresholds. An isolated fault is carried `settle` samples later.
+A transient ends when its energy falls to `faded`. A carried fault is no longer estimated when the error of its size has
+the energy `learned` in a window, and is cleared when its significance falls below the share `forgiven` of the
+threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
 """
 
-ODD = 4.3
-"""Standard deviations by which what more noise of one sensor leaves along the others may be too large."""
-
 FEWEST = 4
-"""Samples that a noise must have grown for."""
+"""Fewest samples of increased noise."""
 
 WATCHING, NAMING, SETTLING, LOST = range(4)
-"""Phases: no alarm; alarm, not named; named, the size still growing sharp; an alarm that no candidate explains."""
+"""Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains."""
 
 NOTHING, AGAIN = -1, -2
-"""No candidate is named; the alarm is one that no candidate has explained before."""
-
-
-class Loudness(NamedTuple):
-    """The sensor whose noise seems to have grown: -1 for none; by which factor, for how many samples, and the gain."""
-
-    sensor: int = -1
-    factor: float = 1.0
-    count: int = 0
-    gain: float = 0.0
+"""No candidate is isolated; no candidate has explained the alarm before."""
 
 
 @dataclass(eq=False)
 class Decisions:
-    """State of the decisions.
+    """State of the decisions."""
 
-    Attributes:
-        columns: the candidates.
-        labels: what they are called.
-        q: (C,) their thresholds.
-        rules: numbers, see `RULES`.
-        outputs: names of the sensors.
-        phase, alarm, named, named_at, quiet: where the decisions are.
-        begun: first sample after the last input of which nothing is known.
-        testable: (C,) whether a whole loss would be noticed.
-        passing: [candidate, sample at which it has faded] of transients.
-        kept: the statistics (T, C) of all samples, where they are asked for.
-    """
-
-    columns: Columns
-    labels: tuple[str, ...]
-    q: Array
-    rules: dict[str, float]
-    outputs: tuple[str, ...]
-    testable: np.ndarray
-    passing: list[list[int]]
+    columns: Columns  # of the candidates
+    labels: tuple[str, ...]  # of the candidates
+    q: Array  # (C,) their thresholds
+    rules: dict[str, float]  # numbers, see `RULES`
+    outputs: tuple[str, ...]  # names of the sensors
+    testable: np.ndarray  # (C,) whether a total loss is detectable
+    passing: list[list[int]]  # [candidate, sample at which it has faded] of transients
     phase: int = WATCHING
-    alarm: int = 0
-    named: int = NOTHING
-    named_at: int = 0
-    quiet: int = 0
-    begun: int = 0
-    kept: list[Array] | None = None
+    alarm: int = 0  # sample of the alarm
+    named: int = NOTHING  # isolated candidate
+    named_at: int = 0  # sample at which it was isolated
+    quiet: int = 0  # consecutive samples with statistics below the release level
+    begun: int = 0  # first sample after the last unknown input
+    kept: list[Array] | None = None  # the statistics (T, C) of all samples, where they are requested
 
     KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "passing"
 
@@ -92,14 +66,14 @@ class Decisions:
         return self.phase == WATCHING and not self.passing
 
     def count_quiet(self, statistic: Array) -> None:
-        """Count the samples (T, C) at the end of a block in which all is quiet."""
+        """Count the samples at the end of a block with all statistics (T, C) below the release level."""
         loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.q, axis=1))
         self.quiet = self.quiet + len(statistic) if not loud.size else len(statistic) - 1 - int(loud[-1])
         if self.kept is not None:
             self.kept.append(statistic)
 
     def excitation(self, weight: Array, now: int, window: int) -> list[Event]:
-        """Return what becomes testable or untestable along weights (T, C) of samples from `now` on."""
+        """Return the events "testable" and "untestable" of weights (T, C) of samples from `now` on."""
         events, samples = [], now + np.arange(len(weight))
         for c, candidate in enumerate(self.columns.candidates):
             if candidate.additive:
@@ -115,7 +89,7 @@ class Decisions:
         return sorted(events, key=lambda e: e.sample)
 
     def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
-        """Decide what the last sample means; nothing may be named while a sensor repeats its reading (`hold`)."""
+        """Return the event of the last sample; no fault is isolated while a sensor repeats its reading (`hold`)."""
         gains = np.where(window.peak > 0, window.statistic - self.q, -np.inf)
         best, watching = int(np.argmax(gains)), self.phase == WATCHING
         if self.phase in (WATCHING, LOST) and gains[best] > 0:
@@ -134,12 +108,12 @@ class Decisions:
         return Event("cleared", now)
 
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
-        rule, noise = self.rules, noisy_sensor(window)
-        # a noise that has grown is an answer, too, and the likely one where it was the answer before
-        louder = noise.gain - float(self.q.min()) * (self.named != AGAIN)
+        rule, noise = self.rules, self._noisy_sensor(now, window)
+        # increased noise is an answer, too, and the likely one where no candidate explained the alarm before
+        louder = (0.0 if noise is None else noise.statistic) - float(self.q.min()) * (self.named != AGAIN)
         share = np.exp(np.clip(np.append(gains, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
-        chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is named
+        chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is isolated
         if self.phase == NAMING:
             odd, free = self._left_over(best, window)
             waited = now - self.alarm
@@ -171,34 +145,30 @@ class Decisions:
         return None
 
     def forgive(self, window: Window) -> None:
-        """Watch from the next sample on, as if there had been no alarm."""
+        """Discard the alarm from the next sample on."""
         window.restart()
         self.phase, self.named, self.quiet = WATCHING, NOTHING, 0
 
-    def _lost(self, now: int, best: int, window: Window, noise: Loudness) -> Event | None:
+    def _lost(self, now: int, best: int, window: Window, noise: Event | None) -> Event | None:
         said, onset = self.named == AGAIN, now - int(window.peak[best]) + 1
         energy = float(window.statistic[best])
         self.phase, self.named, self.quiet = LOST, AGAIN, 0
         window.restart()
         if said:
             return None
-        if noise.gain > self.q.min():
-            return Event("isolated", now, ((f"sensor:{self.outputs[noise.sensor]} noise", 1.0),), now - noise.count + 1,
-                         (noise.factor,), noise.gain, "size is the factor of the standard deviation")
+        if noise is not None and noise.statistic > self.q.min():
+            return noise
         return Event("isolated", now, (("unknown", 1.0),), onset, (), energy, "no candidate explains it")
 
     def _left_over(self, number: int, window: Window) -> tuple[float, float]:
-        """How many deviations more than noise a candidate leaves since its onset, and on how many readings."""
+        """Excess of the residual since the onset of a candidate in standard deviations, and degrees of freedom."""
         if not np.isfinite(self.rules["odd"]):
             return 0.0, np.inf
         energy, free = window.since(number)
         free -= float(self.columns.size[number])
         if free < 1:
             return 0.0, free
-        # Wilson and Hilferty: the cube root of chi2 / free is nearly Gaussian
-        spread = 2 / (9 * free)
-        left = max(energy - float(window.statistic[number]), 0.0)
-        return float(((left / free) ** (1 / 3) - 1 + spread) / np.sqrt(spread)), free
+        return float(excess(max(energy - float(window.statistic[number]), 0.0), free)), free
 
     def _event(self, kind: str, now: int, best: int, gains: Array, window: Window) -> Event:
         weight = np.exp((gains - gains.max()) / 2)
@@ -207,16 +177,16 @@ class Decisions:
         kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
         note = ""
         if kind == "isolated" and not (self.columns.candidates[best].additive or self.testable[best]):
-            note = "the actuator hardly moves: its loss cannot be told from a constant"
+            note = "the actuator hardly moves: its loss is not isolable from a constant"
         elif kind == "isolated" and kept > 1:
-            note = "not told apart in time"
+            note = "not isolated in time"
         sizes, _, _ = window.estimate(best)
         return Event(kind, now, tuple((self.labels[c], float(weight[c])) for c in order[:kept]),
                      now - int(window.peak[best]) + 1, self.columns.in_order(best, sizes),
                      float(window.statistic[best]), note)
 
     def _review(self, now: int, window: Window, plant: RunningFilter) -> Event | None:
-        """Drop carried faults that have gone, hold those that are known well; report the first one gone."""
+        """Clear carried faults that have vanished, hold those that have converged; return the first one cleared."""
         for number, (owner, until) in enumerate(self.passing):
             if now >= until:
                 del self.passing[number]
@@ -242,6 +212,23 @@ class Decisions:
                     plant.forget(p, window)
         return None
 
+    def _noisy_sensor(self, now: int, window: Window) -> Event | None:
+        """The sensor whose noise has most likely increased; the statistic is twice the log-likelihood gained.
+
+        More noise of one sensor increases the whitened innovations along one direction alone.
+        """
+        r, root = window.recent(min(int(window.clock[0]), window.length)), window.steady.root
+        l, n = r.shape[1], np.arange(1, len(r) + 1)[:, None]  # noqa: E741
+        along = np.cumsum((r @ (root / np.linalg.norm(root, axis=0))) ** 2, axis=0)
+        share, total = along / n, np.cumsum(np.sum(r**2, axis=1))[:, None]
+        alike = (l == 1) | (excess(total - along, np.maximum((l - 1) * n, 1)) < RULES["odd"])
+        gain = np.where((share > 1) & (n >= FEWEST) & alike, n * (share - 1 - np.log(np.maximum(share, 1.0))), 0.0)
+        if not gain.any():
+            return None
+        k, o = np.unravel_index(int(np.argmax(gain)), gain.shape)
+        return Event("isolated", now, ((f"sensor:{self.outputs[o]} noise", 1.0),), now - int(k),
+                     (float(np.sqrt(share[k, o])),), float(gain[k, o]), "size is the factor of the standard deviation")
+
 
 def _fading(plant: RunningFilter, energy: float, faded: float) -> int:
     """Samples after which a transient has faded."""
@@ -251,22 +238,10 @@ def _fading(plant: RunningFilter, energy: float, faded: float) -> int:
     return 1 + int(np.ceil(np.log(faded / energy) / np.log(min(max(radius, 1e-6), 1 - 1e-6)) / 2))
 
 
-def noisy_sensor(window: Window) -> Loudness:
-    """Return the sensor whose noise has most likely grown since some sample, and twice the log-likelihood gained.
+def excess(energy: Any, free: Any) -> Any:
+    """Return the excess of energies over chi-square with `free` degrees of freedom, in standard deviations.
 
-    More noise of one sensor makes the whitened innovations larger along one direction alone, the others stay as they
-    are.
+    The cube root of chi2 / free is nearly Gaussian (Wilson and Hilferty 1931).
     """
-    r, root = window.recent(min(int(window.clock[0]), window.length)), window.steady.root
-    l, n = r.shape[1], np.arange(1, len(r) + 1)[:, None]  # noqa: E741
-    along = np.cumsum((r @ (root / np.linalg.norm(root, axis=0))) ** 2, axis=0)
-    share, free = along / n, (l - 1) * n
-    total = np.cumsum(np.sum(r**2, axis=1))[:, None]
-    # Wilson and Hilferty: the cube root of chi2 / free is nearly Gaussian
-    rest = np.cbrt((total - along) / np.maximum(free, 1)) - 1 + 2 / (9 * np.maximum(free, 1))
-    possible = (share > 1) & (n >= FEWEST) & ((l == 1) | (rest < ODD * np.sqrt(2 / (9 * np.maximum(free, 1)))))
-    gain = np.where(possible, n * (share - 1 - np.log(np.maximum(share, 1.0))), 0.0)
-    if not gain.any():
-        return Loudness()
-    k, o = (int(i) for i in np.unravel_index(int(np.argmax(gain)), gain.shape))
-    return Loudness(o, float(np.sqrt(share[k, o])), k + 1, float(gain[k, o]))
+    spread = 2 / (9 * free)
+    return (np.cbrt(energy / free) - 1 + spread) / np.sqrt(spread)

@@ -1,4 +1,4 @@
-"""What a monitor says."""
+"""The events of a monitor and the faults that it carries."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,19 +6,18 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened.
+    """An event reported by the monitor.
 
     Attributes:
-        kind: "alarm", "isolated" (the set of candidates shrank to one, or did not in time), "cleared", "untestable" (a
-            whole loss of the actuator would go unnoticed, or be taken for a constant), "testable" (again), "outside"
-            (an input left the identified range) or "inside" (again).
-        sample: when, counted from the first sample that the monitor saw.
-        candidates: (label, posterior), most probable first, those of the 95 % set; ("unknown", 1.0) where nothing
-            explains the alarm.
-        onset: sample that the fault began at, of the first candidate; for "untestable" the sample since when.
+        kind: "alarm", "isolated" (one candidate is left, or several after the time allowed), "cleared", "untestable"
+            (a total loss of the actuator is not detectable, or not isolable from a constant), "testable" (again),
+            "outside" (an input left the identified range) or "inside" (again).
+        sample: counted from the first sample of the stream.
+        candidates: (label, posterior) of the 95 % set, most probable first; ("unknown", 1.0) where none explains it.
+        onset: first sample of the fault, of the first candidate; for "untestable" the first untestable sample.
         size: magnitudes of the first candidate, as in `Dictionary.signature`.
-        statistic: energy that the first candidate explains; of "untestable" the energy that a whole loss would have.
-        note: what else is to be known.
+        statistic: energy explained by the first candidate; of "untestable" that of a total loss.
+        note: remark.
     """
 
     kind: str
@@ -30,7 +29,7 @@ class Event:
     note: str = ""
 
     def __str__(self) -> str:
-        """Say it in one line."""
+        """Return the event in one line."""
         text = f"{self.sample}: {self.kind}"
         if self.candidates:
             names = [label if p >= 0.995 else f"{label} ({p:.0%})" for label, p in self.candidates[:3]]
@@ -49,19 +48,13 @@ class Event:
 
 @dataclass(frozen=True)
 class Carried:
-    """A fault that was named and is accounted for since.
+    """An isolated fault whose effect is compensated."""
 
-    Attributes:
-        label: the candidate.
-        size: its magnitudes.
-        deviation: their standard deviations; zero once they are known well enough and no longer estimated.
-    """
-
-    label: str
-    size: tuple[float, ...]
-    deviation: tuple[float, ...]
+    label: str  # the candidate
+    size: tuple[float, ...]  # its magnitudes
+    deviation: tuple[float, ...]  # their standard deviations; zero once they are held and no longer estimated
 
     def __str__(self) -> str:
-        """Say it in one line."""
+        """Return the fault in one line."""
         sizes = ", ".join(f"{size:.4g} +- {spread:.2g}" for size, spread in zip(self.size, self.deviation))
         return f"carried: {self.label}, size {sizes}"

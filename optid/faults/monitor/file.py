@@ -1,4 +1,4 @@
-"""The state of a monitor on disk: everything that the next sample needs, restored bit for bit."""
+"""The state of a monitor on disk, restored bit for bit."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,12 +26,12 @@ PREDICTOR = "A", "C", "L", "K", "covariance", "root"
 
 
 def _parts(monitor: "Monitor") -> dict[str, tuple[Any, tuple[str, ...]]]:
-    """What the arrays of the state belong to, by the first word of their names."""
+    """The owners of the arrays of the state, by the prefix of their names."""
     return {"search": (monitor.search, Window.KEPT), "plant": (monitor.plant, RunningFilter.KEPT)}
 
 
 def save(monitor: "Monitor", path: str | Path) -> Path:
-    """Write dictionary, thresholds and state; the file appears complete or not at all."""
+    """Write dictionary, thresholds and state atomically."""
     found, plant, decisions = monitor.dictionary, monitor.plant, monitor.decisions
     head = {
         "model": found.model.to_dict(), "candidates": [{w: getattr(c, w) for w in WORDS} for c in found.candidates],
@@ -51,7 +51,7 @@ def save(monitor: "Monitor", path: str | Path) -> Path:
 
 
 def load(monitor: "Monitor", path: str | Path, functions: dict[str, Any] | None = None) -> None:
-    """Fill a monitor that has not been set up; arguments and errors as of `Monitor.load`."""
+    """Fill an empty monitor; arguments and errors as of `Monitor.load`."""
     try:
         head, _ = read_state(path, "monitor", VERSION, [])
         names = [f"{place}_{i}" for i in range(len(head["candidates"])) for place in PLACES]

@@ -1,4 +1,4 @@
-"""What healthy records say about the noise: its colour, its size, and how much the thresholds must rise."""
+"""The noise of healthy records: its colour, its size, and the thresholds that it requires."""
 
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from optid.faults.monitor.monitoring import Monitor
 
 FEWEST = 20
-"""Windows that a healthy record has at least."""
+"""Fewest windows of a healthy record."""
 
 ORDERS = 1, 2, 3, 4, 6, 8
 """Orders of the autoregressions tried for innovations that are not white."""
@@ -30,15 +30,10 @@ LONGEST = 3000
 
 
 def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> tuple[Array, Array]:
-    """Return what uncertain parameters of unit variance leave in the whitened innovations of the record they came from.
+    """Return signatures (T, l, q) of uncertain parameters of unit variance, and the functions of the inputs (T, r).
 
-    Args:
-        known: the uncertainty.
-        data: the record.
-        steady: what whitens: the predictor of the uncertainty, or that with the colour of a healthy record.
-
-    Returns:
-        (T, l, q), and the functions of the inputs (T, r) along which it does.
+    The innovations are those of the record of the identification, whitened by the predictor of the uncertainty or by
+    that with the colour of a healthy record.
     """
     raw = in_units_of(known.model, data)
     given = known.model.initial_state(raw, "predict")
@@ -47,26 +42,21 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
         by_parameter, _ = sensitivities(known.model, known.predictor, here, x0, there, known.root)
-        effects.append(_recoloured_effect(by_parameter.reshape(*here.y.shape, -1), known.predictor, steady))
+        raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
+        effect, taps = raw_effect.copy(), steady.C[:, known.model.nx :]  # the last states are past innovations
+        for lag in range(1, taps.shape[1] // here.y.shape[1] + 1):
+            effect[lag:] -= taps[:, (lag - 1) * len(taps) : lag * len(taps)] @ raw_effect[:-lag]
+        effects.append(steady.root @ effect)
         inputs.append(known.model.expanded(here.u))
     return np.concatenate(effects), np.nan_to_num(np.concatenate(inputs))
 
 
-def _recoloured_effect(effect: Array, before: Predictor, steady: Predictor) -> Array:
-    """Whiten (T, l, q) by a predictor whose last states are the past innovations of another one."""
-    raw, taps = np.linalg.pinv(before.root) @ effect, steady.C[:, len(before.A) :]
-    left = raw.copy()
-    for lag, tap in enumerate(np.split(taps, taps.shape[1] // len(raw[0]), axis=1) if taps.size else [], start=1):
-        left[lag:] -= tap @ raw[:-lag]
-    return steady.root @ left
-
-
 def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
-    """Return a dictionary with the noise that a healthy record shows, and what was changed.
+    """Return a dictionary with the noise of a healthy record, and a remark on the change.
 
-    Samples after an input left its identified range say nothing of the noise. Innovations that are white and of the
-    size predicted leave the dictionary as it is. Otherwise they get an autoregression, whose order is chosen by BIC;
-    its past innovations are states beside those of the plant.
+    Samples after an input left its identified range are not used. Innovations that are white and of the predicted size
+    leave the dictionary unchanged. Otherwise they get an autoregression, whose order is chosen by BIC; its past
+    innovations are states beside those of the plant.
     """
     steady = found.predictor
     whole: list[Any] = as_list(whiten(found.model, healthy, scale=steady))
@@ -90,7 +80,7 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
 
 
 def _autoregression(signals: list[Array], orders: tuple[int, ...]) -> tuple[list[Array], Array]:
-    """Taps (l, l) and covariance of what is left, by least squares; the order by BIC."""
+    """Taps (l, l) and covariance of the residuals, by least squares; the order by BIC."""
     l, best = signals[0].shape[1], (np.inf, [], np.eye(1))  # noqa: E741
     most = max(orders)
     for order in orders:
@@ -106,7 +96,7 @@ def _autoregression(signals: list[Array], orders: tuple[int, ...]) -> tuple[list
 
 
 def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dictionary:
-    """Put an autoregression of the innovations into the state."""
+    """Augment the state by an autoregression of the innovations."""
     model, steady = found.model, found.predictor
     n, l, p = model.nx, model.l, len(taps)  # noqa: E741
     more = p * l
@@ -132,11 +122,11 @@ def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dict
 
 
 def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
-    """Return thresholds that a healthy record keeps: all of them get one factor, never below one.
+    """Return thresholds that a healthy record does not exceed: those of `base` times a factor of at least one.
 
-    A record is rarely long enough to show alarms as rare as a monitor wants them. The factor is the larger of two: how
-    much larger the energies are that a tenth of its windows reach than those of the simulation behind `base`, and what
-    the largest of all asks for.
+    A record is rarely long enough for its false-alarm rate to be measured. The factor is the larger of two: the ratio
+    of the energies that a tenth of its windows exceed to those of the simulation, and 1.05 times its largest energy
+    over the threshold.
 
     Raises:
         DataError: a record of fewer than 20 windows.
@@ -147,8 +137,7 @@ def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calib
     largest = np.max(blocks / base.q, axis=1)
     if len(largest) < FEWEST:
         raise DataError(
-            f"The healthy record has {len(largest)} stretches of {window} samples: {FEWEST} are needed for thresholds."
-        )
+            f"The healthy record has {len(largest)} stretches of {window} samples: {FEWEST} are needed for thresholds.")
     ratio = float(np.quantile(largest, 1 - COMMON)) / base.common
     factor = max(1.0, ratio, 1.05 * float(largest.max()))
     return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.y) for part in records))

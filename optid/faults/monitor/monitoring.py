@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 KINDS_BY_DEFAULT = ("bias", "loss", "spike")
 
 INPUTS, HOLD = 20_000, 5
-"""Samples of simulated input for the calibration, and those over which it keeps its level."""
+"""Samples of simulated input for the calibration, and samples per level."""
 
 BLOCK = 4096
 """Samples searched at a time."""
@@ -44,18 +44,18 @@ _KNOWN: dict[str, Calibration] = {}
 class Monitor:
     """A search for the faults of a dictionary on a stream.
 
-    It is a state: `step` and `run` change it. Missing readings correct nothing and count for nothing. What an input
-    does is taken as unknown while it is missing or outside the range in which the model was identified.
+    `step` and `run` change its state. Missing readings are left out. The effect of an input is unknown while it is
+    missing or outside the range in which the model was identified.
 
     Attributes:
-        dictionary: the faults; its model has the noise of the healthy records, where they asked for another.
-        labels: of the candidates looked for.
-        skipped: {label: why} of the others.
-        calibration: the thresholds and what they rest on.
+        dictionary: the faults; its model has the noise of the healthy records where that differs.
+        labels: of the candidates searched for.
+        skipped: {label: reason} of the others.
+        calibration: the thresholds and their basis.
         window: samples of the window.
         seed: of the simulation.
-        remark: what the healthy records showed; empty without.
-        source: JSON types that are kept with the state: where the stream came from.
+        remark: on the noise of the healthy records; empty without.
+        source: origin of the stream in JSON types, kept with the state.
     """
 
     def __init__(
@@ -68,16 +68,16 @@ class Monitor:
 
         Args:
             model: the healthy model, with noise covariances.
-            faults: what is thought possible; by default biases, losses, spikes and a jump of the state.
+            faults: the dictionary; by default biases, losses, spikes and a jump of the state.
             arl0: mean number of samples between false alarms.
-            window: samples that an onset is looked for in.
+            window: samples in which an onset is searched.
             seed: of the simulation.
             thresholds: a `Calibration` of an earlier monitor, {label: threshold} or (C,), instead of a simulation.
             x0: the state before the first sample: "unknown", "zero" or (n,).
-            healthy: a healthy record that the model was not identified from: the noise that it shows is used, and the
-                thresholds are raised until the record keeps the rate of alarms.
-            uncertainty: the record that the model was identified from, or `model_uncertainty` of it: what the
-                parameters do not know raises the thresholds.
+            healthy: a healthy record other than that of the identification: its noise is used, and the thresholds are
+                raised to its rate of alarms.
+            uncertainty: the record of the identification, or `model_uncertainty` of it: the uncertainty of the
+                parameters raises the thresholds.
             u: (N, m) inputs typical of the healthy plant, for the thresholds of losses and stuck actuators; levels over
                 the intervals of the nonlinearities by default.
             samples: length of the simulation.
@@ -89,14 +89,14 @@ class Monitor:
             DataError: a simulation too short for the ARL0; a healthy record that is too short.
 
         Warns:
-            DataWarning: candidates that a monitor cannot look for; a healthy record of other noise than the model says.
+            DataWarning: candidates that a monitor cannot search for; a healthy record with other noise than the model.
         """
         found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
         if found.model is not model:
             raise StructureError("faults: the dictionary belongs to another model; build it from this one.")
         least = 2 * model.nx + 2
         if isinstance(window, bool) or int(window) != window or window < least:
-            raise StructureError(f"window={window!r}: at least {least} samples are needed for {model.nx} states.")
+            raise StructureError(f"window={window!r}: it must be at least {least} samples for {model.nx} states.")
         unknown = set(rules) - set(RULES)
         if unknown:
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
@@ -132,18 +132,17 @@ class Monitor:
         self.dictionary, self.window, self.seed, self.source = found, window, seed, None
         chosen = tuple(c for c in found.candidates if c.kind in COURSES and not (c.kind == "loss" and not c.columns))
         if not chosen:
-            raise StructureError("No candidate has a signature that a monitor could look for: add the kind 'bias'.")
+            raise StructureError("No candidate has a signature that a monitor can search for: add the kind 'bias'.")
         self.labels = tuple(c.label for c in chosen)
         self.skipped = {
-            c.label: "the readings themselves show it, whatever is asked for" if c.kind in ("frozen", "noise") else
-            "it has no signature that a running search could look for"
+            c.label: "it is detected from the readings in any case" if c.kind in ("frozen", "noise") else
+            "it has no signature that a running search can search for"
             for c in found.candidates if c not in chosen
         }
         model, steady = found.model, found.predictor
         if not model.parts.tables.compiled:
             raise StructureError(
-                "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first."
-            )
+                "The feedback has functions of the user, which cannot be compiled. Fit them by another basis first.")
         self.columns = columns_of(model, chosen)
         self.search = Window(self.columns, window, model.nx + SPARE + 2 * int(self.columns.size.max()), steady)
         self.plant = RunningFilter(model, steady, self.columns)
@@ -171,8 +170,7 @@ class Monitor:
             if thresholds.labels != self.labels or thresholds.window != self.window:
                 raise StructureError(
                     f"thresholds: they are those of {', '.join(thresholds.labels)} in a window of "
-                    f"{thresholds.window}; this monitor looks for {', '.join(self.labels)} in {self.window}."
-                )
+                    f"{thresholds.window}; this monitor searches for {', '.join(self.labels)} in {self.window}.")
             return thresholds
         if isinstance(thresholds, Mapping):
             missing = [label for label in self.labels if label not in thresholds]
@@ -181,7 +179,7 @@ class Monitor:
             thresholds = [thresholds[label] for label in self.labels]
         q = np.array(thresholds, dtype=float)
         if q.shape != (len(self.labels),) or not np.all(q > 0):
-            raise StructureError(f"thresholds: one positive number for each of {', '.join(self.labels)} is needed.")
+            raise StructureError(f"thresholds: give one positive number for each of {', '.join(self.labels)}.")
         return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None)
 
     def _rehearsed(self, u: ArrayLike | None) -> Array:
@@ -192,8 +190,7 @@ class Monitor:
             inputs = np.asarray(u, dtype=float).reshape(len(np.asarray(u)), -1)
             if inputs.shape[1] != model.m or not np.isfinite(inputs).all() or len(inputs) < self.window:
                 raise DataError(
-                    f"u has shape {np.shape(u)}: at least {self.window} samples of {model.m} inputs, none missing."
-                )
+                    f"u has shape {np.shape(u)}; give {self.window} samples or more of {model.m} inputs.")
             return model.expanded(inputs)
         spans = [(-1.0, 1.0)] * model.m
         for c, nonlinearity in zip(model.input_of, model.nonlinearities):
@@ -205,25 +202,21 @@ class Monitor:
     # -- samples -------------------------------------------------------------------------------------------------
 
     def step(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
-        """Take in one sample, (m,) inputs and (l,) readings; NaN is a missing value.
+        """Process one sample, (m,) inputs and (l,) readings; NaN is a missing value.
 
         Raises:
             DataError: another number of channels, or an infinite value.
         """
         model = self.dictionary.model
         try:
-            rows = np.array(u, dtype=float).reshape(1, model.m), np.array(y, dtype=float).reshape(1, model.l)
+            rows = [np.array(part, dtype=float).reshape(1, size) for part, size in ((u, model.m), (y, model.l))]
         except (ValueError, TypeError):
-            raise DataError(
-                f"sample {self.samples}: u = {u!r} and y = {y!r}; {model.m} and {model.l} numbers are "
-                "needed, NaN for one that is missing."
-            ) from None
-        if np.isinf(rows[0]).any() or np.isinf(rows[1]).any():
-            raise DataError(f"sample {self.samples}: an infinite value; use NaN for one that is missing.")
-        return self._take_in(*rows)
+            raise DataError(f"sample {self.samples}: u = {u!r} and y = {y!r}; {model.m} and {model.l} numbers are "
+                            "needed, NaN for a missing one.") from None
+        return self.run(*rows)
 
     def run(self, u: ArrayLike, y: ArrayLike) -> list[Event]:
-        """Take in a block of inputs (N, m) and readings (N, l), with the same result as `step` for each sample.
+        """Process a block of inputs (N, m) and readings (N, l), with the same result as `step` for each sample.
 
         Raises:
             DataError: other channels than the model's, unequal lengths, or an infinite value.
@@ -232,12 +225,12 @@ class Monitor:
         u, y = (np.ascontiguousarray(as_block(part, names, what, self.samples))
                 for part, names, what in ((u, model.inputs, "u"), (y, model.outputs, "y")))
         if len(u) != len(y):
-            raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
+            raise DataError(f"u has {len(u)} samples and y has {len(y)}: they must be equally long.")
         return [event for start in range(0, len(u), BLOCK)
                 for event in self._take_in(u[start : start + BLOCK], y[start : start + BLOCK])]
 
     def watched(self, u: Array, y: Array) -> Array:
-        """Return the statistics (N, C) along a record in raw units without any decision; the monitor stays as it is."""
+        """Return the statistics (N, C) along a record in raw units without decisions; the monitor is unchanged."""
         twin = Monitor.__new__(Monitor)
         twin._set(self.dictionary, self.window, self.seed, self.decisions.rules)  # with thresholds that are infinite
         twin.plant.lose()
@@ -264,7 +257,7 @@ class Monitor:
         return sorted(events, key=lambda e: e.sample)
 
     def _search_block(self, f: Array, fed: Array, y: Array, events: list[Event]) -> int:
-        """Search samples by the steady predictor until a decision is due; return how many."""
+        """Search samples by the steady predictor until a decision is due; return their number."""
         plant, decisions, now = self.plant, self.decisions, self.samples
         x, r = plant.run(f, fed, y)
         moving = self.columns.signals(np.vstack([plant.before, f[:-1]]), f)
@@ -302,7 +295,7 @@ class Monitor:
             events += decisions.excitation(weight, now, self.window)
 
     def _excuse(self, onset: int) -> None:
-        """Forget what a sensor did that has been found frozen."""
+        """Discard the effects of a sensor that has been found frozen."""
         if self.decisions.phase != WATCHING and self.search.peak.any() and self.decisions.alarm >= onset:
             self.decisions.forgive(self.search)
         self.search.restart()
@@ -321,18 +314,16 @@ class Monitor:
     def _fed(self, y: Array) -> Array:
         fed = np.empty((len(y), len(self._output_of)))
         if fed.size and expand(self.dictionary.model.parts.tables, self._output_of, y, fed) >= 0:
-            raise DataError(
-                f"sample {self.samples}: an output leaves the interval of a feedback basis that refuses it."
-            )
+            raise DataError(f"sample {self.samples}: an output leaves the interval of a feedback basis.")
         return fed
 
     def __str__(self) -> str:
-        """Say what is looked for, what the thresholds rest on, what was seen, and what is carried."""
+        """Return the thresholds, the samples processed, and the carried faults."""
         lines = [f"{self.samples} samples seen, window {self.window}" + ", in alarm" * self.alarmed]
         lines += [str(self.calibration), *(f"  not monitored: {label}" for label in self.skipped)]
         return "\n".join([*lines, *map(str, self.carried)])
 
-    # -- what is known now ---------------------------------------------------------------------------------------
+    # -- current state --------------------------------------------------------------------------------------------
 
     @property
     def statistics(self) -> dict[str, float]:
@@ -341,13 +332,13 @@ class Monitor:
 
     @property
     def onsets(self) -> dict[str, int]:
-        """{label: onset at which it explains most}; -1 where it cannot be looked for yet."""
+        """{label: best onset}; -1 where none can be searched yet."""
         peaks = self.search.peak
         return dict(zip(self.labels, np.where(peaks > 0, self.samples - peaks, -1).tolist()))
 
     @property
     def carried(self) -> tuple[Carried, ...]:
-        """The faults that were named and are accounted for."""
+        """The isolated faults whose effect is compensated."""
         plant, size, found = self.plant, self.plant.held.copy(), []
         variance = np.zeros(len(size))
         for at, one in enumerate(plant.directions, self.dictionary.model.nx):
@@ -363,7 +354,7 @@ class Monitor:
 
     @property
     def alarmed(self) -> bool:
-        """Whether there is an alarm that has not been cleared or answered by carrying the fault."""
+        """Whether there is an alarm that is neither cleared nor explained by a carried fault."""
         return self.decisions.phase >= NAMING
 
     @property
@@ -374,7 +365,7 @@ class Monitor:
     # -- files -----------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> Path:
-        """Write the whole state to an npz file, from which `load` continues bit for bit; thresholds included."""
+        """Write the state and the thresholds to an npz file, from which `load` continues bit for bit."""
         from optid.faults.monitor.file import save
 
         return save(self, path)

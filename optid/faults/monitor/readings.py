@@ -1,4 +1,4 @@
-"""What the readings themselves show before any search: dead and frozen sensors, inputs outside the identified range."""
+"""Checks of the readings before any search: dead and frozen sensors, inputs outside the identified range."""
 
 from typing import Any, NamedTuple
 
@@ -10,31 +10,23 @@ from optid.faults.ranges import known_range
 from optid.models import HammersteinSS
 
 DEAD = 10
-"""Readings of a sensor missing in a row, the inputs being there, after which it is dead."""
+"""Consecutive missing readings of a sensor, while the inputs are present, after which it is dead."""
 
 FROZEN = 5
-"""Fewest identical readings in a row of a sensor that is frozen."""
+"""Fewest consecutive identical readings of a frozen sensor."""
 
 CHANCE = 1e-10
-"""Probability of so many identical readings in a row from a healthy sensor, at most."""
+"""Largest probability of that many identical readings of a healthy sensor."""
 
 
 class Screened(NamedTuple):
-    """A block of samples after the checks.
+    """A block of samples after the checks."""
 
-    Attributes:
-        y: (T, l) readings; those of frozen sensors are missing.
-        unsure: (T, m) inputs that are missing or outside their range.
-        repeating: (T,) whether a sensor shows the reading of the sample before.
-        events: in the order of their samples.
-        frozen: {sample of the block: onset in samples of the stream} of the sensors found frozen.
-    """
-
-    y: Array
-    unsure: np.ndarray
-    repeating: np.ndarray
-    events: list[Event]
-    frozen: dict[int, int]
+    y: Array  # (T, l) readings; those of frozen sensors are missing
+    unsure: np.ndarray  # (T, m) inputs that are missing or outside their range
+    repeating: np.ndarray  # (T,) whether a sensor repeats the reading of the sample before
+    events: list[Event]  # in the order of their samples
+    frozen: dict[int, int]  # {sample of the block: onset in samples of the stream} of the sensors found frozen
 
 
 class ReadingChecks:
@@ -43,7 +35,7 @@ class ReadingChecks:
     Attributes:
         model: the plant.
         low, high: (m,) identified range of the inputs, infinite where none is known.
-        memory: numbers that a saved monitor keeps, by sensor, and where inputs left their range.
+        memory: counters by sensor, and the samples at which inputs left their range; saved with the monitor.
     """
 
     def __init__(self, model: HammersteinSS) -> None:

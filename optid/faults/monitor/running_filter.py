@@ -1,10 +1,10 @@
-"""The filter of the monitor: the steady predictor, and a Kalman filter wherever something beside it is uncertain.
+"""The filter of the monitor: the steady predictor, and a Kalman filter while more than the noise is uncertain.
 
-Faults that were named are carried as unknown constants beside the state (B. Friedland, IEEE Trans. Automatic Control
-14, 1969; A. S. Willsky, H. L. Jones, IEEE Trans. Automatic Control 21, 1976). One filter of state and constants covers
-them, an unknown initial state, missing readings, and inputs of which nothing is known. With e the innovations of the
-steady predictor, the plant is x+ = A x + ... + K e, y = C x + ... + e, whose state is known once it was: the filter is
-the steady predictor as soon as nothing else is uncertain.
+Isolated faults are carried as unknown constants beside the state (B. Friedland, IEEE Trans. Automatic Control 14, 1969;
+A. S. Willsky, H. L. Jones, IEEE Trans. Automatic Control 21, 1976). One filter of state and constants covers them, an
+unknown initial state, missing readings, and unknown inputs. With e the innovations of the steady predictor, the plant
+is x+ = A x + ... + K e, y = C x + ... + e: once its state is known it stays known, and the filter is the steady
+predictor.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
 WIDE = 1e8
-"""Energy that what nothing is known of may have in one innovation."""
+"""Prior energy of an unknown in one innovation."""
 
 CERTAIN = 1e-12
 """Energy in one innovation below which the state is known."""
@@ -29,47 +29,35 @@ CERTAIN = 1e-12
 
 @dataclass(eq=False)
 class Direction:
-    """A constant that is carried.
+    """A carried constant."""
 
-    Attributes:
-        owner: number of its candidate.
-        column: of the candidates.
-        growth: what its course grows by per sample.
-        grown: its course at the next sample.
-        power: energy that one unit, left out, leaves in one innovation, on average.
-        age: samples since it is carried.
-        deviation: (n,) what one unit, left out, has done to the state of the steady predictor.
-    """
-
-    owner: int
-    column: int
-    growth: float
-    grown: float
-    power: float = 0.0
-    age: int = 0
-    deviation: Any = 0.0
+    owner: int  # number of its candidate
+    column: int  # of the candidates
+    growth: float  # increase of its course per sample
+    grown: float  # its course at the next sample
+    power: float = 0.0  # mean energy of one unit in one innovation
+    age: int = 0  # samples since it is carried
+    deviation: Any = 0.0  # (n,) effect of one unit on the state of the steady predictor
 
 
 class RunningFilter:
-    """State of the plant and of what is carried, before the next sample.
+    """State of the plant and carried constants, before the next sample.
 
     Attributes:
-        model: the healthy plant.
-        steady: its predictor.
-        columns: of the candidates.
+        model, steady, columns: the healthy plant, its predictor, and the columns of the candidates.
         x: (n + q,) expected state and constants; the additions of carried faults at the next sample are in it.
         P: (n + q, n + q) covariance.
         directions: (q,) the constants.
-        held: (D,) magnitudes that are known well and no longer estimated.
+        held: (D,) magnitudes that are no longer estimated.
         before: (r,) functions of the inputs of the sample before.
         certain: whether the steady predictor is exact.
-        strength: energy that a state of unit size leaves in one innovation, at most.
+        strength: largest energy of a state of unit size in one innovation.
     """
 
     KEPT = "x", "P", "held", "before"
 
     def __init__(self, model: HammersteinSS, steady: Predictor, columns: Columns) -> None:
-        """Begin with a state that is known to be zero."""
+        """Start from a known state of zero."""
         self.model, self.steady, self.columns = model, steady, columns
         self.x, self.P = np.zeros(model.nx), np.zeros((model.nx, model.nx))
         self.held, self.before = np.zeros(len(columns.course)), np.zeros(model.B.shape[1])
@@ -78,14 +66,14 @@ class RunningFilter:
         self.strength = float(np.max(np.sum((steady.root @ steady.C) ** 2, axis=0), initial=1e-300))
 
     def lose(self) -> None:
-        """From the next sample on the state is unknown."""
+        """Make the state of the next sample unknown."""
         n = self.model.nx
         self.P[:n], self.P[:, :n] = 0.0, 0.0
         self.P[:n, :n] = WIDE / self.strength * np.eye(n)
         self.certain = False
 
     def additions(self, f: Array) -> tuple[Array, Array]:
-        """Return what held faults add to the next state (T, n) and to the output (T, l)."""
+        """Return the additions of held faults to the next state (T, n) and to the output (T, l)."""
         into_state, into_output = (np.zeros((len(f), size)) for size in (self.model.nx, self.model.l))
         for j in np.flatnonzero(self.held):
             number = self.columns.driven[j]
@@ -98,12 +86,9 @@ class RunningFilter:
         return into_state, into_output
 
     def run(self, f: Array, fed: Array, y: Array) -> tuple[Array, Array]:
-        """Return states (T + 1, n) and whitened innovations (T, l) of complete samples; the filter stays as it is.
+        """Return states (T + 1, n) and whitened innovations (T, l) of complete samples; the filter is unchanged.
 
-        Args:
-            f: (T, r) functions of the inputs.
-            fed: (T, s) functions of the outputs.
-            y: (T, l) readings.
+        f (T, r) are functions of the inputs, fed (T, s) of the outputs, y (T, l) the readings.
         """
         model, steady = self.model, self.steady
         drive, direct = np.tile(model.offset_x, (len(y), 1)), np.tile(model.offset_y, (len(y), 1))
@@ -121,13 +106,13 @@ class RunningFilter:
         return x, r
 
     def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
-        """Take in one sample; return the whitened innovation (l,) and the matrices of the search.
+        """Process one sample; return the whitened innovation (l,) and the matrices of the search.
 
         Args:
             f: (r,) functions of the inputs.
             fed: y -> (s,) functions of the outputs.
             y: (l,) readings, NaN where missing.
-            unsure: (r,) functions of the inputs of which nothing is known at this sample.
+            unsure: (r,) which functions of the inputs are unknown.
         """
         model, steady, n, q = self.model, self.steady, self.model.nx, len(self.directions)
         there, lost = np.flatnonzero(~np.isnan(y)), np.where(np.isnan(y), model.L, 0.0)
@@ -187,7 +172,7 @@ class RunningFilter:
         return r, (A, C, missing, root)
 
     def carry(self, number: int, window: Window) -> float:
-        """Correct the state by the estimate of a candidate and carry it; return the energy left in the state alone."""
+        """Correct the state by the estimate of a candidate and carry it; return the remaining energy of a jump."""
         sizes, covariance, whole = window.estimate(number)
         n, q, own, grown = self.model.nx, len(self.directions), self.columns.of(number), int(window.peak[number])
         kind, moved = self.columns.course[own.start], whole[: n + q]
@@ -201,7 +186,7 @@ class RunningFilter:
         self.certain = False
         if not jump:
             self._append(number, own, sizes, covariance, moved, float(drifting), course)
-        if drifting:  # an onset that is a little off leaves a constant
+        if drifting:  # an error of the onset leaves a constant
             self.P[n + q :, n + q :] *= 4.0
             guess = np.diag(np.diag(covariance)) * (2.0 * grown) ** 2
             constant = np.vstack([self._constant(own, grown), np.zeros((q + len(sizes), len(sizes)))])
@@ -217,7 +202,7 @@ class RunningFilter:
         self.directions += [Direction(number, j, growth, grown) for j in range(own.start, own.stop)]
 
     def _constant(self, own: slice, count: int) -> Array:
-        """What constants in the place of columns have done to the state after some samples of the steady predictor."""
+        """Effect of constants in the place of columns on the state after some samples of the steady predictor."""
         steady, jolt, shift = self.steady, self.columns.into_state[own].T, self.columns.into_output[own].T
         moved = jolt
         for _ in range(count):
@@ -233,7 +218,7 @@ class RunningFilter:
             window.drop(n + p)
 
     def release(self, rows: list[int], own: slice, window: Window) -> None:
-        """Stop accounting for columns, estimated in some rows of the constants or held."""
+        """Stop compensating columns, estimated in some rows of the constants or held."""
         for p in reversed(rows):
             self.forget(p, window)
         later, _ = self.columns.units(self.before, self.before)
@@ -241,7 +226,7 @@ class RunningFilter:
         self.held[own] = 0.0
 
     def room(self, count: int) -> None:
-        """Hold the oldest constants until so many new ones find room."""
+        """Hold the oldest constants until there is room for so many new ones."""
         most = SPARE + 2 * int(self.columns.size.max()) - count
         while len(self.directions) > most:
             self.forget(0, None)

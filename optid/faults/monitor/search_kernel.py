@@ -1,8 +1,8 @@
 """Compiled search of a running window: the energy that every candidate explains from every onset.
 
-A fault leaves a deviation in the state of the predictor, which is followed for every column of every candidate and
-every onset of the window. The arrays are indexed by onset last and used as rings, so that every loop over the onsets
-runs over contiguous numbers; the onsets in use are the first ones of the ring.
+The deviation of the state of the predictor is propagated for every column of every candidate and every onset of the
+window. The arrays are ring buffers with the onset as last index, so that every loop over the onsets runs over
+contiguous numbers; the onsets in use are the first ones of the ring.
 """
 
 import numpy as np
@@ -11,10 +11,10 @@ from numba import njit
 from optid.models.state_kernels import value_and_slope
 
 LASTING, DRIFT, JUMP, DRIVEN = range(4)
-"""The course of a column after its onset: 1, 1 2 3 .., 1 0 0 .., given by the signals of the plant."""
+"""The course of a column after its onset: 1 1 1 .., 1 2 3 .., 1 0 0 .., or given by the signals of the plant."""
 
 DEPENDENT = 1e-9
-"""A column with less than this share of its energy beside the columns before it explains nothing of its own."""
+"""A column with less than this share of its energy beside the columns before it counts as dependent."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -53,12 +53,12 @@ def search(matrices, parts, signals, r, limit, tabled, table, work, memory, foun
         limit: (C,) thresholds.
         tabled: whether the columns of candidates without a driven one are those of the table.
         table: signatures (D, l, 2 W), Cholesky factors (pairs, 2 W) of the products of a candidate, and inverses
-            (D, 2 W) of their diagonals, zero for a column that explains nothing of its own; oldest onset first, twice.
-        work: the same of one window, for the columns that are followed; changed.
+            (D, 2 W) of their diagonals, zero for a dependent column; oldest onset first, twice.
+        work: the same of one window, for the propagated columns; changed.
         memory: deviations (D, room, W), correlations with r (D, W), products of the columns of a candidate (pairs, W),
             samples since the onset (W,), the first counted, and samples searched (1,); changed.
-        found: statistics (T, C), samples since the best onset of the last sample (C,), 0 without one, and what the last
-            column of a candidate with a driven one has beside the others in a whole window (T, C); written.
+        found: statistics (T, C), samples since the best onset of the last sample (C,), 0 without one, and the energy of
+            the last column of a candidate with a driven one beside the others in a whole window (T, C); written.
     """
     A, C, gain, root = matrices
     into_state, into_output, course, driven, moving, first, size, least = parts

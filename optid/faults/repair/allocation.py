@@ -1,4 +1,4 @@
-"""Control of a damaged plant with the actuators that are left: what can be reached, and how."""
+"""Control of a damaged plant by the remaining actuators: attainable outputs and the inputs that hold them."""
 
 import warnings
 from collections.abc import Sequence
@@ -31,40 +31,29 @@ ACTIVE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """The resting point nearest to a reference.
+    """The steady state nearest to a reference."""
 
-    Attributes:
-        reference: (l,) outputs wanted.
-        y: (l,) outputs at rest.
-        u: (m,) inputs there.
-        v: (r,) their f.
-        x: (n,) state there.
-        distance: weighted distance of y from the reference.
-        reachable: whether there is none to speak of.
-        limiting: {actuator: by how much the distance falls per unit of v, on the NLP route of u, by which its bound
-            moves}, the most limiting first; empty where the reference is reached.
-        solution: of the programme behind it; None where no actuator is left.
-        idle: why nothing can be done, where no actuator is left; "" otherwise.
-    """
-
-    reference: Array
-    y: Array
-    u: Array
-    v: Array
-    x: Array
-    distance: float
-    reachable: bool
+    reference: Array  # (l,) desired outputs
+    y: Array  # (l,) steady outputs
+    u: Array  # (m,) inputs
+    v: Array  # (r,) their f
+    x: Array  # (n,) steady state
+    distance: float  # weighted distance of y from the reference
+    reachable: bool  # whether it is negligible
+    # {actuator: reduction of the distance per unit of v (of u on the NLP route) by which its bound is relaxed},
+    # the most limiting first; empty where the reference is reached
     limiting: dict[str, float]
+    # of the programme behind it; None where no actuator has an effect
     solution: "Solution | None" = field(default=None, repr=False)
-    idle: str = ""
+    idle: str = ""  # the reason where no actuator has an effect; "" otherwise
 
     def __str__(self) -> str:
-        """Say whether it is reached, how near one gets, and what is in the way."""
+        """Return whether the reference is reached, the distance, and the limiting actuators."""
         wanted, got = (", ".join(f"{value:.4g}" for value in point) for point in (self.reference, self.y))
         if self.reachable:
             return f"({wanted}) is reached with inputs ({', '.join(f'{value:.4g}' for value in self.u)})"
         if self.idle:
-            return f"({wanted}) is not reachable: {self.idle}; the outputs rest at ({got}) whatever the inputs are"
+            return f"({wanted}) is not reachable: {self.idle}; the outputs settle at ({got}) for any inputs"
         words = ", ".join(f"{name} ({price:.3g} per unit)" for name, price in self.limiting.items())
         limit = f"; limited by {words}" if words else ""
         return f"({wanted}) cannot be reached: nearest is ({got}), weighted distance {self.distance:.4g}{limit}"
@@ -72,16 +61,16 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """What a plant can still do; `attainable` and `controller` use it.
+    """Control of a plant within the bounds of its inputs: `attainable` and `controller`.
 
-    With several members (`robust_allocation`) both are right for all of them: the worst of them is made least.
+    With several members (`robust_allocation`) the cost of the worst of them is minimised.
 
     Attributes:
-        model: the plant as it is now; the healthy one with several members.
-        problem: what is left of it in v = f(u), with the bounds.
+        model: the plant now; the healthy one with several members.
+        problem: the plant in v = f(u), with the bounds.
         route: "qp" (in v, exact), or "nlp" (in u).
-        messages: why the route is what it is, and what is not as it was.
-        solver: back end of the programmes; on the NLP route one that takes no such programmes gives way to "auto".
+        messages: the reasons for the route.
+        solver: back end of the programmes; on the NLP route "auto" replaces one that takes no such programmes.
         labels: of several members.
     """
 
@@ -108,12 +97,9 @@ class Allocation:
         return (self.low + self.high) / 2
 
     def attainable(self, reference: ArrayLike) -> Target:
-        """Return the resting point nearest to a reference, its weighted distance, and the actuators that limit it.
+        """Return the steady state nearest to a reference (l,), its weighted distance, and the limiting actuators.
 
-        With several members the one that they share, and y of the worst.
-
-        Args:
-            reference: (l,) outputs wanted.
+        Several members share the inputs, and y is that of the worst.
 
         Raises:
             StructureError: a reference of the wrong size or not finite, or a solver that finds no point.
@@ -121,7 +107,7 @@ class Allocation:
         from optid.registry import fault_formulation
 
         problem, r = self.problem, self.checked(reference)
-        if not self.moving:  # where the outputs come to rest by themselves, every actuator where it stands
+        if not self.moving:
             return self._target(r, self.middle, self.model.expanded(self.middle[None, :])[0], None)
         if self.route == "qp":
             solution = self.solved(fault_formulation("allocation.target")(problem, reference=r), {})
@@ -144,7 +130,7 @@ class Allocation:
         return min(found, key=lambda one: one.distance)
 
     def _target(self, r: Array, u: Array, v: Array, solution: "Solution | None") -> Target:
-        """What the plant, of several members the worst, does at rest at u and v."""
+        """The steady state of the plant, of several members the worst, at u and v."""
         weights, points = self.problem.weights, self._rests(u, v)
         distances = [float(np.linalg.norm(weights * (y - r))) for _, y in points]
         distance, (x, y) = max(distances), points[int(np.argmax(distances))]
@@ -154,13 +140,13 @@ class Allocation:
         return Target(r, y, u, v, x, distance, reachable, limiting, solution, self.idle)
 
     def _rests(self, u: Array, v: Array) -> list[tuple[Array, Array]]:
-        """Return state and outputs of every member at rest."""
+        """Return the steady state and outputs of every member."""
         if self.problem.feedback:
             return [self.model.equilibrium(u)]
         return [(one.rest_state(v), one.rest_output(v)) for one in self.problem.members]
 
     def _limiting(self, solution: "Solution | None", distance: float) -> dict[str, float]:
-        """Actuators at a bound beyond which the outputs would come nearer, with the multipliers of the distance."""
+        """Actuators at a bound whose relaxation reduces the distance, with the multipliers of the distance."""
         if solution is None:
             return {f"actuator:{name}": float("nan") for name in self.model.inputs}
         prices = {}
@@ -174,25 +160,19 @@ class Allocation:
 
     @property
     def idle(self) -> str:
-        """Why nothing can be controlled, where no actuator moves; "" otherwise."""
+        """The reason why nothing can be controlled, where no actuator has an effect; "" otherwise."""
         return "" if self.moving else f"nothing acts on {', '.join(self.model.outputs)}"
 
     def checked(self, reference: ArrayLike) -> Array:
-        """Return a reference (l,); refuse another size, and numbers that are not finite."""
+        """Return a reference as an array (l,); refuse another size, and numbers that are not finite."""
         r = np.atleast_1d(np.asarray(reference, dtype=float))
         if r.shape != (self.model.l,) or not np.all(np.isfinite(r)):
-            raise StructureError(
-                f"reference of shape {r.shape}: ({self.model.l},) finite numbers are needed, one per output "
-                f"({', '.join(self.model.outputs)})."
-            )
+            raise StructureError(f"reference of shape {r.shape}: it must be ({self.model.l},) finite numbers, one per "
+                                 f"output ({', '.join(self.model.outputs)}).")
         return r
 
     def solved(self, program: "Program", start: dict[str, Array], prove: bool = True) -> "Solution":
-        """Solve a programme from a start, and refuse an outcome without a point.
-
-        Raises:
-            StructureError: no point.
-        """
+        """Return the solution of a programme from a start; `StructureError` where there is no point."""
         from optid.backends.choice import find
         from optid.solving.solve import solve
 
@@ -202,7 +182,7 @@ class Allocation:
             solver = "auto"
         solution = solve(program, solver, prove=prove, warm=False)
         if not solution.has_point or solution.status.value not in ("optimal", "locally optimal", "inaccurate"):
-            what = "resting point was" if program.name == "allocation.target" else "move was"
+            what = "steady state was" if program.name == "allocation.target" else "move was"
             raise StructureError(f"no {what} found: {solution.status} ({solution.reason or solution.claimed})")
         return solution
 
@@ -219,18 +199,14 @@ class Allocation:
         return np.append(self.model.expanded(u[None, :])[0], fed)
 
     def corners(self) -> Array:
-        """Return the corners (k, 2) of the set of outputs that can be held at rest, two outputs, in order.
-
-        With a limit that the actuators share this is the set without it.
+        """Return the corners (k, 2), in order, of the set of attainable steady outputs, without a shared limit.
 
         Raises:
             StructureError: other than two outputs, or a plant that is not linear in f(u).
         """
         if self.model.l != 2 or not self.problem.linear:
-            raise StructureError(
-                "The attainable set is drawn for two outputs and a plant that is linear in f(u); ask "
-                "attainable(reference) point by point."
-            )
+            raise StructureError("The attainable set is drawn for two outputs and a plant that is linear in f(u); call "
+                                 "attainable(reference) point by point.")
         gain, centre = self.problem.members[0].gain(), self.problem.members[0].rest_output(self.problem.middle)
         edges = (gain * ((self.problem.high - self.problem.low) / 2)).T
         edges = edges[np.linalg.norm(edges, axis=1) > 0]
@@ -242,7 +218,7 @@ class Allocation:
 
     @cached_property
     def moving(self) -> tuple[str, ...]:
-        """Names of the inputs that still move something."""
+        """Names of the inputs that have an effect."""
         live = {c for one, c in zip(self.problem.inverses, self.problem.input_of) if not one.dead}
         return tuple(self.model.inputs[c] for c in sorted(live))
 
@@ -253,14 +229,12 @@ class Allocation:
 
         if self.idle:
             rest = ", ".join(f"{value:.4g}" for value in self.attainable(np.zeros(self.model.l)).y)
-            raise StructureError(
-                f"not reachable: {self.idle}, so that there is nothing to control. The outputs rest at ({rest}); "
-                "attainable(reference) says how far that is from a reference, and the observer goes on watching."
-            )
+            raise StructureError(f"not reachable: {self.idle}, so that there is nothing to control. The outputs settle "
+                                 f"at ({rest}); attainable(reference) gives the distance from a reference.")
         return Controller(self, horizon, effort=effort, rates=rates, route=route or self.route)
 
     def __str__(self) -> str:
-        """Say which actuators are left and by which route."""
+        """Return the actuators, their ranges, and the route."""
         rows = [f"actuators that move: {', '.join(self.moving) or 'none'}; route {self.route}"]
         for one, c in zip(self.problem.inverses, self.problem.input_of):
             state = "does not move" if one.dead else f"f from {one.v_low:.4g} to {one.v_high:.4g}"
@@ -276,18 +250,18 @@ def allocate(
     """Prepare the control of a plant within the bounds of its inputs.
 
     Args:
-        model: the plant as it is now; an actuator that moves nothing has a constant nonlinearity.
+        model: the plant now; an actuator without effect has a constant nonlinearity.
         low: (m,) least inputs; the intervals of their bases by default.
         high: (m,) largest inputs.
         weights: (l,) of the outputs in distances and costs; ones by default.
-        norm: (k, r) matrix S of a limit ‖S f(u)‖ <= `limit` that the actuators share.
+        norm: (k, r) matrix S of a shared limit ‖S f(u)‖ <= `limit`.
         limit: of the norm; with a limit and no norm S is the identity.
         route: "qp", "nlp", or "auto": in f(u) where every f has an inverse, else in u.
         solver: back end of the programmes.
 
     Raises:
         StructureError: bounds that are missing or empty, weights that are not positive, an unknown route, a plant that
-            is not stabilisable by what is left (with the mode).
+            the remaining actuators do not stabilise (with the mode).
 
     Warns:
         DataWarning: a nonlinearity without an inverse, with the interval, and the route taken instead.
@@ -299,7 +273,7 @@ def allocate(
     messages = [f"{model.inputs[c]}: {one.message}" for one, c in zip(inverses, model.input_of) if one.message]
     check_stabilisable(model, [i for i, one in enumerate(inverses) if not one.dead])
     if len(set(model.input_of)) < len(model.input_of):
-        messages.append("an input acts through several nonlinearities: their values are not free of one another")
+        messages.append("an input acts through several nonlinearities: their values are not independent")
     if model.feedback:
         messages.append("the plant has nonlinear feedback: it is not linear in f(u)")
     if route == "qp" and not problem.linear:
@@ -311,17 +285,17 @@ def allocate(
     if norm is not None or np.isfinite(limit):
         root = np.eye(len(inverses)) if norm is None else np.atleast_2d(np.asarray(norm, dtype=float))
         if root.shape[1] != len(inverses) or not limit > 0:
-            raise StructureError(f"norm of shape {root.shape} and limit {limit!r}: ({len(inverses)} columns, and a "
-                                 "positive limit are needed.")
+            raise StructureError(f"norm of shape {root.shape} and limit {limit!r}: the norm must have {len(inverses)} "
+                                 "columns, and the limit must be positive.")
         problem = replace(problem, norm=root, limit=limit)
     return Allocation(model, problem, taken, tuple(messages), solver)
 
 
 def robust_allocation(model: "HammersteinSS", members: "Sequence[Damage]", *, low: Any, high: Any, weights: Any,
                       solver: Any = "auto") -> Allocation:
-    """Prepare the control of a plant of which several explanations are left; arguments as of `allocate`.
+    """Prepare the control of a plant with several explanations; arguments as of `allocate`.
 
-    Every member is a gain and a constant of the v of the healthy nonlinearities, as the diagnosis estimates them.
+    Every member has the gains and constants of v that the diagnosis estimates.
 
     Raises:
         StructureError: an input with several nonlinearities, a nonlinearity that turns back, or nonlinear feedback.
@@ -330,8 +304,7 @@ def robust_allocation(model: "HammersteinSS", members: "Sequence[Damage]", *, lo
     if len(set(model.input_of)) < len(model.input_of) or any(one.turns for one in problem.inverses):
         raise StructureError("The members share no v: an input has several nonlinearities, or one that turns back.")
     if model.feedback:
-        raise StructureError("The model has nonlinear feedback: it is not linear in f(u). Use the route 'nlp', which "
-                             "needs no such structure.")
+        raise StructureError("The model has nonlinear feedback: it is not linear in f(u). Use route='nlp'.")
     plants = tuple(Member.of(model, one.gains, one.constants, one.added) for one in members)
     return Allocation(model, replace(problem, members=plants), "qp", (), solver, tuple(one.label for one in members))
 
@@ -340,7 +313,7 @@ def _problem(model: "HammersteinSS", low: Any, high: Any, weights: Any) -> Alloc
     least, most = input_bounds(model, low, high)
     w = np.ones(model.l) if weights is None else np.broadcast_to(np.asarray(weights, dtype=float), (model.l,)).copy()
     if not np.all(np.isfinite(w) & (w > 0)):
-        raise StructureError(f"weights {w.tolist()}: positive numbers are needed, one per output.")
+        raise StructureError(f"weights {w.tolist()}: they must be positive numbers, one per output.")
     inverses = tuple(inverse(f, least[c], most[c]) for f, c in zip(model.nonlinearities, model.input_of))
     return AllocationProblem(
         (Member.of(model),), np.array([one.v_low for one in inverses]),
@@ -361,7 +334,7 @@ def input_bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Ar
         if given is not None:
             numbers = np.asarray(given, dtype=float)
             if numbers.shape not in ((), (1,), (model.m,)):
-                raise StructureError(f"{word}={numbers.tolist()}: one number is needed, or one per input ({model.m}).")
+                raise StructureError(f"{word}={numbers.tolist()}: it must be one number, or one per input ({model.m}).")
             ends.append(np.broadcast_to(numbers, (model.m,)).copy())
             continue
         found = np.full(model.m, np.nan)
@@ -375,6 +348,5 @@ def input_bounds(model: "HammersteinSS", low: Any, high: Any) -> tuple[Array, Ar
     if not np.all(np.isfinite(ends[0]) & np.isfinite(ends[1]) & (ends[0] < ends[1])):
         c = int(np.argmin(ends[0] < ends[1]))
         raise StructureError(
-            f"the range of input {model.inputs[c]!r}, [{ends[0][c]:g}, {ends[1][c]:g}], is empty or not finite."
-        )
+            f"the range of input {model.inputs[c]!r}, [{ends[0][c]:g}, {ends[1][c]:g}], is empty or not finite.")
     return ends[0], ends[1]

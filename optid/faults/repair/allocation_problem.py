@@ -1,4 +1,4 @@
-"""What is left of a plant to control: linear dynamics in v = f(u), bounds of v, and what the actuators share."""
+"""The plant of a re-allocation: linear dynamics in v = f(u), bounds of v, and a limit shared by the actuators."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,27 +16,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """x+ = A x + B v + d, y = C x + D v + c; nonlinear feedback g(y) is a further column of v.
+    """x+ = A x + B v + d, y = C x + D v + c; nonlinear feedback g(y) is a further column of v."""
 
-    Attributes:
-        A: (n, n), output injection included.
-        B: (n, r).
-        C: (l, n).
-        D: (l, r).
-        d: (n,).
-        c: (l,).
-    """
-
-    A: Array
-    B: Array
-    C: Array
-    D: Array
-    d: Array
-    c: Array
+    A: Array  # (n, n), output injection included
+    B: Array  # (n, r)
+    C: Array  # (l, n)
+    D: Array  # (l, r)
+    d: Array  # (n,)
+    c: Array  # (l,)
 
     @classmethod
     def of(cls, model: "HammersteinSS", gains: Any = 1.0, constants: Any = 0.0, added: Any = 0.0) -> "Member":
-        """Take a model, with v replaced by gains v + constants where actuators are broken, and a load on its states."""
+        """Return the member of a model, with gains v + constants in place of v and a load added to its states."""
         constants = np.broadcast_to(constants, model.B.shape[1])
         A, B = model.A + model.L @ model.C, model.B + model.L @ model.D
         d = model.offset_x + model.L @ model.offset_y + B @ constants + added
@@ -44,12 +35,12 @@ class Member:
         return cls(A, np.hstack([B * gains, model.E]), model.C, D, d, model.offset_y + model.D @ constants)
 
     def rest_state(self, v: Array) -> Array:
-        """Return the state (n,) that rests at v, the nearest where a pole is at 1."""
+        """Return the steady state (n,) at v, by least squares where a pole is at 1."""
         rest: Any = np.linalg.lstsq(np.eye(len(self.A)) - self.A, self.B @ v + self.d, rcond=None)[0]
         return rest
 
     def rest_output(self, v: Array) -> Array:
-        """Return the outputs (l,) at rest at v."""
+        """Return the steady outputs (l,) at v."""
         return np.asarray(self.C @ self.rest_state(v) + self.D @ v + self.c)
 
     def gain(self) -> Array:
@@ -57,10 +48,9 @@ class Member:
         return np.asarray(self.C @ np.linalg.lstsq(np.eye(len(self.A)) - self.A, self.B, rcond=None)[0] + self.D)
 
     def terminal_root(self, problem: "AllocationProblem") -> Array:
-        """Return T with T'T the cost from the end of the horizon on at v at rest, (n, n).
+        """Return T (n, n) with T'T the cost to go after the horizon: at constant v, or under the optimal feedback.
 
-        The cost to go of a stable plant whose v rests; the slowest weight that is finite otherwise: of the plant held
-        by its optimal feedback.
+        The optimal feedback serves a plant that is not stable.
         """
         from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
@@ -76,43 +66,26 @@ class Member:
 
 @dataclass(frozen=True, eq=False)
 class AllocationProblem:
-    """Numbers of a re-allocation of r columns v = f(u) and m inputs u.
+    """Numbers of a re-allocation of r columns v = f(u) and m inputs u."""
 
-    Attributes:
-        members: the plant; several where it is not known what is broken.
-        low: (r,) least v.
-        high: (r,) largest v.
-        names: names of the actuators, one per column.
-        outputs: names of the outputs.
-        weights: (l,) of the outputs.
-        norm: (k, r) matrix S of ‖S v‖ <= limit; None for none.
-        limit: of the norm.
-        inverses: (r) f and f^-1.
-        input_of: the input of every column.
-        inputs: names of the inputs.
-        u_low: (m,) least inputs.
-        u_high: (m,) largest inputs.
-        feedback: function and output of the columns beyond r.
-    """
-
-    members: tuple[Member, ...]
-    low: Array
-    high: Array
-    names: tuple[str, ...]
-    outputs: tuple[str, ...]
-    weights: Array
-    norm: Array | None
-    limit: float
-    inverses: tuple[Inverse, ...]
-    input_of: tuple[int, ...]
-    inputs: tuple[str, ...]
-    u_low: Array
-    u_high: Array
-    feedback: "tuple[tuple[Nonlinearity, int], ...]" = ()
+    members: tuple[Member, ...]  # the plant; several where the damage is ambiguous
+    low: Array  # (r,) least v
+    high: Array  # (r,) largest v
+    names: tuple[str, ...]  # of the actuators, one per column
+    outputs: tuple[str, ...]  # names of the outputs
+    weights: Array  # (l,) of the outputs
+    norm: Array | None  # (k, r) matrix S of ‖S v‖ <= limit; None for none
+    limit: float  # of the norm
+    inverses: tuple[Inverse, ...]  # (r) f and f^-1
+    input_of: tuple[int, ...]  # the input of every column
+    inputs: tuple[str, ...]  # names of the inputs
+    u_low: Array  # (m,) least inputs
+    u_high: Array  # (m,) largest inputs
+    feedback: "tuple[tuple[Nonlinearity, int], ...]" = ()  # function and output of the columns beyond r
 
     @property
     def linear(self) -> bool:
-        """Whether the plant is linear in v and every v is free of the others."""
+        """Whether the plant is linear in v and every v can be chosen independently."""
         return not self.feedback and len(set(self.input_of)) == len(self.input_of)
 
     @property
@@ -127,12 +100,12 @@ class AllocationProblem:
 
     @property
     def half(self) -> Array:
-        """(r,) half of the ranges; one for an actuator that does not move."""
+        """(r,) half of the ranges; one for an actuator without effect."""
         half = (self.high - self.low) / 2
         return np.where(half > 0, half, 1.0)
 
     @cached_property
     def scale(self) -> float:
-        """Weighted square of what one actuator can do at most to the outputs at rest."""
+        """Weighted square of the largest change of the steady outputs by one actuator."""
         reach = np.abs(self.weights[:, None] * self.members[0].gain()[:, : self.low.size]) * self.half
         return float(np.max(np.sum(reach**2, axis=0), initial=0.0)) or 1.0

@@ -1,8 +1,8 @@
-"""What to do while a diagnosis names several faults: wait, act for the worst of them, or ask the plant.
+"""Advice while a diagnosis names several faults: wait, control the worst case, or apply a probing input.
 
-Refitting the wrong part is worse than doing nothing, so that as long as several explanations are left the model stays
-the healthy one. How soon the ordinary input tells them apart, and how much sooner a probe would, is computed from what
-each of them leaves in the whitened innovations.
+Refitting the wrong part is worse than no refit, so that the model stays the healthy one while several explanations are
+left. The samples until the ordinary input, or a probe, isolates one of them follow from the signatures of all of them
+in the whitened innovations.
 """
 
 from collections.abc import Sequence
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 APART = 4.0
-"""Distance of two explanations in the whitened innovations at which one of them is dropped nearly always."""
+"""Distance of two explanations in the whitened innovations at which one is rejected nearly always."""
 
 PATIENCE = 20
-"""Samples that are waited for before anything else is done."""
+"""Longest wait, in samples, that is advised before other actions."""
 
 RECENT = 60
-"""Samples of the ordinary input that say how soon it tells explanations apart."""
+"""Samples of the ordinary input from which the wait is extrapolated."""
 
 STARTS = 12
 ROUNDS = 100
@@ -38,54 +38,36 @@ ROUNDS = 100
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """An input that tells explanations apart.
+    """An input that isolates explanations."""
 
-    Attributes:
-        u: (L, m) inputs, within their bounds.
-        separation: smallest distance of two members in the whitened innovations over the probe.
-        ordinary: the same of an input with random levels, median of several; of the input given as `before`.
-        bound: no input within the bounds separates the worst pair by more.
-        pair: the two members that it separates least.
-    """
-
-    u: Array
-    separation: float
-    ordinary: float
-    bound: float
-    pair: tuple[str, str]
+    u: Array  # (L, m) inputs, within their bounds
+    separation: float  # smallest distance of two members in the whitened innovations over the probe
+    ordinary: float  # the same of an input with random levels, median of several
+    bound: float  # upper bound of the separation of the worst pair by any input within the bounds
+    pair: tuple[str, str]  # the two members with the smallest distance
 
     def __str__(self) -> str:
-        """Say what it achieves."""
+        """Return the length, the separation and its bound."""
         return (
-            f"probe of {len(self.u)} samples: {self.pair[0]} and {self.pair[1]} come apart by {self.separation:.3g} "
+            f"probe of {len(self.u)} samples: {self.pair[0]} and {self.pair[1]} differ by {self.separation:.3g} "
             f"standard deviations\n  (random levels {self.ordinary:.3g}; at most {self.bound:.3g} possible)"
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Ambiguity:
-    """What is advised while several explanations are left.
+    """Advice while several explanations are left."""
 
-    Attributes:
-        action: "wait", "probe" or "robust".
-        reason: why.
-        labels: of the members, the most probable first.
-        posteriors: their probabilities.
-        wait: samples after which the ordinary input has told the closest pair apart; inf where it never will.
-        robust: control for all of them; None where there is none, see `reason`.
-        probe: an input that tells them apart; None where no input can.
-    """
-
-    action: str
-    reason: str
-    labels: tuple[str, ...]
-    posteriors: tuple[float, ...]
-    wait: float
-    robust: Allocation | None = field(repr=False)
-    probe: Probe | None = field(repr=False)
+    action: str  # "wait", "probe" or "robust"
+    reason: str  # of the action
+    labels: tuple[str, ...]  # of the members, the most probable first
+    posteriors: tuple[float, ...]  # their probabilities
+    wait: float  # samples after which the ordinary input isolates the closest pair; inf where it never does
+    robust: Allocation | None = field(repr=False)  # control for all of them; None where there is none, see `reason`
+    probe: Probe | None = field(repr=False)  # an input that isolates them; None where no input does
 
     def __str__(self) -> str:
-        """Say what is advised, and why."""
+        """Return the members, the action and its reason."""
         members = ", ".join(f"{label} ({100 * p:.0f} %)" for label, p in zip(self.labels, self.posteriors))
         lines = [f"{len(self.labels)} explanations are left: {members}", f"  advice: {self.action}; {self.reason}"]
         return "\n".join(lines + [f"  {line}" for line in str(self.probe or "").splitlines()])
@@ -95,17 +77,17 @@ def probe_input(
     model: Any, members: Sequence["Damage | Answer"], *, length: int = 20, hold: int = 5, low: ArrayLike | None = None,
     high: ArrayLike | None = None, seed: int = 0,
 ) -> Probe:
-    """Find an input that tells several explanations apart soonest.
+    """Return the input that maximises the smallest distance between several explanations.
 
-    What two of them leave in the innovations differs by M v + d, v being f(u) over the probe. The input with the
-    largest smallest distance lies in a corner of the bounds; it is sought from several starts, level by level, and
-    compared with a bound from the largest singular value of M.
+    The signatures of two of them in the innovations differ by M v + d, v being f(u) over the probe. The best input lies
+    in a corner of the bounds; it is searched from several starts, level by level, and compared with a bound from the
+    largest singular value of M.
 
     Args:
         model: the healthy model, or the dictionary that holds it.
         members: answers of a diagnosis, or damages; at least two.
         length: samples.
-        hold: samples that a level is held.
+        hold: samples per level.
         low: (m,) least inputs; the intervals of the bases by default.
         high: (m,) largest inputs.
         seed: of the starts.
@@ -116,7 +98,7 @@ def probe_input(
     plant = getattr(model, "model", model)
     broken = [one for member in members for one in ([member] if isinstance(member, Damage) else damages(plant, member))]
     if len(broken) < 2:
-        raise StructureError("A probe tells several explanations apart: give at least two.")
+        raise StructureError("A probe isolates one of several explanations: give at least two.")
     if length < 2 or hold < 1:
         raise StructureError(f"length={length!r}, hold={hold!r}: at least 2 samples, and levels of at least one.")
     least, most = input_bounds(plant, low, high)
@@ -125,9 +107,8 @@ def probe_input(
     differences = [(left[i][0] - left[j][0], left[i][1] - left[j][1]) for i, j in pairs]
     if max(float(np.abs(M).max()) for M, _ in differences) <= 1e-12:
         raise StructureError(
-            "What these explanations leave differs by nothing that an input changes: a probe cannot help. Wait, or "
-            "check the parts by hand."
-        )
+            "These explanations differ by nothing that an input changes: no probe isolates one. Wait, or check the "
+            "parts by hand.")
 
     def course(levels: Array) -> Array:
         return np.repeat(levels, hold, axis=0)[:length]
@@ -163,7 +144,7 @@ def probe_input(
 
 
 def _responses(model: "HammersteinSS", members: Sequence[Damage], length: int) -> list[tuple[Array, Array]]:
-    """What each member leaves in the whitened innovations: M v + d, M (length l, length r), d (length l,)."""
+    """Signature of each member in the whitened innovations: M v + d, M (length l, length r), d (length l,)."""
     steady, (n, r), l = predictor(model), model.B.shape, model.l  # noqa: E741
     x, y = np.zeros((length, n, r)), np.zeros((length, l, r))
     x[1], y[0] = model.B, model.D
@@ -184,13 +165,12 @@ def advise(
     model: "HammersteinSS", members: Sequence[Damage], u: Array | None, robust: Allocation | None, why_not: str,
     *, action: str = "auto", seed: int = 0,
 ) -> Ambiguity:
-    """Choose between waiting, probing and acting robustly ("auto"), or take the action asked for.
+    """Return advice: "wait", "probe" or "robust", or the better one ("auto").
 
-    The ordinary input is judged from recent inputs u (N, m), where there are some; where no control is right for all
-    members, `why_not` says why.
+    The wait follows from recent inputs u (N, m); `why_not` is the reason where there is no robust control.
 
     Raises:
-        StructureError: an action that is not possible here.
+        StructureError: an action that is not possible.
     """
     wait = _waiting(model, members, u)
     probe, no_probe = None, ""
@@ -200,16 +180,16 @@ def advise(
         no_probe = str(error)
     if action == "probe" and probe is None or action == "robust" and robust is None:
         raise StructureError(no_probe if action == "probe" else why_not)
-    soon = f"about {wait:.0f} more samples tell them apart"
-    waiting = soon if np.isfinite(wait) else "waiting will not tell them apart"
-    reason = f"as asked for ({waiting})"
+    soon = f"about {wait:.0f} more samples isolate one"
+    waiting = soon if np.isfinite(wait) else "waiting isolates none"
+    reason = f"as requested ({waiting})"
     if action == "auto":
         if wait <= PATIENCE:
             action, reason = "wait", waiting
         elif probe is not None and probe.separation >= APART and probe.separation > 1.2 * probe.ordinary:
-            action, reason = "probe", f"{waiting}; {len(probe.u)} samples of the probe do"
+            action, reason = "probe", f"{waiting}; {len(probe.u)} samples of the probe isolate one"
         elif robust is not None:
-            action, reason = "robust", f"{waiting}, and no short probe does"
+            action, reason = "robust", f"{waiting}, nor does a short probe"
         else:
             action, reason = "wait", f"{waiting}; no robust control: {why_not}"
     return Ambiguity(action, reason, tuple(one.label for one in members), tuple(one.posterior for one in members), wait,
@@ -217,7 +197,7 @@ def advise(
 
 
 def _waiting(model: "HammersteinSS", members: Sequence[Damage], u: Array | None) -> float:
-    """Samples until the closest pair is apart under the ordinary input."""
+    """Samples until the ordinary input isolates one of the closest pair."""
     plain = all(np.all(one.gains == 1) and not one.constants.any() and not one.added.any() for one in members)
     if plain and len({one.sensors for one in members}) > 1:
         return float("inf")

@@ -24,34 +24,26 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """What a controller does at one sample.
+    """The move of a controller at one sample."""
 
-    Attributes:
-        u: (m,) inputs, within their bounds.
-        v: (r,) their f.
-        reachable: whether the reference can be held.
-        route: "qp" (own solver), "program" (in v, by a back end) or "nlp" (in u, by a back end).
-        residual: of the optimality conditions, relative; NaN where a back end's point was judged.
-    """
-
-    u: Array
-    v: Array
-    reachable: bool
-    route: str
-    residual: float
+    u: Array  # (m,) inputs, within their bounds
+    v: Array  # (r,) their f
+    reachable: bool  # whether the reference can be held
+    route: str  # "qp" (own solver), "program" (in v, by a back end) or "nlp" (in u, by a back end)
+    residual: float  # of the optimality conditions, relative; NaN with a back end
 
 
 class Controller:
     """Model predictive control of a plant within the bounds of its inputs.
 
-    The cost is ‖W (y_k - r)‖² over the horizon, with a small weight on the distance of v from that of the resting
-    point, and the cost to go of the plant at rest. Calls of `step` start from the solution of the one before.
+    The cost is ‖W (y_k - r)‖² over the horizon, with a small weight on the distance of v from its steady value, and the
+    cost to go. `step` is warm-started by the solution of the sample before.
 
     Args:
-        allocation: what is left of the plant.
+        allocation: the plant and its bounds.
         horizon: samples.
-        effort: weight of the distance of v (of u on the NLP route) from its resting value.
-        rates: (m,) largest step of each input; they are bounds of u, so that the programme is the one in u.
+        effort: weight of the distance of v (of u on the NLP route) from its steady value.
+        rates: (m,) largest step of each input; with them the programme is the one in u.
         route: "qp" or "nlp".
 
     Raises:
@@ -69,7 +61,7 @@ class Controller:
         self.allocation, self.effort = allocation, float(effort)
         self.rates = None if rates is None else np.broadcast_to(np.asarray(rates, dtype=float), (m,)).copy()
         if self.rates is not None and not np.all(self.rates > 0):
-            raise StructureError(f"rates {self.rates.tolist()}: positive numbers are needed, one per input.")
+            raise StructureError(f"rates {self.rates.tolist()}: they must be positive numbers, one per input.")
         several = len(problem.members) > 1
         if several and self.rates is not None:
             raise StructureError("Rates are bounds of the inputs, and several members share no input: leave them out.")
@@ -104,24 +96,24 @@ class Controller:
         """Return the inputs of this sample.
 
         Args:
-            x: (n,) predicted state of this sample; of several members one each.
-            reference: (l,) outputs wanted.
+            x: (n,) predicted state of this sample; one for each of several members.
+            reference: (l,) desired outputs.
             previous: (m,) inputs of the sample before; needed with rates.
 
         Raises:
             StructureError: sizes that do not fit, rates without the inputs before, or a solver that finds no point.
 
         Warns:
-            DataWarning: a reference that cannot be reached, once for each.
+            DataWarning: a reference that cannot be reached, once for each reference.
         """
         a = self.allocation
         r, states = a.checked(reference), np.atleast_2d(np.asarray(x, dtype=float))
         if len(states) != len(a.problem.members):
             raise StructureError(f"{len(states)} states for {len(a.problem.members)} members ({', '.join(a.labels)}).")
         if states.shape[1] != a.model.nx:
-            raise StructureError(f"state of shape {states.shape[1:]}: ({a.model.nx},) is needed.")
+            raise StructureError(f"state of shape {states.shape[1:]}: it must be ({a.model.nx},).")
         if self.rates is not None and previous is None:
-            raise StructureError("With rates the inputs of the sample before are needed: previous=(m,).")
+            raise StructureError("With rates give the inputs of the sample before: previous=(m,).")
         before = None if previous is None else np.asarray(previous, dtype=float)
         goal = self._goal(r)
         if self.route != "qp":
@@ -132,10 +124,10 @@ class Controller:
         return Move(a.inputs(v, before), v, goal.reachable, "qp", residual)
 
     def _goal(self, r: Array) -> "Target":
-        """Return the resting point, kept for the next sample."""
+        """Return the steady state nearest to a reference, cached by the reference."""
         key = r.tobytes()
         if key not in self._goals:
-            if len(self._goals) > 1000:  # a reference that never rests
+            if len(self._goals) > 1000:  # a reference that changes all the time
                 self._goals.clear()
             self._goals[key] = self.allocation.attainable(r)
             if not self._goals[key].reachable:
@@ -161,8 +153,8 @@ class Controller:
             how = {"horizon": self.horizon, "effort": self.effort, "states": states, "rests": rests, **given}
             if inputs:
                 how |= {"rates": self.rates, "previous": before}
-            pose = fault_formulation("allocation.nonlinear" if inputs else "allocation.track")
-            program = self._program = pose(a.problem, **how)
+            formulation = fault_formulation("allocation.nonlinear" if inputs else "allocation.track")
+            program = self._program = formulation(a.problem, **how)
         for number, (state, rest) in enumerate(zip(states, rests)):
             label = f"[{number + 1}]" if len(states) > 1 else ""
             given |= {f"state{label}": state, f"rest{label}": rest}
@@ -184,7 +176,7 @@ class Controller:
         return Move(u, a.model.expanded(u[None, :])[0], goal.reachable, "nlp", float("nan"))
 
     def _course(self, x: Array, r: Array, goal: "Target", near: Array | None) -> dict[str, Array]:
-        """Return a start of the programme in u: the solution in v where there is one, else the resting point."""
+        """Return a start of the programme in u: the solution in v where there is one, else the steady state."""
         a = self.allocation
         u = np.tile(goal.u, (self.horizon, 1))
         if a.problem.linear:
@@ -202,17 +194,10 @@ class Controller:
 
 
 def box_quadratic(H: Array, g: Array, low: Array, high: Array, z: Array) -> tuple[Array, float]:
-    """Minimise z' H z / 2 + g' z over low <= z <= high by projected Newton steps (Bertsekas 1982).
+    """Minimise z' H z / 2 + g' z over low <= z <= high by projected Newton steps (Bertsekas 1982), from z (q,).
 
-    Args:
-        H: (q, q) positive definite.
-        g: (q,).
-        low: (q,) lower bounds.
-        high: (q,) upper bounds, not below low.
-        z: (q,) start.
-
-    Returns:
-        the solution; the largest component of its projected gradient, relative to that of g.
+    H (q, q) is positive definite. Returned are the solution and the largest component of its projected gradient,
+    relative to that of g.
     """
     z, scale, residual = np.clip(z, low, high), max(float(np.abs(g).max()), 1e-300), np.inf
     for _ in range(STEPS):

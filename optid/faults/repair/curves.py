@@ -1,4 +1,4 @@
-"""A damaged nonlinearity: the nodes at which its values are estimated, what a record says of each, and the estimate."""
+"""A damaged nonlinearity: the nodes of its values, the samples that support each, and the estimate."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -16,33 +16,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A nonlinearity of an input that is damaged; printed as a table after its refit.
+    """A damaged nonlinearity of an input; printed as a table after its refit."""
 
-    Attributes:
-        name: the input, with the number of the function where it has several.
-        column: its index among the nonlinearities of the model.
-        basis: the basis of its new values.
-        to_nodes: (P + 1, P + 1) of [mu; constant] to the values at its nodes.
-        healthy: (P + 1,) values before the fault.
-        visited: (P + 1,) how many samples after the fault lie at each node, shared between neighbours.
-        seen: smallest and largest input after the fault.
-        dead: whether it is held flat: the actuator no longer moves.
-        values: (P + 1,) values after the refit, in the scale of the healthy one; empty before.
-        std: (P + 1,) their standard errors, bounds not counted.
-        excitation: smallest eigenvalue of what the record says of the values that it visits, in squared deviations
-            of the innovations per half of the healthy range.
-    """
-
-    name: str
-    column: int
-    basis: Triangular
-    to_nodes: Array
-    healthy: Array
-    visited: Array
-    seen: tuple[float, float]
-    dead: bool
-    values: Array
-    std: Array
+    name: str  # the input, with the number of the function where it has several
+    column: int  # its index among the nonlinearities of the model
+    basis: Triangular  # the basis of its new values
+    to_nodes: Array  # (P + 1, P + 1) of [mu; constant] to the values at its nodes
+    healthy: Array  # (P + 1,) values before the fault
+    visited: Array  # (P + 1,) samples after the fault at each node, shared between neighbours
+    seen: tuple[float, float]  # smallest and largest input after the fault
+    dead: bool  # whether it is held constant: the actuator has no effect
+    values: Array  # (P + 1,) values after the refit, in the scale of the healthy one; empty before
+    std: Array  # (P + 1,) their standard errors, bounds not counted
+    # smallest eigenvalue of the information of the record on the values it visits, in squared deviations of the
+    # innovations per half of the healthy range
     excitation: float = 0.0
 
     @property
@@ -52,7 +39,7 @@ class Curve:
 
     @property
     def values_open(self) -> int:
-        """How many values are estimated."""
+        """Number of estimated values."""
         return 1 if self.dead else self.nodes.size
 
     @property
@@ -62,7 +49,7 @@ class Curve:
 
     @property
     def prior_only(self) -> NDArray[np.bool_]:
-        """(P + 1,) whether the record says nothing of a value: less than half a sample lies there."""
+        """(P + 1,) whether a value rests on the prior alone: less than half a sample lies there."""
         return self.visited < 0.5
 
     def __str__(self) -> str:
@@ -76,15 +63,9 @@ class Curve:
 
 
 def curve_of(model: "HammersteinSS", column: int, inputs: Array, raw: Data, nodes: int, dead: bool) -> Curve:
-    """Return the nodes of a damaged nonlinearity: those of its own hats, or even ones over its range.
+    """Return a damaged nonlinearity at the nodes of its own triangular basis, or at even nodes over its range.
 
-    Args:
-        model: the healthy model.
-        column: index of the nonlinearity.
-        inputs: (N, m) after the fault.
-        raw: the whole record, whose range is taken where the basis has none.
-        nodes: number of even nodes.
-        dead: whether the actuator no longer moves.
+    The inputs (N, m) are those after the fault; the range of the whole record is used where the basis has none.
     """
     healthy, c = model.nonlinearities[column], model.input_of[column]
     u, basis = inputs[:, c], healthy.basis

@@ -1,14 +1,14 @@
-"""From an answer of a diagnosis to the damaged plant: what is open, what is lost, what is added."""
+"""The damaged plant that an answer of a diagnosis describes: open parameters, lost channels, additions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.bases import Triangular
-from optid.errors import StructureError
 from optid.faults.faults import channel_of
 from optid.faults.signatures import Candidate
 from optid.models.nonlinearity import Nonlinearity
@@ -23,47 +23,30 @@ DEAD_SHARE = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Damage:
-    """What one explanation of a record says is broken.
+    """The damage of one explanation of a record."""
 
-    Attributes:
-        label: the explanation.
-        posterior: its probability.
-        onset: first sample that the last of its faults changes.
-        same_onset: whether all of its faults began there.
-        columns: functions of the inputs that are damaged.
-        dead: those of them that no longer move.
-        sensors: names of outputs that are not to be trusted.
-        offsets: faults that add something to the plant.
-        louder_sensors: {output: standard deviation added}.
-        louder_states: covariance (n, n) added to the process noise; zeros where there is none.
-        gains: (r,) share of each f that is left.
-        constants: (r,) added to it.
-        added: (n,) constant added in the state equation.
-        notes: what is to be known of it.
-    """
-
-    label: str
-    posterior: float
-    onset: int
-    same_onset: bool
-    columns: tuple[int, ...]
-    dead: tuple[int, ...]
-    sensors: tuple[str, ...]
-    offsets: tuple[Candidate, ...]
-    louder_sensors: Mapping[str, float]
-    louder_states: Array
-    gains: Array
-    constants: Array
-    added: Array
-    notes: tuple[str, ...]
+    label: str  # the explanation
+    posterior: float  # its probability
+    onset: int  # first sample that the last of its faults changes
+    same_onset: bool  # whether all of its faults began there
+    columns: tuple[int, ...]  # functions of the inputs that are damaged
+    dead: tuple[int, ...]  # those of them that are constant
+    sensors: tuple[str, ...]  # names of outputs whose readings are not used
+    offsets: tuple[Candidate, ...]  # faults that add something to the plant
+    louder_sensors: Mapping[str, float]  # {output: standard deviation added}
+    louder_states: Array  # covariance (n, n) added to the process noise; zeros where there is none
+    gains: Array  # (r,) share of each f that is left
+    constants: Array  # (r,) added to it
+    added: Array  # (n,) constant added in the state equation
+    notes: tuple[str, ...]  # remarks for the report
 
     @property
     def needs_refit(self) -> bool:
-        """Whether something about the plant itself is to be estimated."""
+        """Whether parameters of the plant itself are to be estimated."""
         return bool(self.columns or self.offsets)
 
     def with_noise(self, model: "HammersteinSS") -> "HammersteinSS":
-        """Return a model with the noise that the faults add."""
+        """Return a model with the added noise of the faults."""
         if model.noise is None or not (self.louder_sensors or self.louder_states.any()):
             return model
         R = np.array(model.noise.R)
@@ -76,7 +59,7 @@ class Damage:
         return replace(model, K=steady.K, noise=replace(model.noise, Q=Q, R=R, innovation=steady.innovation))
 
     def believed(self, model: "HammersteinSS") -> "HammersteinSS":
-        """Return the model that the diagnosis alone describes: gains and constants, without a refit."""
+        """Return the model with the gains and constants of the diagnosis, without a refit."""
         functions = list(model.nonlinearities)
         constants = np.array(self.constants)
         for i in self.columns:
@@ -94,33 +77,28 @@ class Damage:
 
 
 def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
-    """Return what an answer may mean: one explanation, or one for each part of a group that no record tells apart."""
-    variants: list[list[tuple[str, Estimate]]] = [[]]
-    for fault in answer.faults:
-        places = fault.candidate.places or (fault.name,)
-        variants = [[*before, (place, fault)] for before in variants for place in places]
+    """Return one explanation of an answer, or one for each part of a group that is not isolable."""
+    parts = [[(place, fault) for place in fault.candidate.places or (fault.name,)] for fault in answer.faults]
+    variants = list(product(*parts))
     return [_damage(model, parts, answer.posterior / len(variants)) for parts in variants]
 
 
 def merged(broken: list[Damage]) -> list[Damage]:
-    """Return one explanation for those that break the same parts, as a loss and a stuck actuator do.
+    """Merge explanations that break the same parts, as a loss and a stuck actuator do, which are refitted alike.
 
-    They are refitted alike; the most probable speaks for them, and their probabilities add up.
+    The most probable one is kept, with the sum of their probabilities.
     """
     groups: dict[Any, list[Damage]] = {}
-    for one in broken:
+    for one in sorted(broken, key=lambda one: -one.posterior):
         key = (frozenset(one.columns), frozenset(one.sensors), frozenset(c.label for c in one.offsets),
                frozenset(one.louder_sensors), bool(one.louder_states.any()))
         groups.setdefault(key, []).append(one)
-    found = []
-    for group in groups.values():
-        best = max(group, key=lambda one: one.posterior)
-        found.append(replace(best, posterior=sum(one.posterior for one in group)))
+    found = [replace(group[0], posterior=sum(one.posterior for one in group)) for group in groups.values()]
     return sorted(found, key=lambda one: -one.posterior)
 
 
-def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posterior: float) -> Damage:
-    """Add up what the faults at some places break."""
+def _damage(model: "HammersteinSS", parts: Sequence[tuple[str, "Estimate"]], posterior: float) -> Damage:
+    """Collect the damage of faults at some places."""
     r, n = len(model.nonlinearities), model.nx
     found: dict[str, list[Any]] = {"columns": [], "dead": [], "sensors": [], "offsets": [], "notes": []}
     louder: dict[str, float] = {}
@@ -132,7 +110,7 @@ def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posteri
         known = bool(np.all(np.isfinite(size)))
         into_state = fault.candidate.into_state
         if fault.kind == "spike":
-            notes.append(f"{channel}: single readings were wrong; nothing is broken")
+            notes.append(f"{channel}: single readings were wrong; no part is broken")
         elif part == "actuator":
             mine = [i for i, of in enumerate(model.input_of) if of == channel_of(model.inputs, place)]
             found["columns"] += mine
@@ -148,8 +126,7 @@ def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posteri
                 if size[0] >= DEAD_SHARE and low <= 1 <= high or fault.kind == "frozen":
                     found["dead"] += mine
                     gains[mine] = 0.0
-                    notes.append(f"{channel}: nothing of its effect is left within the interval of the share lost: "
-                                 "hard-over")
+                    notes.append(f"{channel}: the interval of the share lost includes a total loss: hard-over")
         elif part == "sensor":
             name = model.outputs[channel_of(model.outputs, place)]
             if fault.kind == "noise" and known:
@@ -161,7 +138,7 @@ def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posteri
         elif fault.kind == "noise":
             states = states + into_state * size**2 @ into_state.T if known else states
         elif fault.kind == "jump":
-            notes.append("the state jumped once: the plant is as it was, the observer starts anew")
+            notes.append("the state jumped once: the plant is unchanged, the observer restarts")
         else:
             found["offsets"].append(replace(fault.candidate, kind=fault.kind, name=place,
                                             members=fault.candidate.members or (place,)))
@@ -174,22 +151,3 @@ def _damage(model: "HammersteinSS", parts: list[tuple[str, "Estimate"]], posteri
     once: dict[str, Any] = {name: tuple(dict.fromkeys(values)) for name, values in found.items() if name != "offsets"}
     return Damage(label, posterior, max(onsets), min(onsets) == max(onsets), offsets=tuple(found["offsets"]),
                   louder_sensors=louder, louder_states=states, gains=gains, constants=constants, added=added, **once)
-
-
-def check_answers(diagnosis: Any) -> None:
-    """Refuse a diagnosis that names nothing.
-
-    Raises:
-        StructureError: verdicts "unknown", "untestable" and "not isolable" without candidates.
-    """
-    if diagnosis.candidates:
-        return
-    why = {
-        "unknown": "no fault of the dictionary fits, so that there is nothing to put into the model. Add candidates to "
-                   "the dictionary, or fit a new model to the record after the alarm",
-        "untestable": "the record cannot say: its input does not move what is suspected. Record with a moving input, "
-                      "or apply optid.faults.probe_input",
-        "not isolable": "the record cannot say which part it is: with one output every fault with a free course fits. "
-                        "Add a sensor, or use kinds of faults with a course of their own",
-    }.get(diagnosis.verdict, "it has no candidates")
-    raise StructureError(f"The diagnosis is {diagnosis.verdict!r}: {why}.")

@@ -1,4 +1,4 @@
-"""The inverse of a static nonlinearity over the range of its input, and where there is none."""
+"""The inverse of a static nonlinearity over the range of its input, and the intervals without one."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,13 +13,13 @@ from optid.errors import StructureError
 from optid.models.nonlinearity import Nonlinearity
 
 POINTS = 2049
-"""Points at which a nonlinearity is looked at."""
+"""Points at which a nonlinearity is tabulated."""
 
 FLAT = 1e-9
 """A step below this share of the range, per point, is none: the inverse would divide by it."""
 
 DEAD = 1e-9
-"""A range below this share of the values is that of an actuator that no longer moves anything."""
+"""A range of f below this share of its values is that of an actuator without effect."""
 
 EXACT = 1e-13
 """Width of the bracket of an input, relative to its range, at which the search ends."""
@@ -27,47 +27,36 @@ EXACT = 1e-13
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """u = f^-1(v) for v between the least and the largest value of f.
+    """u = f^-1(v) for v between the least and the largest value of f."""
 
-    Attributes:
-        f: the nonlinearity.
-        low: least input.
-        high: largest input.
-        v_low: least value of f there.
-        v_high: largest value.
-        refused: intervals of the input on which f is flat or turns back, so that there is no inverse.
-        turns: whether f turns back on one of them; else it is only flat there.
-        points: (T,) inputs of a table.
-        values: (T,) of f.
-    """
-
-    f: Nonlinearity
-    low: float
-    high: float
-    v_low: float
-    v_high: float
+    f: Nonlinearity  # the nonlinearity
+    low: float  # least input
+    high: float  # largest input
+    v_low: float  # least value of f there
+    v_high: float  # largest value
+    # intervals of the input on which f is flat or turns back, so that there is no inverse
     refused: tuple[tuple[float, float], ...]
-    turns: bool
-    points: Array = field(repr=False)
-    values: Array = field(repr=False)
+    turns: bool  # whether f turns back on one of them; else it is only flat there
+    points: Array = field(repr=False)  # (T,) inputs of a table
+    values: Array = field(repr=False)  # (T,) of f
 
     @property
     def dead(self) -> bool:
-        """Whether the actuator moves nothing: f is the same everywhere."""
+        """Whether the actuator has no effect: f is constant."""
         return self.v_high - self.v_low <= DEAD * max(abs(self.v_low), abs(self.v_high), 1e-300)
 
     @property
     def message(self) -> str:
-        """Where there is no inverse and why, "" where there is one everywhere."""
+        """The intervals without an inverse and the reason; "" where there are none."""
         if not self.refused or self.dead:
             return ""
         parts = ", ".join(f"[{a:.4g}, {b:.4g}]" for a, b in self.refused)
         return f"no inverse on {parts}: f {'turns back' if self.turns else 'is flat'} there"
 
     def __call__(self, v: ArrayLike, near: float | None = None) -> Array:
-        """Return inputs whose f is v, any shape; v beyond the range of f gets the end.
+        """Return inputs whose f is v, any shape, v limited to the range of f.
 
-        Where several inputs give v (on a refused interval), the one nearest to `near` is returned, or to the middle.
+        Of several inputs (on a refused interval) the one nearest to `near`, or to the middle, is returned.
         """
         wanted = np.clip(np.asarray(v, dtype=float), self.v_low, self.v_high)
         middle = (self.low + self.high) / 2 if near is None else float(np.clip(near, self.low, self.high))
@@ -76,7 +65,7 @@ class Inverse:
         return np.reshape([self._nearest(value, middle) for value in wanted.ravel().tolist()], wanted.shape)
 
     def _nearest(self, v: float, near: float) -> float:
-        """Search the cell of the table that v crosses nearest to an input."""
+        """Return the root in the cell of the table that v crosses nearest to an input."""
         error = self.values - v
         crossing = np.flatnonzero(error[:-1] * error[1:] <= 0)
         best = np.clip(near, self.points[crossing], self.points[crossing + 1])
@@ -86,7 +75,7 @@ class Inverse:
             return float(np.clip(near, a, b))
 
         def error_at(u: float) -> float:
-            """Error there, that of the table at its points: one rounded otherwise might lose its sign."""
+            # at its points the error is that of the table: one rounded otherwise might lose its sign
             return ends[(a, b).index(u)] if u in (a, b) else float(self.f(u)) - v
 
         found: Any = brentq(error_at, a, b, xtol=EXACT * (self.high - self.low))
@@ -94,12 +83,7 @@ class Inverse:
 
 
 def inverse(f: Nonlinearity, low: float, high: float) -> Inverse:
-    """Look at a nonlinearity over a range of its input and prepare its inverse.
-
-    Args:
-        f: the nonlinearity.
-        low: least input.
-        high: largest input.
+    """Return the inverse of a nonlinearity f over the inputs from low to high.
 
     Raises:
         StructureError: an empty range.
@@ -119,7 +103,7 @@ def inverse(f: Nonlinearity, low: float, high: float) -> Inverse:
     turns = bool(np.any(sign * steps < -FLAT * size))
     edges = np.flatnonzero(np.diff(bad.astype(int), prepend=0, append=0))
     refused = tuple((float(points[a]), float(points[b])) for a, b in zip(edges[::2], edges[1::2]))
-    if turns:  # the values of a part that turns back are those of other parts, too
+    if turns:  # other parts take the values of a part that turns back, too
         back = np.concatenate([values[i : j + 1] for i, j in zip(edges[::2], edges[1::2])])
         inside = points[(values >= back.min()) & (values <= back.max())]
         refused = ((float(inside[0]), float(inside[-1])),)

@@ -19,12 +19,12 @@ def write(found: Reformulation, path: str | Path, *, record: str = "", command: 
         OSError: the file cannot be written.
     """
     caption = (
-        "Effect of every actuator before and now, with twice its standard error (open dots: no sample lies there); "
-        "outputs that can be held at rest; predicted errors of the outputs without their noise."
+        "Effect of every actuator before and after the fault, with twice its standard error (open dots: no sample lies "
+        "there); attainable steady outputs; predicted errors of the outputs without their noise."
     )
     return write_page(
         path, f"Reformulation: {found.status}", (record, found.healthy.title),
-        headings=("What is there now", "Before and now", "Explanations"), draw=found.plot, caption=caption,
+        headings=("The damaged system", "Before and after", "Explanations"), draw=found.plot, caption=caption,
         cards=_cards(found), tables=_tables(found), texts=[(member.label, str(member)) for member in found.members],
         tone=TONES[found.status], word=HEADS[found.status], sentences=_sentences(found),
         notes=list(dict.fromkeys(found.notes)), call=command or "optid.faults.reformulate(model, diagnosis, data)",
@@ -36,15 +36,15 @@ def _sentences(found: Reformulation) -> list[str]:
     labels = " or ".join(member.label for member in found.members)
     if found.if_ambiguous is not None:
         advice = found.if_ambiguous
-        return [f"What broke is {labels}.", f"Advice: {advice.action}; {advice.reason}."]
-    lines = [f"What broke is {labels}."] if labels else ["Nothing is to be changed."]
+        return [f"Fault: {labels}.", f"Advice: {advice.action}; {advice.reason}."]
+    lines = [f"Fault: {labels}."] if labels else ["The plant is unchanged."]
     if found.schedule is not None:
         lines.append(
             f"The model was refitted from {found.schedule.samples} samples after the fault: {found.schedule.stage} "
             f"({found.schedule.reason})."
         )
     if found.observer.lost:
-        lines.append(f"Without {', '.join(found.observer.lost)} the other sensors say what they would read.")
+        lines.append(f"{', '.join(found.observer.lost)}: not used; the filter on the other sensors estimates them.")
     return lines
 
 
@@ -70,17 +70,17 @@ def _tables(found: Reformulation) -> list[Table]:
             for u, old, new, std, unseen in zip(one.nodes, one.healthy, one.values, one.std, one.prior_only)
         ]
         note = (
-            f"Inputs after the fault from {one.seen[0]:.4g} to {one.seen[1]:.4g}; smallest eigenvalue of what the "
-            f"record says of the values it visits {one.excitation:.3g}. Standard errors do not count the rules."
+            f"Inputs after the fault from {one.seen[0]:.4g} to {one.seen[1]:.4g}; smallest eigenvalue of the "
+            f"information on the values with samples {one.excitation:.3g}. Standard errors: without constraints."
         )
         tables.append(Table(f"Effect of {one.name}", ("input", "before", "now", "standard error", ""), rows, note))
     seen = found.observer
-    if not seen.lost:  # nothing has changed of what the sensors say
+    if not seen.lost:
         return tables
     rows = [(name, "not used" if name in seen.lost else "used", number(value, 3), number(seen.noise[name], 3),
              number(seen.open_loop[name], 3)) for name, value in seen.rmse.items()]
     tables.append(Table(
         "Outputs", ("output", "sensor", "predicted RMSE", "noise of the sensor", "RMSE of a simulation"), rows,
-        "Of the outputs without their noise, from the Riccati equation of the filter on the sensors that are used.",
+        "Of the outputs without their noise, from the Riccati equation of the filter on the used sensors.",
     ))
     return tables

@@ -1,4 +1,4 @@
-"""A reformulation as a picture: what the actuators do now, where the plant can rest, what the sensors still say."""
+"""A figure of a reformulation: effect of the actuators, attainable outputs, predicted errors of the outputs."""
 
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, cast
@@ -11,17 +11,16 @@ from optid.show.panels import BLUE, GREEN, INK, MUTED, ORANGE, plain, shorten, s
 
 if TYPE_CHECKING:
     from optid.faults.repair.reformulation import MemberModel, Reformulation
-    from optid.models import HammersteinSS
 
 COLOURS = (ORANGE, GREEN, BLUE)
 
 
 @styled
 def draw(found: "Reformulation") -> Figure:
-    """Draw the nonlinearities before and now, the outputs that can be held, and what replaces a lost sensor."""
+    """Draw the nonlinearities before and after, the attainable outputs, and the errors of the outputs."""
     inputs = found.healthy.m
     flat = found.healthy.l == 2
-    lost = bool(found.observer.lost)  # with all sensors left nothing has changed of what they say
+    lost = bool(found.observer.lost)
     panels = inputs + int(flat) + int(lost)
     columns = 2 if panels == 4 else min(panels, 3)
     rows = -(-panels // columns)
@@ -41,18 +40,10 @@ def draw(found: "Reformulation") -> Figure:
 
 
 def _shown(found: "Reformulation") -> "list[tuple[MemberModel, str, str]]":
-    """Explanations that are drawn, with their colours and words."""
+    """Explanations that are drawn, with their colours and labels."""
     one = len(found.members) == 1
     return [(member, colour, "now" if one else shorten(member.label, 20))
             for member, colour in zip(found.members, COLOURS)]
-
-
-def _values(model: "HammersteinSS", healthy: "HammersteinSS", column: int, u: np.ndarray) -> np.ndarray:
-    """Return f of one column with the constant that a refit has put into the constants of the model."""
-    b = np.concatenate([healthy.B[:, column], healthy.D[:, column]])
-    moved = np.concatenate([model.offset_x - healthy.offset_x, model.offset_y - healthy.offset_y])
-    constant = float(b @ moved / (b @ b)) if b.any() and np.array_equal(model.B, healthy.B) else 0.0
-    return np.asarray(model.nonlinearities[column](u)) + constant
 
 
 def _input(ax: Axes, found: "Reformulation", c: int) -> None:
@@ -71,7 +62,7 @@ def _input(ax: Axes, found: "Reformulation", c: int) -> None:
             curves = () if member.schedule is None else member.schedule.values
             one = next((curve for curve in curves if curve.column == i), None)
             if one is None:
-                ax.plot(u, _values(member.model, found.healthy, i, u), color=colour, label=name)
+                ax.plot(u, member.damage.gains[i] * values + member.damage.constants[i], color=colour, label=name)
                 continue
             at, now, unseen = one.nodes, one.values, one.prior_only
             ax.plot(at, now, color=colour, label=name)
@@ -87,7 +78,7 @@ def _input(ax: Axes, found: "Reformulation", c: int) -> None:
 
 
 def _attainable(ax: Axes, found: "Reformulation") -> None:
-    """The outputs that can be held at rest, before and now."""
+    """The attainable steady outputs, before and after."""
     from optid.errors import OptidError
     from optid.faults.repair.allocation import allocate
 
@@ -105,7 +96,7 @@ def _attainable(ax: Axes, found: "Reformulation") -> None:
         around = np.vstack([corners, corners[:1]])
         ax.plot(*around.T, dash, color=colour, label=word, marker="o" if len(corners) == 1 else None)
     names = [plain(shorten(name)) for name in found.healthy.outputs]
-    ax.set(title="outputs that can be held", xlabel=names[0], ylabel=names[1])
+    ax.set(title="attainable outputs", xlabel=names[0], ylabel=names[1])
     if ax.get_legend_handles_labels()[0]:
         low, high = ax.get_ylim()
         ax.set_ylim(low, high + 0.35 * (high - low))
@@ -113,7 +104,7 @@ def _attainable(ax: Axes, found: "Reformulation") -> None:
 
 
 def _sensors(ax: Axes, found: "Reformulation") -> None:
-    """Predicted errors of the outputs: of the readings, and of the filter on what is left."""
+    """Predicted errors of the outputs: of the readings, and of the filter on the remaining sensors."""
     from optid.faults.repair.virtual_sensor import observer
 
     before = observer(found.healthy)

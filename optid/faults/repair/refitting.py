@@ -1,8 +1,8 @@
-"""What a record after a fault says of the parameters that are open: innovations and their sensitivities, compressed.
+"""The record after a fault as a regression on the open parameters: innovations and their sensitivities.
 
-The predictor is the steady Kalman predictor of the healthy plant, started where the healthy plant was when it broke.
-Its innovations are linear in the values of a damaged nonlinearity, since the columns of B and D that carry it stay; in
-the other parameters they are linearised.
+The predictor is the steady Kalman predictor of the healthy plant, started in the state at the onset. Its innovations
+are linear in the values of a damaged nonlinearity, since the columns of B and D that carry it stay, and linearised in
+the other parameters.
 """
 
 import warnings
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array, compact
+from optid.arrays import Array
 from optid.bases import Linear
 from optid.data.record import Data
 from optid.data.stretches import interpolated
@@ -38,13 +38,13 @@ MATRICES = ("A", "B", "C", "D")
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is believed before the record: the plant is as it was, but for what broke.
+    """Prior of a refit: the plant is as it was, except for what broke.
 
     Attributes:
         damaged: standard deviation of a value of a damaged nonlinearity about its healthy one, in halves of the range
             of the healthy nonlinearity.
-        curvature: standard deviation of the second differences of its values about those of the healthy one times what
-            is left of its gain, in the same units.
+        curvature: standard deviation of its second differences about those of the healthy one times the remaining
+            gain, in the same units.
         healthy: standard deviation of the entries of A, B, C and D, and of the coefficients of the other
             nonlinearities, in units of the largest entry of each; used only where all parameters are open.
 
@@ -59,56 +59,41 @@ class Prior:
     def __post_init__(self) -> None:
         for word in ("damaged", "curvature", "healthy"):
             if not getattr(self, word) > 0:
-                raise StructureError(f"prior: {word} = {getattr(self, word)!r}; a positive number is needed.")
+                raise StructureError(f"prior: {word} = {getattr(self, word)!r} must be a positive number.")
 
 
 class Window(NamedTuple):
-    """A record from the sample before the fault on, or from the fault on where nothing is known before it.
+    """A record from the sample before the fault on, or from the fault on where no earlier sample is usable."""
 
-    Attributes:
-        u: (N, m) inputs.
-        y: (N, l) readings.
-        present: (N, l) whether a reading is there.
-        fed: (N, n) what measured outputs drive the state with: E g(y) + L y, missing readings interpolated.
-        x0: (n,) predicted state at the first sample; unknown where not held.
-        e0: (l,) innovation there.
-        held: whether the first sample is before the fault: its innovation belongs to the healthy plant.
-    """
+    u: Array  # (N, m) inputs
+    y: Array  # (N, l) readings
+    present: Array  # (N, l) whether a reading is there
+    fed: Array  # (N, n) E g(y) + L y of the measured outputs, missing readings interpolated
+    x0: Array  # (n,) predicted state at the first sample; unknown where not held
+    e0: Array  # (l,) innovation there
+    held: bool  # whether the first sample is before the fault: its innovation belongs to the healthy plant
 
-    u: Array
-    y: Array
-    present: Array
-    fed: Array
-    x0: Array
-    e0: Array
-    held: bool
+    @property
+    def since(self) -> np.ndarray:
+        """(N,) samples since the onset."""
+        return np.arange(len(self.u)) - int(self.held)
 
 
 @dataclass(frozen=True, eq=False)
 class Refitting:
-    """A record after a fault and what is open in the model.
+    """A record after a fault and the open parameters of the model."""
 
-    Attributes:
-        model: the healthy model.
-        steady: its predictor; its gain is kept.
-        windows: one per experiment.
-        curves: the damaged nonlinearities.
-        offsets: faults that add a constant or a drift, whose size is estimated along.
-        whole: whether the matrices and the other nonlinearities are open, too.
-        prior: what is believed beforehand.
-    """
-
-    model: "HammersteinSS"
-    steady: Predictor
-    windows: tuple[Window, ...]
-    curves: tuple[Curve, ...]
-    offsets: tuple[Candidate, ...]
-    whole: bool
+    model: "HammersteinSS"  # the healthy model
+    steady: Predictor  # its predictor; its gain is kept
+    windows: tuple[Window, ...]  # one per experiment
+    curves: tuple[Curve, ...]  # the damaged nonlinearities
+    offsets: tuple[Candidate, ...]  # faults that add a constant or a drift, whose size is estimated as well
+    whole: bool  # whether the matrices and the other nonlinearities are open, too
     prior: Prior
 
     @cached_property
     def unknowns(self) -> dict[str, Array]:
-        """The unknowns by name, in their order, at the healthy plant."""
+        """The unknowns by name, in order, with their values in the healthy plant."""
         found: dict[str, Array] = {}
         for curve in self.curves:
             coefficients: Any = np.linalg.solve(curve.to_nodes, curve.healthy)
@@ -123,7 +108,7 @@ class Refitting:
 
     @cached_property
     def others(self) -> tuple[int, ...]:
-        """Healthy nonlinearities with a shape of their own."""
+        """Healthy nonlinearities with more than one coefficient."""
         damaged = {curve.column for curve in self.curves}
         return tuple(i for i, f in enumerate(self.model.nonlinearities)
                      if i not in damaged and f.basis.size > 1 and not isinstance(f.basis, Linear))
@@ -163,7 +148,7 @@ class Refitting:
 
     @cached_property
     def held(self) -> Array:
-        """(q,) unknowns that stay zero: the shape of a dead actuator, and a matrix of zeros."""
+        """(q,) unknowns fixed at zero: the shape of a dead actuator, and a matrix of zeros."""
         held = np.zeros(self.start.size, dtype=bool)
         for curve in self.curves:
             held[self.slices[f"mu[{curve.name}]"]] = curve.dead
@@ -173,11 +158,11 @@ class Refitting:
 
     @property
     def anchored(self) -> tuple[str, ...]:
-        """Names of the unknowns that are believed to be those of the healthy plant."""
+        """Names of the unknowns with a healthy prior."""
         return (*MATRICES, *(f"mu {i + 1}" for i in self.others)) if self.whole else ()
 
     def believed(self) -> tuple[Array, Array]:
-        """Return what is believed beforehand: rows of a least-squares problem in [z; shares lost], and their target."""
+        """Return the prior as rows of a least-squares problem in [z; shares lost], and their target."""
         width = self.start.size + len(self.curves)
         rows, wanted = [np.zeros((0, width))], [np.zeros(0)]
         for name in self.anchored:
@@ -197,9 +182,9 @@ class Refitting:
         return np.vstack(rows), np.concatenate(wanted)
 
     def evidence(self) -> float:
-        """Return the log probability of the record under the prior, rules not counted, up to a constant.
+        """Return the log marginal likelihood of the record up to a constant; constraints are not part of it.
 
-        Every share lost is taken as 0.5 +- 0.5. Exact where the unknowns enter linearly.
+        Every share lost is 0.5 +- 0.5. Exact where the unknowns enter linearly.
         """
         r, s = self.linearised(self.start)
         rows, wanted = self.believed()
@@ -207,9 +192,9 @@ class Refitting:
         rows, wanted = np.vstack([rows, shares]), np.concatenate([wanted, np.ones(len(shares))])
         full, target = np.pad(s, ((0, 0), (0, len(self.curves)))), s @ self.start - r
         before, after = rows.T @ rows, rows.T @ rows + full.T @ full
-        told = rows.any(axis=0)  # the others, as an unknown initial state, have a flat prior
-        before, mean = before[np.ix_(told, told)], np.zeros(len(before))
-        mean[told] = np.linalg.solve(before, (rows.T @ wanted)[told])
+        known = rows.any(axis=0)  # the others, as an unknown initial state, have a flat prior
+        before, mean = before[np.ix_(known, known)], np.zeros(len(before))
+        mean[known] = np.linalg.solve(before, (rows.T @ wanted)[known])
         point = np.linalg.solve(after, rows.T @ wanted + full.T @ target)
         left = float(np.sum((full @ point - target) ** 2) + np.sum((rows @ point - wanted) ** 2))
         left -= float(np.sum((rows @ mean - wanted) ** 2))
@@ -223,9 +208,9 @@ class Refitting:
         return replace(self, windows=(*self.windows[:-1], shorter))
 
     def covariance(self, sensitivities: Array) -> Array:
-        """Return the covariance (q, q) of the unknowns, of the record and of what is believed beforehand.
+        """Return the covariance (q, q) of the unknowns given the record and the prior; zero along undetermined ones.
 
-        Bounds are not part of it; along what neither says anything of it is zero.
+        Bounds are not part of it.
         """
         rows, _ = self.believed()
         rows = np.vstack([rows, np.pad(sensitivities, ((0, 0), (0, len(self.curves))))])
@@ -235,7 +220,7 @@ class Refitting:
         return found[: self.start.size, : self.start.size]
 
     def model_at(self, theta: Array) -> "HammersteinSS":
-        """Return the model of a vector of unknowns; constants of damaged nonlinearities go to those of the model."""
+        """Return the model of a vector of unknowns; constants of damaged nonlinearities become its offsets."""
         values = self.unpack(theta)
         changes: dict[str, Any] = {name: values[name] for name in MATRICES if self.whole}
         B, D = changes.get("B", self.model.B), changes.get("D", self.model.D)
@@ -250,57 +235,46 @@ class Refitting:
 
     def linearised(self, theta: Array) -> tuple[Array, Array]:
         """Return the whitened innovations (M,) at a point and their sensitivities (M, q), those present."""
-        model, values = self.model_at(theta), self.unpack(theta)
-        parts = [self._window(model, values, number) for number in range(len(self.windows))]
+        parts = [self._window(theta, number) for number in range(len(self.windows))]
         return np.concatenate([r for r, _ in parts]), np.vstack([s for _, s in parts])
 
-    def _window(self, model: "HammersteinSS", values: dict[str, Array], number: int) -> tuple[Array, Array]:
-        w = self.windows[number]
-        f = model.expanded(w.u)
-        drive, direct = f @ model.B.T + model.offset_x + w.fed, f @ model.D.T + model.offset_y
-        for c in self.offsets:
-            course = _course(c.kind, len(w.u), w.held)
-            drive[:-1] += np.outer(course[1:], c.into_state @ values[f"size[{c.label}]"])
-            direct += np.outer(course, c.into_output @ values[f"size[{c.label}]"])
+    def _window(self, theta: Array, number: int) -> tuple[Array, Array]:
+        w, model, values, q = self.windows[number], self.model_at(theta), self.unpack(theta), theta.size
+        (count, l), n = w.y.shape, model.nx  # noqa: E741
+        drive, direct = self._signals(theta, w, np.zeros((count, n)))
+        drive[0] += self.steady.K @ w.e0
         shown = w.present.copy()
         shown[: int(w.held)] = False  # an innovation that is given does not depend on the parameters
-        drive[0] += self.steady.K @ w.e0
         x = values["x0"][number] if "x0" in values else w.x0
         steady = replace(self.steady, A=model.A, C=model.C, L=np.zeros_like(model.L))
         moved, seen = -np.vstack([x, drive[:-1]])[:, :, None], np.nan_to_num(w.y - direct)[:, :, None]
         innovations = np.where(shown, steady.respond(moved, seen, shown)[..., 0], 0.0)
-        for curve in self.curves:  # its constant went to those of the model
-            f[:, curve.column] += values[f"constant[{curve.name}]"]
-        states = _states(steady, drive, innovations, x) if self.whole else np.zeros((0, model.nx))
-        into_state, into_output = self._additions(model, w, f, states)
+        still = replace(steady, C=np.eye(n), K=np.zeros((n, n)), L=np.zeros((n, n)))  # its outputs are the states
+        entered = np.vstack([x, (drive + innovations @ steady.K.T)[:-1]])[:, :, None]
+        states = still.respond(entered, np.zeros((count, n, 1)))[..., 0]
+        here = self._signals(theta, w, states)
+        into_state, into_output = np.zeros((count, n, q)), np.zeros((count, l, q))
+        for j, unit in enumerate(np.eye(q)):  # exact: the signals are linear in every single unknown
+            there = self._signals(theta + unit, w, states)
+            into_state[1:, :, j], into_output[:, :, j] = (there[0] - here[0])[:-1], there[1] - here[1]
         if "x0" in self.slices:
-            first = self.slices["x0"].start + number * model.nx
-            into_state[0, :, first : first + model.nx] = np.eye(model.nx)
+            first = self.slices["x0"].start + number * n
+            into_state[0, :, first : first + n] = np.eye(n)
         response: Any = steady.whitened(steady.respond(into_state, into_output, shown), shown)
         white: Any = steady.whitened(innovations, shown)
         return white[shown], -response[shown]
 
-    def _additions(self, model: "HammersteinSS", w: Window, f: Array, states: Array) -> tuple[Array, Array]:
-        """What a unit of every unknown adds to the states (N, n, q) and to the outputs (N, l, q)."""
-        count, n, l = len(w.u), model.nx, model.l  # noqa: E741
-        into_state, into_output = np.zeros((count, n, self.start.size)), np.zeros((count, l, self.start.size))
-        damaged = [(self.part(curve), curve.column) for curve in self.curves]
-        for part, i in [*damaged, *((self.slices[f"mu {i + 1}"], i) for i in self.others if self.whole)]:
-            signal = model.nonlinearities[i].basis.values(w.u[:, model.input_of[i]])
-            signal = np.column_stack([signal, np.ones((count, part.stop - part.start - signal.shape[1]))])
-            into_state[1:, :, part] = signal[:-1, None, :] * model.B[:, [i]]
-            into_output[:, :, part] = signal[:, None, :] * model.D[:, [i]]
+    def _signals(self, theta: Array, w: Window, states: Array) -> tuple[Array, Array]:
+        """Return the next states (N, n) and the outputs (N, l) of the model along states (N, n)."""
+        model, values = self.model_at(theta), self.unpack(theta)
+        f = model.expanded(w.u)
+        later = states @ model.A.T + f @ model.B.T + model.offset_x + w.fed
+        outputs = states @ model.C.T + f @ model.D.T + model.offset_y
         for c in self.offsets:
-            course, part = _course(c.kind, count, w.held)[:, None, None], self.slices[f"size[{c.label}]"]
-            into_state[1:, :, part], into_output[:, :, part] = course[1:] * c.into_state, course * c.into_output
-        for name, signal in zip(MATRICES, (states, f, states, f)) if self.whole else ():
-            rows = np.einsum("ij,nk->nijk", np.eye(n if name in "AB" else l), signal)
-            rows = rows.reshape(count, len(rows[0]), -1)
-            if name in "AB":
-                into_state[1:, :, self.slices[name]] = rows[:-1]
-            else:
-                into_output[:, :, self.slices[name]] = rows
-        return into_state, into_output
+            course, size = course_of(c.kind, w.since), values[f"size[{c.label}]"]
+            later[:-1] += np.outer(course[1:], c.into_state @ size)
+            outputs += np.outer(course, c.into_output @ size)
+        return later, outputs
 
 
 def refitting(
@@ -315,12 +289,12 @@ def refitting(
         data: the record; the fault is in the first experiment from `onset` on and in all of the others.
         onset: first sample that the fault changes.
         damaged: indices of the nonlinearities of the inputs that are open.
-        offsets: faults that add something, whose size is estimated along.
+        offsets: faults that add something, whose size is estimated as well.
         whole: open the matrices and the other nonlinearities, too.
-        prior: what is believed beforehand.
+        prior: see `Prior`.
         nodes: values of a damaged nonlinearity, where it has no nodes of its own.
         known_start: whether the plant was healthy before the onset, so that its state there is predicted.
-        dead: those of the damaged that no longer move: one constant each is estimated.
+        dead: those of the damaged that are constant: one value each is estimated.
 
     Raises:
         DataError: a missing input after the fault, an onset beyond the record, other channels than the model's.
@@ -340,14 +314,12 @@ def refitting(
     if found.readings < needed:
         raise RankError(
             f"{found.readings} readings after the fault, and {needed} values to estimate: at least "
-            f"{-(-needed // model.l)} samples with every output are needed. Until then the healthy model stands as "
-            "the prior."
-        )
+            f"{-(-needed // model.l)} samples with every output are needed.")
     return found
 
 
 def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: int, known_start: bool) -> Window:
-    """Cut a record at the onset of a fault; before it the state is predicted from what the plant did."""
+    """Cut a record at the onset of a fault; the state there is predicted from the samples before."""
     if onset >= len(y):
         raise DataError(f"The onset {onset} lies beyond the record of {len(y)} samples.")
     if len(y) - onset > LONGEST:
@@ -357,8 +329,8 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
     start, before = max(onset - 1, 0), slice(max(0, onset - 4 * steady.settling), onset)
     missing = np.isnan(u[start:]).any(axis=1)
     if missing.any():
-        raise DataError(f"Sample {start + int(np.argmax(missing))} lacks an input: a refit needs every input from the "
-                        "fault on.")
+        raise DataError(f"Sample {start + int(np.argmax(missing))} lacks an input: a refit needs every input after "
+                        "the onset.")
     fed = np.zeros((len(y), model.nx))
     if model.feedback or model.L.any():
         filled = interpolated(y)
@@ -375,21 +347,3 @@ def _cut(model: "HammersteinSS", steady: Predictor, u: Array, y: Array, onset: i
         x0, e0 = white.states[-1], np.nan_to_num(white.innovations[-1])
     after = slice(start if held else onset, None)
     return Window(u[after], y[after], ~np.isnan(y[after]), fed[after], x0, e0, held)
-
-
-def _states(steady: Predictor, drive: Array, innovations: Array, x0: Array) -> Array:
-    """States (N, n) of a predictor from its innovations."""
-    from optid.faults.kernels import predict
-
-    count, outputs = innovations.shape
-    states, nothing = np.empty(drive.shape), np.zeros((count - 1, outputs))
-    states[0] = x0
-    entered = drive + innovations @ steady.K.T  # nothing else corrects the states
-    predict(compact(steady.A), compact(steady.C), np.zeros(steady.K.shape), compact(steady.root), entered[:-1],
-            nothing, nothing, states, np.empty(nothing.shape))
-    return states
-
-
-def _course(kind: str, count: int, held: bool) -> Array:
-    """Course of a fault that adds something, from the first sample it changes on."""
-    return course_of(kind, np.arange(count) - int(held))

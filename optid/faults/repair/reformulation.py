@@ -1,11 +1,11 @@
-"""The damaged system as a new problem: its model, what observes it, what can be done with it.
+"""The damaged system as a new problem: its model, its observer, and the control that remains possible.
 
 Everything here is a pure function of a healthy model and a diagnosis; the healthy model is never changed.
 """
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.records import record_of
 from optid.faults.repair.allocation import Allocation, Target, allocate, robust_allocation
 from optid.faults.repair.ambiguity import Ambiguity, advise
-from optid.faults.repair.damage import Damage, check_answers, damages, merged
+from optid.faults.repair.damage import Damage, damages, merged
 from optid.faults.repair.refitting import NODES, Prior
 from optid.faults.repair.schedule import Schedule, refit
 from optid.faults.repair.virtual_sensor import Observer, observer, without_sensors
@@ -31,39 +31,40 @@ if TYPE_CHECKING:
 HEADS = {
     "healthy": "healthy: the plant is as it was",
     "refitted": "one explanation; the model is refitted",
-    "as diagnosed": "one explanation; the model is what the diagnosis says",
+    "as diagnosed": "one explanation; the model is that of the diagnosis",
     "ambiguous": "several explanations; the model stays the healthy one until one is left",
 }
-"""What the statuses mean."""
+"""The statuses in words."""
+
+WITHOUT_ANSWER = {
+    "unknown": "no fault of the dictionary fits, so that no part of the model can be changed. Add candidates to the "
+               "dictionary, or fit a new model to the record after the alarm",
+    "untestable": "the input does not excite what is suspected. Record with a moving input, or apply "
+                  "optid.faults.probe_input",
+    "not isolable": "with one output every fault with a free course fits. Add a sensor, or use kinds of faults with a "
+                    "course of their own",
+}
+"""Why verdicts without candidates give no reformulation."""
 
 
 @dataclass(frozen=True, eq=False)
 class MemberModel:
-    """The plant if one explanation is the right one.
+    """The plant under one explanation."""
 
-    Attributes:
-        damage: the explanation.
-        model: the plant then.
-        observer: filter on the sensors that are left.
-        allocation: what the actuators that are left can do; None where `notes` say why.
-        schedule: how the model was refitted; None where nothing of the plant itself changed.
-        notes: what is to be known.
-    """
-
-    damage: Damage
-    model: "HammersteinSS"
-    observer: Observer
-    allocation: Allocation | None
-    schedule: Schedule | None
-    notes: tuple[str, ...]
+    damage: Damage  # the explanation
+    model: "HammersteinSS"  # the plant under it
+    observer: Observer  # filter on the remaining sensors
+    allocation: Allocation | None  # control by the remaining actuators; None where `notes` say why
+    schedule: Schedule | None  # how the model was refitted; None where the plant itself is unchanged
+    notes: tuple[str, ...]  # remarks
 
     @property
     def label(self) -> str:
-        """What it is called."""
+        """The name of the explanation."""
         return self.damage.label
 
     def __str__(self) -> str:
-        """Say what is left of the plant if this explanation is right."""
+        """Return the refit, the observer, the allocation and the notes."""
         parts = [one for one in (self.schedule, self.observer, self.allocation) if one is not None]
         return "\n".join([*map(str, parts), *(f"note: {note}" for note in self.notes)])
 
@@ -73,16 +74,15 @@ class Reformulation:
     """The damaged system; `print` it, or ask `attainable`.
 
     Attributes:
-        status: "healthy" (everything is as it was), "refitted", "as diagnosed" (the plant itself is as the diagnosis
-            says, without a refit) or "ambiguous".
-        healthy: the model before.
+        status: "healthy" (unchanged), "refitted", "as diagnosed" (without a refit) or "ambiguous".
+        healthy: the model before the fault.
         model: the model to use: the healthy one while the diagnosis is ambiguous.
-        observer: filter on the sensors that are left; of an ambiguous diagnosis the ones no member distrusts.
-        allocation: what the actuators that are left can do; None where it cannot be said.
+        observer: filter on the remaining sensors; of an ambiguous diagnosis those that no member suspects.
+        allocation: control by the remaining actuators; None where it cannot be set up.
         schedule: how the model was refitted; None without a refit.
         members: one per explanation, the most probable first.
-        if_ambiguous: what to do while there are several; None where there is one.
-        notes: what is to be known.
+        if_ambiguous: advice while there are several; None where there is one.
+        notes: remarks.
     """
 
     status: str
@@ -93,20 +93,17 @@ class Reformulation:
     schedule: Schedule | None
     members: tuple[MemberModel, ...]
     if_ambiguous: Ambiguity | None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     @property
     def fit_interval(self) -> tuple[float, float]:
-        """90 % interval (%) of the simulation fit that the uncertainty of the refit leaves; NaN without a refit."""
+        """90 % interval (%) of the simulation fit from the uncertainty of the refit; NaN without a refit."""
         return (float("nan"), float("nan")) if self.schedule is None else self.schedule.fit_interval
 
     def attainable(self, reference: ArrayLike) -> Target:
-        """Return the resting point nearest to a reference, its distance, and the actuators that limit it.
+        """Return the steady state nearest to a reference (l,), its distance, and the actuators that limit it.
 
-        While the diagnosis is ambiguous, the one whose worst member is nearest.
-
-        Args:
-            reference: (l,) outputs wanted.
+        While the diagnosis is ambiguous, the distance is that of the worst member.
 
         Raises:
             StructureError: no allocation, with the reason.
@@ -114,17 +111,17 @@ class Reformulation:
         if self.if_ambiguous is not None and self.if_ambiguous.robust is not None:
             return self.if_ambiguous.robust.attainable(reference)
         if self.allocation is None:
-            raise StructureError(f"What can be reached is not known: {'; '.join(self.notes) or 'no allocation'}.")
+            raise StructureError(f"The attainable outputs are unknown: {'; '.join(self.notes) or 'no allocation'}.")
         return self.allocation.attainable(reference)
 
     def plot(self) -> "Figure":
-        """Draw what changed: nonlinearities, what can be reached, and what is not measured any more."""
+        """Draw the nonlinearities before and after, the attainable outputs, and the errors of the outputs."""
         from optid.faults.repair.picture import draw
 
         return draw(self)
 
     def __str__(self) -> str:
-        """Say what is left of the plant, in 80 columns."""
+        """Return the result in 80 columns."""
         told = (self.schedule, self.if_ambiguous, *((self.observer, self.allocation) if self.members else ()))
         heads = [f"{one.label} (probability {one.damage.posterior:.3g})" for one in self.members]
         text = "\n".join([HEADS[self.status], *heads, *(str(one) for one in told if one is not None)])
@@ -141,20 +138,20 @@ def reformulate(
     low: ArrayLike | None = None, high: ArrayLike | None = None, weights: ArrayLike | None = None,
     route: str = "auto", if_ambiguous: str = "auto", solver: Any = "auto", seed: int = 0,
 ) -> Reformulation:
-    """Turn a healthy model and a diagnosis into the damaged system.
+    """Return the damaged system from a healthy model and a diagnosis.
 
     A broken actuator is refitted from the record after its onset; a broken sensor is replaced by a filter on the
-    others; noise that grew is put into the filter. Several explanations give several members, and the model stays the
-    healthy one until one of them is left.
+    others; added noise enters the filter. Several explanations give several members, and the model stays the healthy
+    one until one of them is left.
 
     Args:
         model: the healthy model, with noise covariances.
         diagnosis: of the record.
         data: the record with the fault: Data, a pair (u, y) of arrays, or a frame or file with the channels of the
-            model as columns; without it the plant is what the diagnosis alone says.
+            model as columns; without it the plant has the sizes of the diagnosis.
         constraints: of a damaged nonlinearity: constraints on f or their words; "default": monotone as before and
             nowhere steeper.
-        prior: what is believed beforehand; by default with the curvature that makes the record most probable.
+        prior: of the refit; by default with the curvature that makes the record most probable.
         nodes: values of a damaged nonlinearity that has no nodes of its own.
         stage: "affected only", "all with prior", or "auto": by hold-out.
         low: (m,) least inputs; the intervals of the bases by default.
@@ -167,12 +164,12 @@ def reformulate(
 
     Raises:
         DataError: a record that does not go with the model or the diagnosis.
-        StructureError: an unknown word; a diagnosis that names nothing; a damaged plant that is not detectable or not
+        StructureError: an unknown word; a diagnosis without candidates; a damaged plant that is not detectable or not
             stabilisable, with the mode; no noise covariances.
-        SolverFailed: a refit whose point does not hold.
+        SolverFailed: a refit without a feasible point.
 
     Warns:
-        DataWarning: too few samples for a refit; values that no sample supports; a nonlinearity without an inverse.
+        DataWarning: too few samples for a refit; values without a sample; a nonlinearity without an inverse.
     """
     _check(model, diagnosis, stage, nodes, if_ambiguous)
     if data is not None and not isinstance(data, Data):
@@ -190,7 +187,6 @@ def reformulate(
     if diagnosis.verdict == "healthy":
         allocation, notes = allocated(model)
         return Reformulation("healthy", model, model, observer(model), allocation, None, (), None, tuple(notes))
-    check_answers(diagnosis)
     broken, members = merged([one for answer in diagnosis.candidates for one in damages(model, answer)]), []
     for damage in broken:
         watched, schedule = damage.with_noise(model), None
@@ -201,7 +197,7 @@ def reformulate(
                 nodes=nodes, stage=stage, solver=solver, seed=seed)
         allocation, notes = allocated(plant)
         if damage.needs_refit and data is None:
-            notes.append("no record: the plant is what the diagnosis says")
+            notes.append("no record: the plant has the sizes of the diagnosis")
         members.append(MemberModel(damage, plant, observer(plant, damage.sensors), allocation, schedule,
                                    (*damage.notes, *notes)))
     if len(members) == 1:
@@ -213,7 +209,7 @@ def reformulate(
     allocation, notes = allocated(model)
     if len(distrusted) == model.l:
         distrusted = []
-        notes = ["every sensor is suspected by some member: all are used until one is left", *notes]
+        notes = ["every sensor is suspected by some member: all are used until one member is left", *notes]
     robust, why_not = None, ""
     try:
         robust = robust_allocation(model, broken, **bounds)
@@ -234,11 +230,14 @@ def _check(model: Any, diagnosis: Any, stage: str, nodes: int, if_ambiguous: str
     if isinstance(diagnosis, tuple | list):
         raise StructureError("Several diagnoses: reformulate takes one, of one experiment.")
     if not hasattr(diagnosis, "verdict"):
-        raise StructureError(f"{type(diagnosis).__name__} is no diagnosis: pass what optid.faults.diagnose returned.")
+        raise StructureError(f"{type(diagnosis).__name__} is no diagnosis: pass the result of optid.faults.diagnose.")
     if diagnosis.outputs and tuple(diagnosis.outputs) != model.outputs:
         raise DataError(
             f"The diagnosis is of outputs {', '.join(diagnosis.outputs)}; the model has {', '.join(model.outputs)}."
         )
+    if diagnosis.verdict != "healthy" and not diagnosis.candidates:
+        why = WITHOUT_ANSWER.get(diagnosis.verdict, "it has no candidates")
+        raise StructureError(f"The diagnosis is {diagnosis.verdict!r}: {why}.")
     for word, given, known in (("stage", stage, ("auto", "affected only", "all with prior")),
                                ("if_ambiguous", if_ambiguous, ("auto", "wait", "probe", "robust"))):
         if given not in known:

@@ -1,4 +1,4 @@
-"""Refit of a damaged model, from what broke alone to all parameters, as the record grows: decided by hold-out."""
+"""Refit of a damaged model: of the damaged part alone, or of all parameters where hold-out favours it."""
 
 import warnings
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from optid.program.solution import Solution
 
 HELD_OUT = 0.3
-"""Share of the samples after the fault that decides between the two."""
+"""Share of the samples after the fault that is held out."""
 
 FEWEST = 20
 """Samples after the fault below which all parameters are not tried."""
 
 MARGIN = 2.0
-"""By how much the squared innovations of the held-out samples must fall for all parameters to be taken."""
+"""Reduction of the squared innovations of the held-out samples from which all parameters are refitted."""
 
 DRAWS = 100
 
@@ -37,34 +37,23 @@ STAGES = ("affected only", "all with prior")
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """How the model was refitted.
+    """How the model was refitted."""
 
-    Attributes:
-        stage: "prior" (too few samples), "affected only" or "all with prior".
-        samples: samples after the fault.
-        least: fewest samples for a refit.
-        held_out: {stage: mean squared whitened innovation of the samples held out}; empty where only one was tried.
-        values: the damaged nonlinearities.
-        offsets: {fault: size estimated along}.
-        fit_interval: 90 % interval of the simulation fit (%) that the uncertainty of the refit leaves; NaN without one.
-        active: constraints that bind.
-        solution: of the last programme; None without one.
-        reason: why this stage.
-    """
-
-    stage: str
-    samples: int
-    least: int
+    stage: str  # "prior" (too few samples), "affected only" or "all with prior"
+    samples: int  # samples after the fault
+    least: int  # fewest samples for a refit
+    # {stage: mean squared whitened innovation of the samples held out}; empty where only one was tried
     held_out: dict[str, float]
-    values: tuple[Curve, ...]
-    offsets: dict[str, Array]
+    values: tuple[Curve, ...]  # the damaged nonlinearities
+    offsets: dict[str, Array]  # {fault: estimated size}
+    # 90 % interval of the simulation fit (%) from the uncertainty of the refit; NaN without one
     fit_interval: tuple[float, float]
-    active: tuple[str, ...]
-    solution: "Solution | None" = field(default=None, repr=False)
-    reason: str = ""
+    active: tuple[str, ...]  # constraints that bind
+    solution: "Solution | None" = field(default=None, repr=False)  # of the last programme; None without one
+    reason: str = ""  # why this stage
 
     def __str__(self) -> str:
-        """Say what was refitted from what, and why."""
+        """Return the stage, the reason, the fit expected and the values."""
         lines = [f"refit: {self.stage}, {self.samples} samples after the fault ({self.reason})"]
         if self.solution is not None:
             proof = f"gap {self.solution.gap:.1e}" if self.solution.proof else "no proof of global optimality"
@@ -79,9 +68,9 @@ class Schedule:
 
 
 def fit_words(low: float, high: float) -> str:
-    """Say an interval of a fit (%); one below zero is worse than the mean of the outputs, by how much or not."""
+    """Return the words for an interval of a fit (%); below zero its value means nothing."""
     if high <= 0:
-        return "none: what is left of the outputs is smaller than the uncertainty of the refit"
+        return "none: the simulated outputs are smaller than the uncertainty of the refit"
     return f"{max(low, 0.0):.1f} to {high:.1f} %"
 
 
@@ -89,9 +78,9 @@ def refit(
     model: "HammersteinSS", data: Data, damage: Damage, *, constraints: Sequence[Any] | str = "default",
     prior: Prior | None = None, nodes: int = NODES, stage: str = "auto", solver: Any = "auto", seed: int = 0,
 ) -> tuple["HammersteinSS", Schedule]:
-    """Refit what a fault broke, and all parameters once held-out samples say that this is better.
+    """Refit what a fault broke, or all parameters where that predicts held-out samples better.
 
-    The damage says what broke; the other arguments are those of `reformulate`.
+    Arguments other than the damage are those of `reformulate`.
 
     Warns:
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.
@@ -105,10 +94,11 @@ def refit(
             c.into_state.shape[1] for c in damage.offsets)
         after = max(0, data.experiments[0].y.shape[0] - damage.onset)
         none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, (float("nan"), float("nan")), (), None,
-                        "too few for a refit: the model is what the diagnosis says")
+                        "too few for a refit: the model is that of the diagnosis")
         return damage.believed(model), none
-    if prior is None and narrow.curves:
-        narrow = replace(narrow, prior=likeliest(narrow))
+    if prior is None and narrow.curves:  # of the curvatures the one that makes the record most probable
+        tried = [replace(narrow, prior=replace(narrow.prior, curvature=curvature)) for curvature in BENDS]
+        narrow = max(tried, key=Refitting.evidence)
     scores: dict[str, float] = {}
     reason = "as asked for"
     if stage == "auto":
@@ -150,12 +140,6 @@ def refit(
                            _fit_interval(problem, theta, covariance, seed), active, found.solution, reason)
 
 
-def likeliest(problem: Refitting) -> Prior:
-    """Return the prior whose curvature makes the record most probable: how much a fault bends is not known before."""
-    priors = [replace(problem.prior, curvature=curvature) for curvature in BENDS]
-    return max(priors, key=lambda prior: replace(problem, prior=prior).evidence())
-
-
 def _solved(problem: Refitting, constraints: Sequence[Any] | str, solver: Any) -> Any:
     from optid.errors import SolverFailed
     from optid.registry import fault_formulation
@@ -165,7 +149,7 @@ def _solved(problem: Refitting, constraints: Sequence[Any] | str, solver: Any) -
     found = run(fault_formulation(name)(problem, constraints=constraints), solver)
     if found.model is None or found.solution.status.value in ("failed", "infeasible", "unbounded"):
         why = found.solution.reason or found.solution.claimed
-        raise SolverFailed(f"the refit found no point that holds ({found.solution.status}: {why}): no model")
+        raise SolverFailed(f"the refit found no feasible point ({found.solution.status}: {why}): no model")
     return found
 
 
@@ -179,7 +163,7 @@ def _estimated(problem: Refitting, curve: Curve, theta: Array, covariance: Array
 
 
 def _fit_interval(problem: Refitting, theta: Array, covariance: Array, seed: int) -> tuple[float, float]:
-    """Return the 5 and 95 % points of the fit of the model to models drawn from what is left of the uncertainty."""
+    """Return the 5 and 95 % points of the fit of the model to models drawn from the posterior of the unknowns."""
     sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
     root = axes * np.sqrt(np.maximum(sizes, 0.0))
     u = np.vstack([w.u for w in problem.windows])[-2000:]

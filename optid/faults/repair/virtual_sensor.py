@@ -1,9 +1,8 @@
-"""What a lost sensor would read: by a Kalman filter on the others, or learnt from healthy records.
+"""Estimates of the output of a lost sensor: by a Kalman filter on the others, or learnt from healthy records.
 
-The filter on the surviving sensors is the best there is for a known plant, and its Riccati equation says beforehand how
-far it will be off. Without a trusted model the conditional mean of the lost reading given the last readings of the
-others and the last inputs is estimated from healthy data; the projection onto their signal subspace is its older,
-unweighted relative, which ignores how noisy each channel is.
+The filter on the remaining sensors is optimal for a known plant, and its Riccati equation predicts its error. Without
+a reliable model the conditional mean of the lost reading, given the last readings of the others and the last inputs, is
+estimated from healthy data; the projection onto their signal subspace is the same without weighting by the noise.
 """
 
 from collections.abc import Sequence
@@ -27,7 +26,7 @@ LAGS = 16
 """Samples of the past in a sensor that is learnt from data."""
 
 UNSEEN = 1e-8
-"""A mode is lost when its rows have a singular value below this share of the largest."""
+"""A mode is unobservable when its rows have a singular value below this share of the largest."""
 
 MARGINAL = 1e-9
 """Modes within this of the unit circle do not decay."""
@@ -35,10 +34,10 @@ MARGINAL = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Observer:
-    """A Kalman filter on the surviving sensors; `estimate` gives every output, the lost ones included.
+    """A Kalman filter on the remaining sensors; `estimate` gives every output, the lost ones included.
 
     Attributes:
-        model: the plant, with the gain of the one-step predictor on the surviving sensors (zero columns for lost ones).
+        model: the plant, with the gain of the one-step predictor on the remaining sensors (zero columns for lost ones).
         lost: names of the outputs that are not used.
         correction: (n, l) gain of the correction by the readings of the same sample.
         error: (n, n) covariance of the error of the corrected state.
@@ -56,7 +55,7 @@ class Observer:
 
     @property
     def open_loop(self) -> dict[str, float]:
-        """The same of a simulation that no sensor corrects; inf for a plant that is not stable."""
+        """The same of a simulation without measurements; inf for a plant that is not stable."""
         if not self.model.is_stable:
             return dict.fromkeys(self.model.outputs, float("inf"))
         return _output_errors(self.model, _uncorrected(self.model))
@@ -68,25 +67,22 @@ class Observer:
         return dict(zip(self.model.outputs, np.sqrt(np.diag(self.model.noise.R)).tolist()))
 
     def estimate(self, data: Data, x0: Any = "fit") -> Any:
-        """Return the outputs without their noise (N, l), from the surviving sensors up to the same sample.
+        """Return the outputs without their noise (N, l), from the remaining sensors up to the same sample.
 
         Args:
-            data: the record; the readings of lost sensors are ignored, NaN or not.
+            data: the record; the readings of lost sensors are not used. Several experiments give a tuple of arrays.
             x0: as `HammersteinSS.predict`.
-
-        Returns:
-            (N, l); a tuple of such arrays for several experiments.
         """
         seen = without_sensors(in_units_of(self.model, data), self.lost)
         predicted = self.model.predict(seen, x0=x0)
         found = []
         for part, p in zip(seen.experiments, predicted if isinstance(predicted, tuple) else (predicted,)):
-            surprise = np.where(np.isnan(part.y), 0.0, part.y - p)
-            found.append(p + surprise @ (self.model.C @ self.correction).T)
+            innovations = np.where(np.isnan(part.y), 0.0, part.y - p)
+            found.append(p + innovations @ (self.model.C @ self.correction).T)
         return one_or_all(found)
 
     def __str__(self) -> str:
-        """Say what is lost and how far each output will be off."""
+        """Return the lost sensors and the predicted error of each."""
         head = f"filter without {', '.join(self.lost)}" if self.lost else "filter on all sensors"
         rows = [f"  {name}: predicted RMSE {self.rmse[name]:.4g} (its own noise {self.noise[name]:.4g}, simulation "
                 f"{self.open_loop[name]:.4g})" for name in self.lost]
@@ -113,31 +109,23 @@ def _uncorrected(model: "HammersteinSS") -> Array:
 
 
 def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
-    """Return the Kalman filter on the sensors that are left.
-
-    Args:
-        model: with noise covariances.
-        lost: names of outputs, "y1" or "sensor:y1".
+    """Return the Kalman filter on the sensors of a model that are not lost ("y1" or "sensor:y1").
 
     Raises:
         LookupFailed: an unknown output.
-        StructureError: no noise covariances, no sensor left with an unstable mode, or a mode that does not decay and
-            that no surviving sensor sees, named.
+        StructureError: no noise covariances, or a mode that does not decay and is not observable, named.
     """
     if model.noise is None:
-        raise StructureError(
-            "The model has no noise covariances, and the best filter depends on them: estimate them with "
-            "optid.noise.with_noise(model, data)."
-        )
+        raise StructureError("The model has no noise covariances, which the filter depends on: estimate them with "
+                             "optid.noise.with_noise(model, data).")
     names = _names(model, lost)
     left = [o for o, name in enumerate(model.outputs) if name not in names]
     mode = _hidden_mode(model.A, model.C[left])
     if mode:
         words = ", ".join(f"sensor {name}" for name in names) or "more sensors"
         raise StructureError(
-            f"Without {words} the {mode} is seen by no sensor and does not decay: the damaged plant is not detectable, "
-            "and no observer can follow it. Repair the sensor, or measure this mode."
-        )
+            f"Without {words} the {mode} is observed by no sensor and does not decay: the damaged plant is not "
+            "detectable. Repair the sensor, or measure this mode.")
     noise, shape = model.noise, (model.nx, model.l)
     K, correction = np.zeros(shape), np.zeros(shape)
     if left:
@@ -152,23 +140,18 @@ def observer(model: "HammersteinSS", lost: Sequence[str] = ()) -> Observer:
 
 
 def check_stabilisable(model: "HammersteinSS", left: Sequence[int]) -> None:
-    """Refuse when a mode that does not decay is moved by none of the functions of the inputs that are left.
-
-    Raises:
-        StructureError: with the mode.
-    """
+    """Refuse a mode that does not decay and that no remaining function of the inputs controls (`StructureError`)."""
     mode = _hidden_mode(model.A.T, model.B[:, list(left)].T)
     if mode:
         lost = sorted({c for i, c in enumerate(model.input_of) if i not in left})
         words = ", ".join(f"actuator {model.inputs[c]}" for c in lost) or "any actuator"
         raise StructureError(
-            f"Without {words} the {mode} is moved by no actuator and does not decay: the damaged plant is not "
-            "stabilisable, and no controller can hold it."
-        )
+            f"Without {words} the {mode} is controlled by no actuator and does not decay: the damaged plant is not "
+            "stabilisable.")
 
 
 def _hidden_mode(A: Array, C: Array) -> str:
-    """Name the first mode on or outside the unit circle that C does not see, and the state it is largest in."""
+    """Name the first unobservable mode on or outside the unit circle, and the state it is largest in."""
     for value, vector in zip(*(part.T for part in np.linalg.eig(A))):
         sizes = np.linalg.svd(np.vstack([value * np.eye(len(A)) - A, C]), compute_uv=False)
         if abs(value) >= 1 - MARGINAL and sizes[-1] < UNSEEN * sizes[0]:
@@ -187,29 +170,19 @@ def _names(model: "HammersteinSS", lost: Sequence[str]) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class LearntSensor:
-    """A lost output as a linear function of the last readings of the others and of the last inputs.
+    """A lost output as a linear function of the last readings of the others and of the last inputs."""
 
-    Attributes:
-        model: gives the nonlinearities of the inputs and the names.
-        lost: names of the outputs that are reconstructed.
-        method: "conditional mean" or "subspace".
-        lags: samples that it looks back on, the present one included.
-        weights: (features, lost) acting on [other readings; f(u)] of every lag, the newest first.
-        constant: (lost,).
-        residual: (lost,) standard deviation of what it missed in the healthy record, the noise of the sensor included.
-    """
-
-    model: "HammersteinSS"
-    lost: tuple[str, ...]
-    method: str
-    lags: int
-    weights: Array
-    constant: Array
-    residual: Array
+    model: "HammersteinSS"  # gives the nonlinearities of the inputs and the names
+    lost: tuple[str, ...]  # names of the outputs that are estimated
+    method: str  # "conditional mean" or "subspace"
+    lags: int  # samples of the past, the present one included
+    weights: Array  # (features, lost) acting on [other readings; f(u)] of every lag, the newest first
+    constant: Array  # (lost,)
+    residual: Array  # (lost,) standard deviation of its error on the healthy record, the noise of the sensor included
 
     @cached_property
     def rmse(self) -> dict[str, float]:
-        """Predicted root mean square error of each lost output without its noise, where the model knows the noise."""
+        """Predicted root mean square error of each lost output, without its noise where the model has covariances."""
         noise = self.model.noise
         places = [self.model.outputs.index(name) for name in self.lost]
         own = np.zeros(len(places)) if noise is None else noise.R[places, places]
@@ -234,7 +207,7 @@ def conditional_mean(model: "HammersteinSS", data: Data, lost: Sequence[str], *,
         lags: samples of the past, the present one included.
 
     Raises:
-        DataError: fewer complete windows than twice the weights, with the length that is needed.
+        DataError: fewer complete windows than twice the weights, with the required length.
         LookupFailed: an unknown output.
         StructureError: no output is named.
     """
@@ -251,7 +224,7 @@ def conditional_mean(model: "HammersteinSS", data: Data, lost: Sequence[str], *,
 def subspace_projection(
     model: "HammersteinSS", data: Data, lost: Sequence[str], *, lags: int = LAGS, rank: int | None = None
 ) -> LearntSensor:
-    """Learn a lost sensor from healthy data: the point of the signal subspace that agrees with what is left.
+    """Learn a lost sensor from healthy data: the point of the signal subspace that agrees with the other channels.
 
     Arguments as in `conditional_mean`, as are the errors raised; `rank` is the dimension of the subspace, lags times
     the inputs and the states by default.
@@ -280,8 +253,7 @@ def _learning(model: "HammersteinSS", data: Data, lost: Sequence[str], lags: int
     if complete.sum() < least:
         raise DataError(
             f"{complete.sum()} complete windows of {lags} samples do not determine {rows.shape[1] + 1} weights: at "
-            f"least {least + lags} healthy samples are needed, or fewer lags."
-        )
+            f"least {least + lags} healthy samples are needed, or fewer lags.")
     return names, rows[complete], readings[complete]
 
 
