@@ -81,7 +81,7 @@ def draw(path: Path, record: tuple[np.ndarray, np.ndarray], events: list, rebuil
         corners = allocation.corners()
         reach.fill(*corners.T, color=colour, alpha=0.25, label=label)
     reach.plot(*r, "k*", markersize=11, label="reference")
-    reach.set(title="outputs that can be held", xlabel="y1", ylabel="y2")
+    reach.set(title="attainable outputs", xlabel="y1", ylabel="y2")
     reach.legend(fontsize=8)
 
     for (name, course), colour in zip(courses.items(), ("gray", "tab:orange")):
