@@ -49,9 +49,10 @@ from optid.models import HammersteinSS
 from optid.models.roots import modal_weight
 from optid.program.expressions import tangent_product
 from optid.program.program import Program, Values
+from optid.program.solution import Status
 from optid.program.units import energy_unit, inverse, outer_bases
 from optid.program.view import View
-from optid.solving.solve import Procedure
+from optid.solving.solve import Evidence, Procedure
 from optid.statistics.linearised import Linearised
 from optid.statistics.state_unknowns import SIMULATORS, StateUnknowns
 
@@ -228,6 +229,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
         first = plan if extend is None else replace(plan, data=first_samples(plan.data, STAGES[0]))
         given = _block_rows(first) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
         nx = yield from _subspace_starts(first, given, block_rows is None, found, criterion == "prediction")
+        if isinstance(nx, Evidence):
+            return nx
         errors, starts = _entered(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles))
         errors, best, figures = search_states(errors, starts, weighting, int(iterations))
         if extend is not None:
@@ -257,7 +260,7 @@ def _block_rows(plan: Plan) -> list[int | None]:
 
 def _subspace_starts(plan: Plan, block_rows: Sequence[int | None], imputes: bool, found: dict[str, HammersteinSS],
                      predicts: bool) -> Procedure:
-    """Add the models of subspace fits to those found, and return the order.
+    """Add the models of subspace fits to those found, and return the order; or that no poles satisfy the constraints.
 
     Raises:
         RankError: no fit has a point, and no other start is known.
@@ -270,6 +273,8 @@ def _subspace_starts(plan: Plan, block_rows: Sequence[int | None], imputes: bool
         except (RankError, StructureError, np.linalg.LinAlgError) as error:
             refusal = refusal or error
             continue
+        if evidence.status is Status.INFEASIBLE:
+            return evidence
         if evidence.model is not None:
             nx = nx or int(evidence.figures["order"])
             model = evidence.extended()[0] if predicts else evidence.model  # K counts there

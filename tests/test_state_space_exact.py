@@ -19,7 +19,7 @@ from formulations.state_space import hammerstein_ss as exact
 from formulations.state_space import ss as linear
 from optid.bases import BSpline, Linear, Polynomial, Triangular, UserFunctions
 from optid.data.record import Data
-from optid.errors import DataError, RankError, StructureError
+from optid.errors import DataError, InfeasibleError, RankError, StructureError
 from optid.identify.prediction_error import state_errors
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_search import entered
@@ -233,6 +233,8 @@ def test_poles_obey_their_constraint_at_every_step():
     assert fit.solution.objective > 0
     with pytest.raises(StructureError, match="cannot judge a model"):
         optid.fit(data, linear, nx=2, constraints=[Rule("somewhere", lambda v: [], None, frozenset({"poles"}))])
+    with pytest.raises(InfeasibleError, match="'strip:0.5,0.6' and 'disc:-0.5,0.1' contradict each other"):
+        optid.fit(data, linear, nx=2, constraints=["strip:0.5,0.6", "disc:-0.5,0.1"])
 
 
 @pytest.mark.parametrize("rule", ["stable:0.7", "disc:0.3,0.45"])
