@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import scripts
+from refusals import refuses
 from scipy.signal import lfilter
 from scipy.stats import kstest
 from systems import by_hand, inputs, mimo, siso
@@ -165,17 +166,12 @@ def test_refusals_of_the_test():
     data = record()
     statistics = hankel_statistics(data.records, 15)
     z, phi, y = positions(statistics, 5, 1, 2)
-    with pytest.raises(StructureError, match="take windows that are longer"):
-        rank_test(statistics, z, phi, y, rows=15)
-    with pytest.raises(StructureError, match="within the first 9 block rows"):
-        rank_test(statistics, z, phi, y, rows=9)
-    with pytest.raises(StructureError, match="level=2"):
-        rank_test(statistics, z, phi, y, rows=10, level=2)
-    with pytest.raises(StructureError, match="5 positive numbers"):
-        rank_test(statistics, z, phi, y, rows=10, scale=np.zeros(5))
+    refuses(StructureError, "take windows that are longer", rank_test, statistics, z, phi, y, rows=15)
+    refuses(StructureError, "within the first 9 block rows", rank_test, statistics, z, phi, y, rows=9)
+    refuses(StructureError, "level=2", rank_test, statistics, z, phi, y, rows=10, level=2)
+    refuses(StructureError, "5 positive numbers", rank_test, statistics, z, phi, y, rows=10, scale=np.zeros(5))
     short = hankel_statistics([np.hstack([data.u, data.y])[:28]], 15)
-    with pytest.raises(RankError, match="14 complete windows for 11 instruments and 5 outputs"):
-        rank_test(short, z, phi, y, rows=10)
+    refuses(RankError, "14 complete windows for 11 instruments and 5 outputs", rank_test, short, z, phi, y, rows=10)
 
 
 def test_prediction_errors_of_full_order_are_those_of_least_squares():
