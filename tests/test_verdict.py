@@ -106,7 +106,7 @@ def test_a_gain_that_changes_within_the_record_is_named():
 def test_outliers_are_named():
     u, y = simulated()
     y[[50, 200, 333]] += 100 * y.std()
-    with pytest.warns(optid.errors.DataWarning, match="wild"):
+    with pytest.warns(optid.errors.DataWarning, match="outlier"):
         fit = optid.fit(optid.Data(u, y), "arx", na=2, nb=1, nk=1)
     assert any("huber" in step for _, step in told(fit))
 

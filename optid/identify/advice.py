@@ -81,9 +81,9 @@ def _on_record(fit: Any) -> Iterator[Advice]:
     for role, names in (("input", data.inputs), ("output", data.outputs)):
         for c, name in enumerate(names):
             yield from _jump(role, name, [(e.u if role == "input" else e.y)[:, c] for e in data.experiments])
-    wild = [sentence for sentence in fit.findings if " wild" in sentence]
-    if wild:
-        yield Advice(wild[0].partition(":")[0], "--loss huber, or mark them as missing")
+    outliers = [sentence for sentence in fit.findings if " outlier" in sentence]
+    if outliers:
+        yield Advice(outliers[0].partition(":")[0], "--loss huber, or mark them as missing")
     yield from _halves(fit)
 
 

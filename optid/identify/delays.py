@@ -131,9 +131,6 @@ def linear(data: Data) -> tuple[Basis, ...]:
 
 def _solved(gram: Array, columns: Places, y: Places) -> Array:
     """Solve the normal equations of some columns, scaled; directions without energy are left out."""
-    inner = gram[np.ix_(columns, columns)]
-    sizes = np.sqrt(np.maximum(np.diag(inner), 1e-300))
-    values, vectors = np.linalg.eigh(inner / np.outer(sizes, sizes))
-    kept = values > RIDGE * values[-1]
-    right = vectors[:, kept].T @ (gram[np.ix_(columns, y)] / sizes[:, None])
-    return (vectors[:, kept] @ (right / values[kept, None])) / sizes[:, None]
+    sizes = np.sqrt(np.maximum(np.diag(gram)[columns], 1e-300))
+    inverse = np.linalg.pinv(gram[np.ix_(columns, columns)] / np.outer(sizes, sizes), rcond=RIDGE, hermitian=True)
+    return inverse @ (gram[np.ix_(columns, y)] / sizes[:, None]) / sizes[:, None]

@@ -69,7 +69,9 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
     Args:
         data: the record; NaN = missing. All candidates use the rows of the largest one.
         bases: one basis per input, with an interval; `Linear` for an ARX model.
-        na, nb, nk: largest numbers of output and input lags, largest delay; smaller where the record is short.
+        na: largest number of output lags; smaller where the record is short.
+        nb: largest number of input lags; likewise.
+        nk: largest delay; likewise.
         test: a part held out, predicted with the coefficients of `data`; None for none.
 
     Raises:

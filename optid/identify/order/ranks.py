@@ -139,8 +139,9 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
     Args:
         statistics: moments of windows of `rows` + reach samples; the reach is the largest lag between windows whose
             correlation counts, at most the number of future block rows.
-        instruments, regressors, outputs: positions of Z, Phi and Y in the first `rows` block rows
-            (`HankelStatistics.at`; 0 is the constant).
+        instruments: positions of Z in the first `rows` block rows (`HankelStatistics.at`; 0 is the constant).
+        regressors: of Phi there.
+        outputs: of Y there.
         rows: block rows of the instruments, regressors and outputs together.
         level: probability of rejecting the true order; min(0.01, 10 / j) when not given.
         largest: order to be chosen, (alpha - 1) l for alpha future block rows of l outputs.

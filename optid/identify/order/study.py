@@ -58,7 +58,9 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
         feedback_basis: functions of the outputs that are fed back, one basis or one per output; none when not given.
         block_rows: future block rows, larger than the order; 10, or fewer on a short record.
         nx: largest order of interest, which the block rows must be able to show.
-        na, nb, nk: largest numbers of output and input lags, and largest delay, of the scan.
+        na: largest number of output lags of the scan.
+        nb: largest number of input lags of the scan.
+        nk: largest delay of the scan.
         holdout: share of every experiment, from its end, that is held out; 0 for none.
         level: probability of rejecting the true order; min(0.01, 10 / N) when not given.
 

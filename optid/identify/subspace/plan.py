@@ -1,4 +1,4 @@
-"""What a subspace method is asked for, on a record in its own units."""
+"""The request to a subspace method, on a record in its own units."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,10 +23,7 @@ WORDS = {"observer": ("auto", "none", "kalman"), "split": ("exact", "lumped"), "
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a method is asked for, of a record in its own units; see `planned`.
-
-    Attributes named as arguments of `formulations.hammerstein_ss.sid` mean the same.
-    """
+    """The request to a method; see `planned`. Attributes have the meaning of the arguments of `hammerstein_ss.sid`."""
 
     name: str
     data: Data

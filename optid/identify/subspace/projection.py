@@ -15,20 +15,19 @@ from optid.statistics.rq import RQ, rq
 
 WEIGHTINGS = ("moesp", "cva", "plain")
 
-KEPT = 0.5  # share of the windows left by missing samples below which the user is told
+KEPT = 0.5  # share of the windows left by missing samples below which a warning is given
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """What the projection step leaves."""
+    """The result of the projection step."""
 
     statistics: HankelStatistics  # moments of the windows of 2 block_rows samples
     blocks: RQ  # the RQ decomposition
-    scale: Array  # (l,) standard deviations of the outputs; one output is left as it is
-    # of the projected outputs: "moesp" (outputs divided by their sizes: those in small units are not lost), "cva" (the
-    # inverse root of the covariance of the future outputs with the regressors removed, so that singular values are
-    # canonical correlations: Larimore 1990) or "plain" (outputs in their units: at an order too low the larger ones
-    # come first)
+    scale: Array  # (l,) standard deviations of the outputs; one for a single output
+    # of the projected outputs: "moesp" (outputs divided by their sizes), "cva" (the inverse root of the covariance of
+    # the future outputs with the regressors removed, so that singular values are canonical correlations: Larimore 1990)
+    # or "plain" (outputs in their units)
     weighting: str = WEIGHTINGS[0]
 
     @cached_property
