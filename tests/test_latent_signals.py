@@ -289,7 +289,7 @@ def test_a_free_run_that_leaves_the_record_is_told():
     assert "free run" not in calm.figures and "free run" not in calm.solution.reason
 
 
-@pytest.mark.filterwarnings("ignore:The record does not look")
+@pytest.mark.filterwarnings("ignore:The record is not consistent")
 def test_tables_figures_and_checks_show_the_latent_function():
     u = np.repeat(np.random.default_rng(3).uniform(-1.5, 1.5, 150), 4)
     data = Data(u, oscillator(u, 0.02))

@@ -76,7 +76,7 @@ def test_what_is_wrong_with_a_structure_is_named(plant, formulation, arguments, 
 
 def test_a_needless_function_is_named():
     fit = optid.fit(optid.Data(*simulated()), "hammerstein_oe.exact", na=2, nb=1, nk=1, basis="triangular:6")
-    assert ("a straight line does as well as the function of the input", "--formulation oe.exact") in told(fit)
+    assert ("a linear function of the input fits as well", "--formulation oe.exact") in told(fit)
 
 
 def test_swapped_columns_are_named():
