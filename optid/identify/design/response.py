@@ -47,16 +47,14 @@ class FrequencyResponse:
 
 
 def frequency_response(data: Data, segment: int | None = None) -> FrequencyResponse:
-    """Measure the frequency response by averaged spectra (Welch 1967; Bendat and Piersol, Random Data, for coherence).
+    """Measure the frequency response G = S_yu S_uu^-1 by averaged spectra (Welch 1967; Bendat and Piersol).
 
-    Hann windows that overlap by half; segments that touch a missing sample are left out; experiments are averaged.
-    G = S_yu S_uu^-1 at every frequency. A segment has a quarter of the samples of the longest experiment when it is not
-    given (less with four inputs or more), and at least 32. Resonances narrower than its inverse are flattened, and
-    leave disturbance behind.
+    Hann windows overlap by half; segments with a missing sample are left out; experiments are averaged. By default a
+    segment has a quarter of the samples of the longest experiment (less with four inputs or more), at least 32.
 
     Raises:
         StructureError: a segment of fewer than 8 samples.
-        DataError: fewer than 2 m complete segments, or inputs that cannot be told apart at any frequency.
+        DataError: fewer than 2 m complete segments, or inputs that are collinear at every frequency.
     """
     longest = max(e.n_samples for e in data.experiments)
     size = max(32, longest // max(4, data.m + 1)) if segment is None else check_integer(segment, "segment", 8)
@@ -73,8 +71,8 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
             sums += spectrum[:, :, None] * np.conj(spectrum[:, None, :])
             count += 1
     if count < 2 * m:
-        raise DataError(f"{count} complete segments of {size} samples: at least {2 * m} are needed for {m} inputs. "
-                        "Use a longer record without gaps or a smaller segment.")
+        raise DataError(f"{count} complete segments of {size} samples, fewer than {2 * m} for {m} inputs: use a longer "
+                        "record without gaps or a smaller segment.")
     spectra = sums[1:] * (2 * data.dt / (count * np.sum(window**2)))
     frequency = np.arange(1, size // 2 + 1) / (size * data.dt)
     uu, yu = spectra[:, :m, :m], spectra[:, m:, :m]
@@ -85,7 +83,7 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
     values = np.linalg.svd(uu[heard] / (scale[:, :, None] * scale[:, None, :]), compute_uv=False)
     k = heard[values[:, 0] < 1e6 * values[:, -1]]  # where every input has power of its own
     if not k.size:
-        raise DataError("the inputs cannot be told apart at any frequency: they are collinear or hardly move.")
+        raise DataError("the inputs are collinear or without power at every frequency.")
     response = np.full((frequency.size, l, m), np.nan, dtype=complex)
     coherence, disturbance = np.zeros((frequency.size, l)), yy.copy()
     response[k] = np.linalg.solve(uu[k].swapaxes(1, 2), yu[k].swapaxes(1, 2)).swapaxes(1, 2)
