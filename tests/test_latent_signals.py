@@ -322,7 +322,7 @@ def test_functions_without_effect_are_named(formulation):
     rng = np.random.default_rng(2)
     u = rng.uniform(-1, 1, 400)
     data = Data(u, lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=400))
-    with pytest.warns(DataWarning, match="no effect that the record shows"):
+    with pytest.warns(DataWarning, match="no significant effect"):
         fit = optid.fit(data, formulation, nx=1)
     assert "leave them out" in fit.figures["effect of latent signals"]
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
+from optid.identify.arguments import violations
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
 
@@ -103,8 +104,8 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
     free = np.linalg.lstsq(up, down, rcond=None)[0]
     bound = float(np.linalg.norm(up @ free - down))
     verified = all(getattr(rule, "verify", None) is not None for rule in rules)
-    if not _disobeyed(free, rules) and verified:
-        return Shift(free, bound, bound, False, Status.OPTIMAL, "the least-squares solution obeys every rule")
+    if not _violated(free, rules) and verified:
+        return Shift(free, bound, bound, False, Status.OPTIMAL, "the least-squares solution satisfies every rule")
     if len(free) > LARGEST and verified:
         shift = yield from _deflated(up, down, free, bound, rules, programmes)
         if shift is not None:
@@ -123,7 +124,7 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
             break
         trial = step.recover(solution.values)
         residual, fall = float(np.linalg.norm(up @ trial - down)), 0.0
-        if residual < best and not set(_disobeyed(trial, rules)) - set(_disobeyed(a, rules)):
+        if residual < best and not set(_violated(trial, rules)) - set(_violated(a, rules)):
             fall, a, best, found = best - residual, trial, residual, solution
         if last or fall <= ENOUGH * (best - bound) or best - bound <= TINY * step.size:
             break
@@ -143,11 +144,11 @@ def _deflated(up: Array, down: Array, free: Array, bound: float, rules: Sequence
     """
     from scipy.linalg import schur
 
-    def obeys(re: float, im: float) -> bool:
-        return not _disobeyed(np.array([[re, im], [-im, re]]), rules)
+    def satisfies(re: float, im: float) -> bool:
+        return not _violated(np.array([[re, im], [-im, re]]), rules)
 
     try:
-        found: Any = schur(free, output="real", sort=obeys)
+        found: Any = schur(free, output="real", sort=satisfies)
     except np.linalg.LinAlgError:  # poles too close to be reordered: all of them are constrained
         found = (*schur(free, output="real"), 0)
     triangle, basis, kept = found
@@ -178,7 +179,7 @@ def _judged(a: Array, up: Array, down: Array, bound: float, status: Status, reas
     residual = float(np.linalg.norm(up @ a - down))
     excess = residual - bound
     reasons = [f"the constrained shift step exceeds the least-squares residual {bound:.3g} by {max(excess, 0.0):.2g}"]
-    if outside := _disobeyed(a, rules):
+    if outside := _violated(a, rules):
         status, reason = Status.INACCURATE, "; ".join(outside)
     if status in (Status.OPTIMAL, Status.LOCAL):
         status = Status.OPTIMAL if excess <= TINY * np.linalg.norm(down) else Status.LOCAL
@@ -187,10 +188,8 @@ def _judged(a: Array, up: Array, down: Array, bound: float, status: Status, reas
     return Shift(a, residual, bound, True, status, "; ".join(reasons))
 
 
-def _disobeyed(a: Array, rules: Sequence[Any]) -> list[str]:
-    model = SimpleNamespace(poles=np.linalg.eigvals(a))
-    checks = [rule.verify for rule in rules if getattr(rule, "verify", None) is not None]
-    return [sentence for check in checks if (sentence := check(model))]
+def _violated(a: Array, rules: Sequence[Any]) -> list[str]:
+    return violations(SimpleNamespace(poles=np.linalg.eigvals(a)), rules)
 
 
 def _definite(p: Array) -> bool:
