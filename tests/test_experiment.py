@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
@@ -77,8 +78,7 @@ def test_response_knows_where_it_knows_nothing():
      "collinear"),
 ])
 def test_records_that_show_no_response(make, error, words):
-    with pytest.raises(error, match=words):
-        make()
+    refuses(error, words, make)
 
 
 @pytest.mark.parametrize("kind", ["multisine", "chirp", "noise", "levels"])
@@ -239,8 +239,7 @@ def test_a_record_with_gaps_and_two_experiments_serves_as_well():
     (lambda: design(optid.Data(PENDULUM.u, np.random.default_rng(0).normal(size=4000))), DataError, "shows no band"),
 ])
 def test_what_cannot_be_designed(call, error, words):
-    with pytest.raises(error, match=words):
-        call()
+    refuses(error, words, call)
 
 
 def run(*words):
