@@ -37,7 +37,7 @@ class Autoregression:
 
 
 class LagSums:
-    """Sums of products of lagged samples: of the `whole` record, and by block of the rows that touch it (`blocks`)."""
+    """Sums of products of lagged samples: of the `whole` record, and of the rows of every block (`blocks`)."""
 
     def __init__(self, blocks: Blocks, bases: tuple[Basis, ...], na: int = 8, lags: int = 16) -> None:
         data = blocks.data

@@ -23,22 +23,16 @@ REACH = 8.0  # inequalities further away than this many standard deviations of t
 
 @dataclass(frozen=True, eq=False)
 class LocalEstimate:
-    """An estimate in whitened tangent coordinates v, and inequalities rows (r, n) @ v + slack (r,) >= 0, slack >= 0.
+    """An estimate in whitened tangent coordinates v, and inequalities rows (r, n) @ v + slack (r,) >= 0, slack >= 0."""
 
-    Attributes:
-        centre: (n,) minimum without the inequalities, relative to the fit.
-        scatter: (n, m) S, the centre has covariance S Sᵀ. Draws are made in the m coordinates, which should not depend
-            on the basis of the tangent space, to be reproducible.
-        dof: degrees of freedom of the noise estimate inside S.
-        draws: number of random draws, at least 100 (`StructureError`); seed: their seed.
-    """
-
-    centre: Array
+    centre: Array  # (n,) minimum without the inequalities, relative to the fit
+    # (n, m) S, the centre has covariance S Sᵀ; draws are made in the m coordinates, which should not depend on the
+    # basis of the tangent space, to be reproducible
     scatter: Array
-    dof: float
+    dof: float  # degrees of freedom of the noise estimate inside S
     rows: Array
     slack: Array
-    draws: int = DRAWS
+    draws: int = DRAWS  # number of random draws, at least 100 (`StructureError`)
     seed: int = 0
 
     def __post_init__(self) -> None:

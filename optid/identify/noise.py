@@ -98,10 +98,7 @@ def noise_spectrum(model: HammersteinSS, w: ArrayLike) -> Array:
 
 
 def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correlation]:
-    """Test the noise at every output for whiteness: of the simulation with measured feedback, without correction.
-
-    Returns {output: test up to so many lags}; one that fails says that the noise of that output is coloured.
-    """
+    """Return {output: whiteness test} of the errors of the simulation with measured feedback, up to so many lags."""
     raw = data.raw()
     rest = residuals(replace(model, K=_observer(model), noise=None), raw)
     lags = max(1, min(lags, int(np.sum(~np.isnan(np.vstack(rest)), axis=0).min()) // 4))

@@ -38,25 +38,16 @@ Quantity = Callable[[Any], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """A fit as a local linear regression, the source of intervals without refits.
+    """A fit as a local linear regression, the source of intervals without refits."""
 
-    Attributes:
-        rebuild: from the values of the variables, by name, to the model in the units, gauge and signs of the fit.
-        shapes: of the variables of the programme by name, in the order of x.
-        x: (n_x,) solution, every variable flattened column by column.
-        directions: (n_x, n) dx/dv, v the whitened tangent coordinates.
-        local: the estimate in these coordinates.
-        noise: (l, l) covariance of the equation error e, in raw units.
-        meaning: what the intervals are, one of `MEANINGS`.
-    """
-
+    # from the values of the variables, by name, to the model in the units, gauge and signs of the fit
     rebuild: Callable[[dict[str, Array]], Any]
-    shapes: dict[str, tuple[int, ...]]
-    x: Array
-    directions: Array
-    local: LocalEstimate = field(repr=False)
-    noise: Array
-    meaning: str
+    shapes: dict[str, tuple[int, ...]]  # of the variables of the programme by name, in the order of x
+    x: Array  # (n_x,) solution, every variable flattened column by column
+    directions: Array  # (n_x, n) dx/dv, v the whitened tangent coordinates
+    local: LocalEstimate = field(repr=False)  # the estimate in these coordinates
+    noise: Array  # (l, l) covariance of the equation error e, in raw units
+    meaning: str  # of the intervals, one of `MEANINGS`
 
     def __getstate__(self) -> dict[str, Any]:
         _ = self._neighbours  # `rebuild`, which holds the programme, is not needed afterwards

@@ -49,7 +49,7 @@ class Refits:
 
     @property
     def meaning(self) -> str:
-        """What the intervals are, in words."""
+        """Description of the intervals."""
         return f"{self.kind} intervals of {len(self.models)} refits to resampled residuals"
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
@@ -77,7 +77,7 @@ class Uncertainty:
 
     @property
     def meaning(self) -> str:
-        """What the intervals are, in words."""
+        """Description of the intervals."""
         return self.source.meaning
 
     def at_level(self, level: float) -> "Uncertainty":

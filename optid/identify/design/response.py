@@ -1,4 +1,4 @@
-"""The frequency response a record shows, nonlinear plant or not: the best linear approximation for that excitation."""
+"""The frequency response of a record: the best linear approximation for its excitation."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError
 
-SILENT = 1e-4  # input power, relative to its largest over frequency, below which nothing is read off
+SILENT = 1e-4  # input power, relative to its largest over frequency, below which there is no estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,7 @@ class FrequencyResponse:
         return found
 
     def gain(self, frequency: Array, c: int) -> Array:
-        """Return how strongly input c moves the outputs at some frequencies (K,), each relative to its largest.
-
-        The root mean square over the outputs of |G| / max |G|.
-        """
+        """Return the root mean square over the outputs of |G| / max |G| of input c at some frequencies (K,)."""
         largest = np.nanmax(np.abs(self.response[:, :, c]), axis=0)
         return np.sqrt(np.mean((np.abs(self.at(frequency)[:, :, c]) / largest) ** 2, axis=1))
 
@@ -78,10 +75,10 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
     uu, yu = spectra[:, :m, :m], spectra[:, m:, :m]
     yy = np.real(np.diagonal(spectra[:, m:, m:], axis1=1, axis2=2))
     power = np.real(np.diagonal(uu, axis1=1, axis2=2))
-    heard = np.flatnonzero((power > SILENT * power.max(axis=0)).all(axis=1))
-    scale = np.sqrt(power[heard])
-    values = np.linalg.svd(uu[heard] / (scale[:, :, None] * scale[:, None, :]), compute_uv=False)
-    k = heard[values[:, 0] < 1e6 * values[:, -1]]  # where every input has power of its own
+    excited = np.flatnonzero((power > SILENT * power.max(axis=0)).all(axis=1))
+    scale = np.sqrt(power[excited])
+    values = np.linalg.svd(uu[excited] / (scale[:, :, None] * scale[:, None, :]), compute_uv=False)
+    k = excited[values[:, 0] < 1e6 * values[:, -1]]  # where the inputs are not collinear
     if not k.size:
         raise DataError("the inputs are collinear or without power at every frequency.")
     response = np.full((frequency.size, l, m), np.nan, dtype=complex)

@@ -32,26 +32,16 @@ from optid.structures.rank_one import RankOne
 
 @dataclass(frozen=True)
 class EquationError:
-    """Least squares in z, ``‖R z - s‖² + remainder`` with one rank-one block per input, with the names of its parts.
+    """Least squares in z, ``‖R z - s‖² + remainder`` with one rank-one block per input, with the names of its parts."""
 
-    Attributes:
-        statistics: of one pass over the record.
-        columns: (n_columns, l) position in z of every coefficient of the regressor.
-        meta: dt, names and units for the model.
-        units: from those of the problem (`optid.program.units`) to those of the record.
-        bases: one per input, in the units of the record.
-        unit: size of one unit of the objective in units of the record.
-        unweighted: statistics of the same rows without weights, where ``statistics`` has weights.
-    """
-
-    statistics: Statistics
+    statistics: Statistics  # of one pass over the record
     problem: RankOne
-    columns: np.ndarray
-    meta: Mapping[str, Any]
-    units: Transform
-    bases: tuple[Basis, ...]
-    unit: float = 1.0
-    unweighted: Statistics | None = None
+    columns: np.ndarray  # (n_columns, l) position in z of every coefficient of the regressor
+    meta: Mapping[str, Any]  # dt, names and units for the model
+    units: Transform  # from those of the problem (`optid.program.units`) to those of the record
+    bases: tuple[Basis, ...]  # one per input, in the units of the record
+    unit: float = 1.0  # size of one unit of the objective in units of the record
+    unweighted: Statistics | None = None  # of the same rows without weights, where ``statistics`` has weights
 
     @property
     def layout(self) -> Layout:

@@ -117,7 +117,7 @@ class CompressedStates(CompressedErrors):
     fixed: bool = False  # whether the programme fixes by rows what changes no output
 
     def settle(self, program: Program) -> None:
-        """Linearise the errors anew, where the variables of the programme stand."""
+        """Linearise the errors again, at the values of the variables of the programme."""
         self.reference = self.places.pack(program.values())
         self.at = self.criterion.linearise(self.reference)
 

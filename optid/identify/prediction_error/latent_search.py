@@ -64,7 +64,7 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         except RankError as error:
             refusal = error
             continue
-        if _promised(searches[-1][0], searches[-1][1].x, channels[0], rng) <= LEFT:
+        if _expected(searches[-1][0], searches[-1][1].x, channels[0], rng) <= LEFT:
             break
     if not searches:
         assert refusal is not None
@@ -83,10 +83,10 @@ def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rn
     x, steps = best.x, best.steps
     for number, latent in enumerate(channels, start=1):
         try:
-            part, end, promise = _added(part, x, _coarse(latent), rng, iterations)
+            part, end, expected = _added(part, x, _coarse(latent), rng, iterations)
         except RankError as error:
             raise RankError(f"latent signal {number}: {error}") from error
-        figures[f"gain promised by latent signal {number}"] = promise
+        figures[f"expected gain of latent signal {number}"] = expected
         x, steps = end.x, steps + end.steps
     for number in [*range(len(channels))] * (tries - 1):
         part, end, more = _exchanged(part, end, number, rng, iterations)
@@ -104,7 +104,7 @@ def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rn
     return part, replace(end, steps=steps), figures
 
 
-def _promised(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator) -> float:
+def _expected(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator) -> float:
     """Return the gain expected of one more function beyond twice that for white errors."""
     part = replace(errors, data=first_samples(errors.data, RANKED // errors.unknowns.l))
     more = _coarse(latent)

@@ -38,10 +38,10 @@ class StateErrors(Criterion):
     """The weighted sum of squared errors of all outputs."""
 
     data: Data  # the record
-    unknowns: StateUnknowns  # their order, and whose errors are meant
+    unknowns: StateUnknowns  # their order, and the criterion
     weight: Array  # (l, l) weight of the errors
     limit: float = STABLE  # modulus below which the poles that carry the state must stay
-    # constraints on poles that every iterate obeys: model -> what is wrong, "" where nothing is
+    # constraints on poles that every iterate satisfies: model -> violation, "" for none
     checks: tuple[Callable[[Any], str], ...] = ()
     gauge: ClassVar[str] = "norm"
 

@@ -228,7 +228,7 @@ class RecursiveARX(SavedState):
 
     @property
     def statistics(self) -> Statistics:
-        """Everything the rows say, the prior included, as the batch statistics of the same layout."""
+        """The information of the rows, the prior included, as the batch statistics of the same layout."""
         root = self.root.copy()
         return Statistics(self.layout, root.T @ root, self.rows, self.candidates, root)
 

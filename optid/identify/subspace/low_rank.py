@@ -101,7 +101,7 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
 
 
 def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int, float]:
-    """Return the simulation fit in %, on another record, of the models of a point, by order: that asked for, or all."""
+    """Return the simulation fit in %, on another record, of the models of a point, by order: as given, or all."""
     order, parts, found = structured.windows.plan.order, structured.decomposed(values), {}
     most = min(structured.rank(parts[1]), structured.problem.rows - 1)
     for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):

@@ -61,7 +61,7 @@ class Plan:
 
     @property
     def order(self) -> int | None:
-        """The order asked for; None where it is to be found."""
+        """The given order; None where it is to be estimated."""
         return None if isinstance(self.nx, str) else int(self.nx)
 
     def expansion(self) -> Expansion:
@@ -85,9 +85,9 @@ class Plan:
 
 def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, offset: bool = True, **settings: Any
             ) -> Plan:
-    """Plan a method on a record in memory, taken to its own units (`optid.program.units`); see `in_record_units`.
+    """Plan a method on a record in memory, in its own units (`optid.program.units`); the settings are further fields.
 
-    Without an offset nothing is centred. The settings are further fields of the plan.
+    Without an offset nothing is centred.
     """
     if not isinstance(data, Data):
         raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")

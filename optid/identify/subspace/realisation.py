@@ -130,7 +130,7 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequ
         raise RankError(f"{rows} equations for {total} unknowns of the step for B, D and x0: use a longer record, "
                         "fewer basis functions or a lower order.")
     size = form.size
-    if extra:  # the equations seen through the instruments: what lies outside them is dropped
+    if extra:  # the equations projected on the instruments
         root = add_to_root(np.zeros((size + 1, size + 1)), root[:size, np.r_[: size - extra, size : total + 1]])
     problem = RankOne(root[:size, :size], root[:size, size], float(root[size, size] ** 2), form.blocks, form.linear,
                       energy)

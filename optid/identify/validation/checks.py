@@ -180,12 +180,12 @@ def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> 
 def shares_outside(model: Any, data: Data) -> Iterator[tuple[StaticFunction, Array, float]]:
     """Yield the functions of a model, samples of their arguments, and the share outside the intervals of the bases.
 
-    Straight lines are known everywhere; functions of a latent signal that runs away in the record are left out.
+    Linear functions have no samples; functions of a latent signal that diverges are left out.
     """
     for function in static_functions(model):
         try:
             x = np.zeros(0) if function.is_linear else function.samples(data)
-        except OptidError:  # the simulation says so
+        except OptidError:
             continue
         outside = np.count_nonzero(function.nonlinearity.basis.is_outside(x))
         yield function, x, outside / max(int(np.sum(~np.isnan(x))), 1)

@@ -1,7 +1,4 @@
-"""The columns of the structure test: functions of inputs through a few filters, stretch by stretch of a record.
-
-The functions follow any static nonlinearity, and the filters are found whatever the nonlinearity and the noise are.
-"""
+"""The columns of the structure test: functions of inputs through a few filters, stretch by stretch of a record."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,7 +22,7 @@ from optid.statistics.rq import rq
 
 BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
 EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
-LATEST = 30  # longest delay looked for, in samples
+LATEST = 30  # longest delay, in samples
 LEVEL = 0.01
 SPARE = 1  # poles beyond the order that noisy data show, which may still matter
 FEW = 3  # functions per input with which the dynamics are estimated
@@ -172,25 +169,17 @@ def _statistics(records: Sequence[Array], signals: Expansion, rows: int) -> Hank
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The signals and filters of the columns of all regressions.
-
-    Attributes:
-        u: inputs of the record, missing samples interpolated, one array per experiment.
-        families, fine: functions of each input, and more of them.
-        filters: (L, J) orthonormal impulse responses, of these poles, which begin after the delay.
-        heavy: samples after a missing input until most of its effect has passed.
-        kept: experiments of the record given that are long enough, those of `data`.
-    """
+    """The signals and filters of the columns of all regressions."""
 
     data: Data
-    u: tuple[Array, ...]
-    families: tuple[Family, ...]
-    fine: tuple[Family, ...]
-    filters: Array
-    heavy: int
+    u: tuple[Array, ...]  # inputs of the record, missing samples interpolated, one array per experiment
+    families: tuple[Family, ...]  # functions of each input
+    fine: tuple[Family, ...]  # more of them
+    filters: Array  # (L, J) orthonormal impulse responses, of these poles, which begin after the delay
+    heavy: int  # samples after a missing input until most of its effect has passed
     poles: NDArray[np.complex128]
     delay: int
-    kept: tuple[int, ...]
+    kept: tuple[int, ...]  # experiments of the given record that are long enough, those of `data`
 
     @classmethod
     def of(cls, data: Data) -> "Design":
