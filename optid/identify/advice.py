@@ -149,7 +149,7 @@ def _tried(fit: Any) -> Iterator[Advice]:
 
 
 def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield structures in words, as options, and as changes of the arguments of a fit."""
+    """Yield structures as a phrase, as options, and as changes of the arguments of a fit."""
     name, arguments, data = fit.formulation, fit.arguments, fit.data
     if hasattr(fit.model, "nk") and "nb" in arguments:
         sharp = [delay for delay in shown_delays(fit.model, data) if delay is not None]

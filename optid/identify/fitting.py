@@ -159,7 +159,7 @@ class Fit(Rendered):
         return parameters(self)
 
     def conf_int(self, level: float = 0.95) -> Parameters:
-        """Return the parameters with intervals that contain the truth with this probability."""
+        """Return the parameters with intervals of this level."""
         return parameters(self, level)
 
     def predict(self, data: Data | None = None, horizon: int = 1) -> Any:

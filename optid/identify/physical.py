@@ -131,7 +131,7 @@ class PhysicalErrors(Criterion):
         return tuple(self.equations.interval(name) for name in self.equations.states)
 
     def in_words(self) -> tuple[str, ...]:
-        """Return the equations in words."""
+        """Return the equations as text."""
         following = "d{}/dt" if self.steps else "{}(k+1)"
         return tuple(f"{following.format(name) if name in self.equations.states else name} = {_in_words(expression)}"
                      for name, expression in self._evaluated.items())

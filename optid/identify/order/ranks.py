@@ -95,7 +95,7 @@ class RankTest:
 
     @property
     def reason(self) -> str:
-        """The decision in words."""
+        """The reason of the decision."""
         n = self.order
         if self.exact:
             return f"{n}: singular value {n + 1} is rounding ({self.singular_values[n]:.1e})"

@@ -72,12 +72,12 @@ class ObserverForm:
 
     @property
     def channels(self) -> list[str]:
-        """Names of the channels in words, those of the feedback last."""
+        """Names of the channels, those of the feedback last."""
         x = self.expansion
         return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
 
     def names(self) -> list[str]:
-        """Name the unknowns in words for messages."""
+        """Return the names of the unknowns for messages."""
         named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
         named += ["the offset"] * (self.l * self.offset)
         for channel, (p, b) in zip(self.channels, self.blocks):

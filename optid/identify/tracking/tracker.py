@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.errors import DataError, StructureError
 from optid.identify.recursive.state import SavedState, as_block, forgetting_factor
 from optid.identify.tracking.subspaces import as_basis, orthonormal, principal_angles
@@ -59,9 +59,8 @@ class SubspaceTracker(SavedState):
         """
         self.n = check_integer(n, "n", 2)
         self.r = check_integer(r, "r", high=self.n - 1)
-        if method not in METHODS or missing not in MISSING:
-            raise StructureError(f"method={method!r}, missing={missing!r}: use one of {', '.join(METHODS)} and one of "
-                                 f"{', '.join(MISSING)}.")
+        one_of("method", method, METHODS)
+        one_of("missing", missing, MISSING)
         if not (np.isfinite(information) and information > 0):
             raise StructureError(f"information={information!r}: must be a positive number.")
         self.method, self.forgetting, self.missing = method, forgetting_factor(forgetting), missing
