@@ -32,7 +32,7 @@ class Projection:
 
     @cached_property
     def decomposition(self) -> tuple[Array, Array]:
-        """Left singular vectors of the weighted outputs, without the weights, and the singular values, largest first."""
+        """Left singular vectors of the weighted outputs, without the weights, and the singular values, descending."""
         scale = self.scale if self.weighting != "plain" else np.ones(len(self.scale))
         sizes = np.tile(scale, self.statistics.rows // 2)  # the future is the second half of a window
         r22, unweighted = self.blocks.r22 / sizes[:, None], np.diag(sizes)
