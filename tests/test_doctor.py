@@ -64,11 +64,11 @@ def test_samples_outside_the_interval_are_counted():
 def test_outliers_are_counted_and_heavy_tails_are_not():
     y = Y.copy()
     y[[7, 70]] = 100
-    with pytest.warns(DataWarning, match=r"2 readings of output 'y' \(samples 7, 70\) are wild.*NaN"):
+    with pytest.warns(DataWarning, match=r"2 outliers in output 'y' \(samples 7, 70\): .*NaN"):
         examined(y=y)
     u = U.copy()
     u[9] = 50
-    with pytest.warns(DataWarning, match=r"1 reading of input 'u' \(sample 9\) is wild.*check the record"):
+    with pytest.warns(DataWarning, match=r"1 outlier in input 'u' \(sample 9\): check the record"):
         examined(u=u, basis=BASIS.__class__(6).fitted(-1, 60))
     assert examined(y=np.random.default_rng(4).standard_t(1.5, 400) ** 3) == []
 
@@ -109,6 +109,6 @@ def test_findings_belong_to_the_fit():
     data = record(count=300)
     y = data.y.copy()
     y[100] = 80
-    with pytest.warns(DataWarning, match=r"sample 100\) is wild"):
+    with pytest.warns(DataWarning, match=r"1 outlier in .*sample 100\)"):
         fit = optid.fit(optid.Data(u=data.u, y=y), na=1, nb=1, basis=BASIS)
     assert len(fit.findings) == 1 and "huber" in fit.findings[0]

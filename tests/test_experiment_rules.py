@@ -124,7 +124,7 @@ def test_fit_names_a_single_sinusoid():
 
 def test_instruments_that_hardly_reach_are_told():
     assert examine_figures({"condition of R11": 1e5}) == []
-    with pytest.warns(DataWarning, match="instruments hardly reach the regressors: cond.R11. = 1.0e\\+09"):
+    with pytest.warns(DataWarning, match="instruments hardly explain the regressors: cond.R11. = 1.0e\\+09"):
         assert len(examine_figures({"condition of R11": 1e9})) == 1
 
 

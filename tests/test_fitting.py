@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 from problems import BASIS, record
+from refusals import refuses
 
 import optid
 from formulations import hammerstein_arx
@@ -65,15 +66,13 @@ def infinite(program, settings):
     (infinite, "non-finite"),
 ])
 def test_a_bad_solver_is_an_error_for_people_and_a_value_for_studies(run, words):
-    with pytest.raises(SolverFailed, match=words):
-        optid.fit(record(), solver=mine(run), **STRUCTURE)
+    refuses(SolverFailed, words, optid.fit, record(), solver=mine(run), **STRUCTURE)
     fit = optid.fit(record(), solver=mine(run), raises=False, **STRUCTURE)
     assert fit.solution.status is Status.FAILED and not fit.solution.proof
 
 
 def test_a_plain_function_is_a_solver():
-    with pytest.raises(SolverFailed, match="crashing gave no usable answer"):
-        optid.fit(record(), solver=crashing, **STRUCTURE)
+    refuses(SolverFailed, "crashing gave no usable answer", optid.fit, record(), solver=crashing, **STRUCTURE)
 
 
 def test_a_solver_that_dies_is_an_outcome():
@@ -167,15 +166,13 @@ def test_the_model_of_a_flipped_sign_keeps_its_units():
     ({"solver": "clarabel"}, StructureError, "not convex in constraint 'residual'.*Use an NLP back end"),
 ])
 def test_requests_that_cannot_be_met(change, error, words):
-    with pytest.raises(error, match=words):
-        optid.fit(record(), **(STRUCTURE | change))
+    refuses(error, words, optid.fit, record(), **(STRUCTURE | change))
 
 
 def test_unknown_formulation():
     with pytest.raises(LookupFailed, match="Did you mean 'hammerstein_arx.exact'"):
         optid.fit(record(), "hammerstein_arx.exat", **STRUCTURE)
-    with pytest.raises(StructureError, match="needs na, nb, basis"):
-        optid.fit(record())
+    refuses(StructureError, "needs na, nb, basis", optid.fit, record())
 
 
 def test_nonconvex_constraints_are_refused_by_convex_formulations():
@@ -191,5 +188,4 @@ def test_nonconvex_constraints_are_refused_by_convex_formulations():
     (record(count=24), RankError, "21 rows for 27 parameters.*longer record"),
 ])
 def test_records_that_will_not_do(data, error, words):
-    with pytest.raises(error, match=words):
-        optid.fit(data, **(STRUCTURE | {"nb": 4}))
+    refuses(error, words, optid.fit, data, **(STRUCTURE | {"nb": 4}))

@@ -289,7 +289,7 @@ def test_a_free_run_that_leaves_the_record_is_told():
     assert "free run" not in calm.figures and "free run" not in calm.solution.reason
 
 
-@pytest.mark.filterwarnings("ignore:The record does not look")
+@pytest.mark.filterwarnings("ignore:The record is not consistent")
 def test_tables_figures_and_checks_show_the_latent_function():
     u = np.repeat(np.random.default_rng(3).uniform(-1.5, 1.5, 150), 4)
     data = Data(u, oscillator(u, 0.02))
@@ -322,7 +322,7 @@ def test_functions_without_effect_are_named(formulation):
     rng = np.random.default_rng(2)
     u = rng.uniform(-1, 1, 400)
     data = Data(u, lfilter([0.0, 0.5], [1.0, -0.8], u) + 0.05 * rng.normal(size=400))
-    with pytest.warns(DataWarning, match="no effect that the record shows"):
+    with pytest.warns(DataWarning, match="no significant effect"):
         fit = optid.fit(data, formulation, nx=1)
     assert "leave them out" in fit.figures["effect of latent signals"]
 

@@ -170,9 +170,9 @@ def test_readings_left_out_are_named_and_squares_keeps_them():
     robust = optid.fit(wild, na=2, nb=2, basis=BASIS, loss="huber")
     assert plain.figures["rows"] == 398 and "marked" not in plain.findings[0] and "NaN" in plain.findings[0]
     assert robust.figures["rows"] == 398 - 3 - 4 - 3 - 3
-    assert robust.figures["wild readings of y"] == "samples 40, 90, 91, 250"
-    assert robust.findings[0].endswith("leaves out every row that holds one, as output or as past output")
-    assert robust.findings[1].startswith("readings wild by their residuals of y, sample 300, were left out")
+    assert robust.figures["outliers of y"] == "samples 40, 90, 91, 250"
+    assert robust.findings[0].endswith("leaves out every row that contains one, as output or as past output")
+    assert robust.findings[1].startswith("outliers by the residuals of y, sample 300, were left out")
 
 
 def test_a_disturbance_of_the_plant_is_no_wrong_reading():
@@ -194,4 +194,4 @@ def test_several_outputs_leave_out_the_rows_of_each():
     with pytest.warns(DataWarning, match="leaves out every row"):
         fit = optid.fit(optid.Data(u=u, y=y), "arx", na=2, nb=2, loss="huber")
     assert fit.figures["rows"] == 598 - 3 - 3 - 4
-    assert fit.figures["wild readings of y2"] == "samples 77, 301"
+    assert fit.figures["outliers of y2"] == "samples 77, 301"

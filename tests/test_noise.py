@@ -292,8 +292,7 @@ def test_the_autoregression_of_the_errors_of_an_observer_shows_the_gain():
 
 def test_a_stable_gain_whose_run_leaves_the_range_of_numbers_is_refused():
     A, C, rest = np.array([[0.0, 1e200], [0.0, 0.0]]), np.array([[1.0, 1.0]]), [np.ones((20, 1))]
-    with pytest.raises(DataError, match="range of numbers"):
-        whitened(A, C, np.zeros((2, 1)), rest)
+    refuses(DataError, "range of numbers", whitened, A, C, np.zeros((2, 1)), rest)
 
 
 def test_a_start_whose_innovations_leave_the_range_of_numbers_is_left_out():

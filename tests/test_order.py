@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import scripts
+from refusals import refuses
 from scipy.signal import lfilter
 from scipy.stats import kstest
 from systems import by_hand, inputs, mimo, siso
@@ -165,17 +166,12 @@ def test_refusals_of_the_test():
     data = record()
     statistics = hankel_statistics(data.records, 15)
     z, phi, y = positions(statistics, 5, 1, 2)
-    with pytest.raises(StructureError, match="take windows that are longer"):
-        rank_test(statistics, z, phi, y, rows=15)
-    with pytest.raises(StructureError, match="within the first 9 block rows"):
-        rank_test(statistics, z, phi, y, rows=9)
-    with pytest.raises(StructureError, match="level=2"):
-        rank_test(statistics, z, phi, y, rows=10, level=2)
-    with pytest.raises(StructureError, match="5 positive numbers"):
-        rank_test(statistics, z, phi, y, rows=10, scale=np.zeros(5))
+    refuses(StructureError, "take windows that are longer", rank_test, statistics, z, phi, y, rows=15)
+    refuses(StructureError, "within the first 9 block rows", rank_test, statistics, z, phi, y, rows=9)
+    refuses(StructureError, "level=2", rank_test, statistics, z, phi, y, rows=10, level=2)
+    refuses(StructureError, "5 positive numbers", rank_test, statistics, z, phi, y, rows=10, scale=np.zeros(5))
     short = hankel_statistics([np.hstack([data.u, data.y])[:28]], 15)
-    with pytest.raises(RankError, match="14 complete windows for 11 instruments and 5 outputs"):
-        rank_test(short, z, phi, y, rows=10)
+    refuses(RankError, "14 complete windows for 11 instruments and 5 outputs", rank_test, short, z, phi, y, rows=10)
 
 
 def test_prediction_errors_of_full_order_are_those_of_least_squares():
@@ -213,16 +209,20 @@ def arx(n=900, seed=0, nonlinear=False):
     return Data(u, lfilter([1], [1, -1.2, 0.6], right))
 
 
+def rows_of(data, one, reach=4):
+    """Dense regressor and target of a structure."""
+    u, y, count = data.u, data.y[:, 0], len(data.y)
+    columns = [np.ones(count - reach)] + [y[reach - i : count - i] for i in range(1, one.na + 1)]
+    columns += [u[reach - k : count - k, c] for c in range(2) for k in range(one.nk[c], one.nk[c] + one.nb[c])]
+    return np.column_stack(columns), y[reach:]
+
+
 def test_lags_equal_dense_least_squares():
     data = arx(200)
     scan = scan_lags(data, fitted_bases(data, Linear()), na=3, nb=3, nk=2)
-    reach = 4
-    y, u = data.y[:, 0], data.u
     for one in scan.candidates[::7]:
-        columns = [np.ones(200 - reach)] + [y[reach - i : 200 - i] for i in range(1, one.na + 1)]
-        columns += [u[reach - k : 200 - k, c] for c in range(2) for k in range(one.nk[c], one.nk[c] + one.nb[c])]
-        phi = np.column_stack(columns)
-        error = y[reach:] - phi @ np.linalg.lstsq(phi, y[reach:])[0]
+        phi, y = rows_of(data, one)
+        error = y - phi @ np.linalg.lstsq(phi, y)[0]
         assert one.aic == pytest.approx(len(error) * np.log(np.mean(error**2)) + 2 * phi.shape[1], rel=1e-9)
     assert scan.rows == 196
 
@@ -259,19 +259,8 @@ def test_hold_out_of_lags_by_hand():
     data = arx(1200)
     train, test = data.split(0.7)
     one = scan_lags(train, fitted_bases(train, Linear()), na=2, nb=4, nk=1, test=test).best("fit")
-    reach, n = 4, len(train.y)
-
-    def rows(part):
-        u, y = part.u, part.y[:, 0]
-        count = len(y)
-        columns = [np.ones(count - reach)] + [y[reach - i : count - i] for i in range(1, one.na + 1)]
-        columns += [u[reach - k : count - k, c] for c in range(2) for k in range(one.nk[c], one.nk[c] + one.nb[c])]
-        return np.column_stack(columns), y[reach:]
-
-    phi, y = rows(train)
-    assert len(y) == n - reach
-    other, target = rows(test)
-    error = target - other @ np.linalg.lstsq(phi, y)[0]
+    other, target = rows_of(test, one)
+    error = target - other @ np.linalg.lstsq(*rows_of(train, one))[0]
     expected = 100 * (1 - np.sqrt(np.mean(error**2) / np.var(target)))
     assert one.fit == pytest.approx(expected, abs=1e-6)
 
@@ -312,15 +301,13 @@ def test_short_records_say_what_they_cannot():
     ({"block_rows": 400}, RankError, "Experiment 1 has 800 samples"),
 ])
 def test_bad_arguments(arguments, error, words):
-    with pytest.raises(error, match=words):
-        optid.order(record(), **arguments)
+    refuses(error, words, optid.order, record(), **arguments)
 
 
 def test_bad_records():
     data = record()
     rng = np.random.default_rng(0)
-    with pytest.raises(DataError, match="constant|does not move"):
-        optid.order(Data(np.ones(300), rng.normal(size=300)))
+    refuses(DataError, "constant|does not move", optid.order, Data(np.ones(300), rng.normal(size=300)))
     with pytest.raises((DataError, RankError), match="u1|u2"):
         optid.order(Data(np.hstack([data.u, data.u]), data.y))
     with pytest.raises(RankError, match="Experiment 2 has 20 samples"):

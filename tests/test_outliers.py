@@ -1,4 +1,4 @@
-"""Wild readings: found up to a large share of them, whatever the signal, and never where there are none."""
+"""Outliers: found up to a large share of them, for every kind of signal, and no false alarms."""
 
 import os
 import time
@@ -56,7 +56,7 @@ OTHERS = {
 
 @pytest.mark.parametrize("name", SIGNALS)
 @pytest.mark.parametrize("count", [8, 20])
-def test_every_wild_reading_is_found_and_no_other(name, count):
+def test_every_outlier_is_found_and_no_other_sample(name, count):
     for seed in range(20):
         rng = np.random.default_rng(seed)
         x = SIGNALS[name](rng, 500)
@@ -124,7 +124,7 @@ def test_the_ends_and_missing_samples():
     assert find_outliers([x])[0].tolist() == [0, 1, 200, 399]
 
 
-def test_three_in_a_row_are_wild_and_four_are_a_step():
+def test_three_in_a_row_are_outliers_and_four_are_a_step():
     x = np.random.default_rng(0).normal(size=400)
     for length, expected in ((3, [70, 71, 72]), (4, [])):
         spoilt = x.copy()
@@ -187,6 +187,6 @@ def test_the_fit_names_channels_and_samples():
     y[rng.choice(500, 20, replace=False)] = 50
     with pytest.warns(DataWarning):
         fit = optid.fit(optid.Data(u=u, y=y, inputs="valve", outputs="level"), "arx", na=1, nb=1)
-    assert fit.findings[0].startswith("8 readings of input 'valve' (samples 20, 60, 100, 140, 180 and 3 more) are wild")
-    assert fit.findings[1].startswith("20 readings of output 'level' (samples ")
+    assert fit.findings[0].startswith("8 outliers in input 'valve' (samples 20, 60, 100, 140, 180 and 3 more): ")
+    assert fit.findings[1].startswith("20 outliers in output 'level' (samples ")
     assert "NaN" in fit.findings[0] and "loss='huber'" in fit.findings[1]

@@ -7,6 +7,7 @@ from itertools import islice
 import casadi as ca
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.optimize import least_squares
 from systems import by_hand, nonlinearity, siso
 
@@ -32,6 +33,10 @@ def record(model=None, count=400, noise=0.2, seed=1):
     rng = np.random.default_rng(seed)
     u = rng.uniform(-0.7, 1.3, (count, model.m))
     return optid.Data(u=u, y=by_hand(model, u) + noise * rng.normal(size=(count, model.l)), dt=model.dt)
+
+
+def fitted(data, **more):
+    return optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, **more)
 
 
 def distance(found, true):
@@ -84,7 +89,7 @@ def test_experiments_of_unequal_length_with_states_of_their_own_and_missing_outp
         y[rng.random(count) < 0.2] = np.nan
         us.append(u[20:])
         ys.append(y)
-    fit = optid.fit(optid.Data(us, ys, dt=true.dt), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    fit = fitted(optid.Data(us, ys, dt=true.dt))
     assert distance(fit.model, true) < 1e-7
     assert fit.values["x0"].shape == (2, 3)
     assert fit.figures["rows"] == sum(int(np.count_nonzero(~np.isnan(y))) for y in ys)
@@ -94,7 +99,7 @@ def test_half_of_the_outputs_missing():
     data = record(count=800)
     y = data.y.copy()
     y[np.random.default_rng(0).random(len(y)) < 0.5] = np.nan
-    fit = optid.fit(optid.Data(data.u, y, dt=data.dt), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    fit = fitted(optid.Data(data.u, y, dt=data.dt))
     assert np.max(np.abs(fit.model.a - [-1.5, 0.7])) < 0.02
     assert fit.solution.status is Status.LOCAL
 
@@ -145,8 +150,7 @@ def simulated_in_casadi(data, basis, a, b, mu, offset, x0):
 def test_constrained_optimum_equals_that_of_ipopt_on_the_same_problem():
     true = siso(basis=BASIS, nonlinearities=(Nonlinearity(BASIS, np.array([-1.0, 0.1, 0.05, 0.9])),))
     data = record(true, count=150, noise=0.4, seed=3)
-    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS,
-                    constraints=["monotone:increasing", "gain:4.0,at=0.6", "stable:0.8"])
+    fit = fitted(data, constraints=["monotone:increasing", "gain:4.0,at=0.6", "stable:0.8"])
     assert fit.solution.status is Status.LOCAL
 
     a, b, mu, offset, x0 = (ca.MX.sym("v", n) for n in (2, 2, 4, 1, 2))
@@ -181,15 +185,14 @@ def test_constrained_optimum_equals_that_of_ipopt_on_the_same_problem():
 def test_any_back_end_for_the_class_solves_the_programmes(solver):
     data = record(count=200)
     words = {"constraints": ["monotone:increasing"]} if solver != "scs" else {}
-    one = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, **words)
-    other = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, solver=solver, **words)
+    one = fitted(data, **words)
+    other = fitted(data, solver=solver, **words)
     assert other.solution.solver == solver
     assert other.solution.objective == pytest.approx(one.solution.objective, rel=1e-6)
 
 
 def test_a_back_end_of_another_class_is_refused():
-    with pytest.raises(StructureError, match="gauss_newton solves.*class QP"):
-        optid.fit(record(), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, solver="gauss_newton")
+    refuses(StructureError, "gauss_newton solves.*class QP", fitted, record(), solver="gauss_newton")
 
 
 # -- what is reported ------------------------------------------------------------------------------------------------
@@ -197,7 +200,7 @@ def test_a_back_end_of_another_class_is_refused():
 
 def test_objective_is_the_sum_of_squared_simulation_errors():
     data = record()
-    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    fit = fitted(data)
     assert fit.solution.objective == pytest.approx(squares(fit, data), rel=1e-9)
     assert fit.one_step_fit[0] == pytest.approx(fit.simulation_fit[0], abs=1e-6)
     assert fit.solution.bound.value == -np.inf and not fit.solution.proof
@@ -232,9 +235,9 @@ def test_units_are_undone(change):
 
 def test_offset_can_be_held_at_zero():
     data = record(siso(basis=BASIS, offset=0.0))
-    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, offset=False)
+    fit = fitted(data, offset=False)
     assert fit.model.offset[0] == 0.0 and "offset" not in fit.program.variables
-    same = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, constraints=[shape.fixed("offset", [0.0])])
+    same = fitted(data, constraints=[shape.fixed("offset", [0.0])])
     assert same.solution.objective == pytest.approx(fit.solution.objective, rel=1e-7)
 
 
@@ -243,7 +246,7 @@ def test_standard_errors_agree_with_the_scatter():
     true = siso(basis=BASIS, nonlinearities=(Nonlinearity(BASIS, np.array([-1.0, 0.1, 0.4, 0.9])),))
     scores = []
     for seed in range(40):
-        fit = optid.fit(record(true, noise=0.3, seed=seed), "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, starts=2)
+        fit = fitted(record(true, noise=0.3, seed=seed), starts=2)
         scores.append((fit.model.a - true.a) / fit.uncertainty.a.error)
     size = np.sqrt(np.mean(np.square(scores), axis=0))  # one, with a standard error of 0.11
     assert np.all((size > 0.65) & (size < 1.35))
@@ -314,8 +317,7 @@ def test_stability_of_higher_orders_holds_for_the_model(radius):
 
 def test_constraints_of_the_user_in_named_variables():
     data = record()
-    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS,
-                    constraints=[lambda v: {"first": v["a"][0] >= -1.4}, lambda v: {"rest": v["x0"] == 0}])
+    fit = fitted(data, constraints=[lambda v: {"first": v["a"][0] >= -1.4}, lambda v: {"rest": v["x0"] == 0}])
     assert fit.model.a[0] >= -1.4 - 1e-7
     assert np.max(np.abs(fit.values["x0"])) < 1e-8
     assert {price.name for price in fit.prices} == {"first", "rest"}
@@ -323,8 +325,8 @@ def test_constraints_of_the_user_in_named_variables():
 
 def test_constraints_that_hold_anyway_cost_nothing():
     data = record()
-    one = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
-    other = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS, constraints=["stable:0.99"])
+    one = fitted(data)
+    other = fitted(data, constraints=["stable:0.99"])
     assert other.solution.objective == pytest.approx(one.solution.objective, rel=1e-8)
     assert not other.prices[0].binding
 
@@ -352,9 +354,9 @@ def test_starts_that_agree_on_a_good_model_are_enough(noise, monkeypatch):
     for seed in range(6):
         data = record(siso(basis=BASIS), noise=noise, seed=seed)
         with monkeypatch.context() as all_of_them:
-            fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+            fit = fitted(data)
             all_of_them.setattr(search, "SUFFICIENT", None)
-            whole = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+            whole = fitted(data)
         assert len(whole.figures["simulation errors of the starts"]) == 6
         staged.append(len(fit.figures["simulation errors of the starts"]))
         assert abs(fit.solution.objective - whole.solution.objective) < 1e-9 * whole.solution.objective
@@ -365,12 +367,12 @@ def test_starts_that_agree_on_a_good_model_are_enough(noise, monkeypatch):
 def test_long_records_are_searched_in_part():
     true = siso(basis=BASIS)
     data = record(true, count=60_000, noise=0.2)
-    fit = optid.fit(data, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    fit = fitted(data)
     assert fit.figures["rows"] == 60_000
     assert np.max(np.abs(fit.model.a - true.a)) < 5e-3
     many = optid.Data([data.u[k : k + 600] for k in range(0, 60_000, 600)],
                       [data.y[k : k + 600] for k in range(0, 60_000, 600)], dt=data.dt)
-    again = optid.fit(many, "hammerstein_oe.exact", na=2, nb=2, basis=BASIS)
+    again = fitted(many)
     assert np.max(np.abs(again.model.a - true.a)) < 5e-3
     assert again.solution.status is Status.LOCAL
 
@@ -407,24 +409,20 @@ def test_inputs_that_the_record_does_not_tell_apart_are_refused_by_name(name, se
         optid.fit(optid.Data(np.hstack([data.u, second(data.u)]), data.y), name, na=2, nb=2, nk=nk, **basis)
 
 
-def test_several_outputs_are_refused_with_the_remedy():
+def test_several_outputs_and_a_short_experiment_are_refused_with_the_remedy():
     data = record()
-    with pytest.raises(StructureError, match="one output.*hammerstein_ss.exact"):
-        optid.fit(optid.Data(data.u, np.hstack([data.y, -data.y])), "oe.exact", na=2, nb=2)
-
-
-def test_a_short_experiment_is_named():
-    data = record()
-    with pytest.raises(RankError, match="experiment 2: 3 samples, but the lags reach back 3"):
-        optid.fit(optid.Data([data.u, data.u[:3]], [data.y, data.y[:3]]), "oe.exact", na=3, nb=3)
+    two = optid.Data(data.u, np.hstack([data.y, -data.y]))
+    short = optid.Data([data.u, data.u[:3]], [data.y, data.y[:3]])
+    refuses(StructureError, "one output.*hammerstein_ss.exact", optid.fit, two, "oe.exact", na=2, nb=2)
+    words = "experiment 2: 3 samples, but the lags reach back 3"
+    refuses(RankError, words, optid.fit, short, "oe.exact", na=3, nb=3)
 
 
 @pytest.mark.parametrize("u, words", [(np.ones(200), "constant"),
                                       (np.where(np.sin(np.arange(200.0) ** 2) > 0, 1.0, -1.0), "binary")])
 def test_inputs_that_say_nothing_about_a_nonlinearity(u, words):
     y = np.random.default_rng(0).normal(size=200)
-    with pytest.raises(DataError, match=words):
-        optid.fit(optid.Data(u, y), "hammerstein_oe.exact", na=1, nb=1, basis="triangular:4")
+    refuses(DataError, words, optid.fit, optid.Data(u, y), "hammerstein_oe.exact", na=1, nb=1, basis="triangular:4")
 
 
 # -- real records ----------------------------------------------------------------------------------------------------

@@ -247,26 +247,9 @@ def test_known_feedthrough():
 
 
 def broken(change):
+    """A record changed by a function of (u, y)."""
     data = example1(600, 0.05, 0.1)
-    u, y = data.u.copy(), data.y.copy()
-    change(u, y)
-    return Data(u=u, y=y)
-
-
-def copy_input(u, y):
-    u[:, 1] = 2 * u[:, 0] + 1
-
-
-def copy_output(u, y):
-    y[:, 1] = -3 * y[:, 0]
-
-
-def still_output(u, y):
-    y[:, 0] = 4.0
-
-
-def tiny_output(u, y):
-    y[:] = 1e-4 * y
+    return Data(*change(data.u, data.y))
 
 
 @pytest.mark.parametrize("data, arguments, error, text", [
@@ -276,9 +259,9 @@ def tiny_output(u, y):
     (example1(600), {"block_rows": 1}, StructureError, "block_rows must be an integer of at least 2; got 1"),
     (example1(60), {"nx": 3, "block_rows": 12}, RankError, "complete windows"),
     (example1(20), {"nx": 3, "block_rows": 12}, RankError, "experiment 1 has 20 samples"),
-    (broken(copy_input), {"nx": 3}, RankError, "input 'u2' is a sum of multiples of u1"),
-    (broken(copy_output), {"nx": 3}, RankError, "output 'y2' is a sum of multiples of y1"),
-    (broken(still_output), {"nx": 3}, DataError, "output 'y1' is constant"),
+    (broken(lambda u, y: (u[:, :1] * [1, 2] + [0, 1], y)), {"nx": 3}, RankError, "'u2' is a sum of multiples of u1"),
+    (broken(lambda u, y: (u, y[:, :1] * [1, -3])), {"nx": 3}, RankError, "output 'y2' is a sum of multiples of y1"),
+    (broken(lambda u, y: (u, y * [0, 1] + [4, 0])), {"nx": 3}, DataError, "output 'y1' is constant"),
     (example1(600), {"nx": 3, "feedback_basis": ["polynomial:3"]}, StructureError, "1 feedback bases for 2 outputs"),
     (example1(600), {"nx": 3, "feedback_basis": ["polynomial:1", None]}, RankError, "linear in the outputs"),
     (example1(600), {"nx": 3, "feedback_basis": [3, None]}, StructureError, "feedback basis of output 'y1'"),
@@ -294,10 +277,10 @@ def test_refusals(data, arguments, error, text):
 
 
 def test_nearly_linear_feedback_is_refused_or_warned_of():
-    data = broken(tiny_output)
+    data = broken(lambda u, y: (u, 1e-4 * y))
     with pytest.raises(RankError, match="cannot be told from an output injection"):
         optid.fit(data, "hammerstein_ss.asivid", nx=3, basis=F, feedback_basis=[G[0], None])
-    small = broken(lambda u, y: np.multiply(y, 0.02, out=y))
+    small = broken(lambda u, y: (u, 0.02 * y))
     with pytest.warns(DataWarning, match="nearly linear"):
         optid.fit(small, "hammerstein_ss.asivid", nx=3, basis=F, feedback_basis=[G[0], None])
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 
 from optid.errors import DataError, RankError, StructureError
 from optid.identify.tracking import (
@@ -177,12 +178,9 @@ def test_samples_that_do_not_determine_their_coordinates_are_passed_over():
 def test_bad_samples_are_refused_by_name():
     tracker = SubspaceTracker(3, 1, missing="refuse", names=["flow", "level", "heat"])
     tracker.update(np.ones((5, 3)))
-    with pytest.raises(DataError, match="level is missing at sample 6"):
-        tracker.update([[1, 1, 1], [1, np.nan, 1]])
-    with pytest.raises(DataError, match="'heat': sample 5 is inf"):
-        tracker.update([1, 1, np.inf])
-    with pytest.raises(DataError, match=r"\(N, 3\)"):
-        tracker.update(np.ones((2, 4)))
+    refuses(DataError, "level is missing at sample 6", tracker.update, [[1, 1, 1], [1, np.nan, 1]])
+    refuses(DataError, "'heat': sample 5 is inf", tracker.update, [1, 1, np.inf])
+    refuses(DataError, r"\(N, 3\)", tracker.update, np.ones((2, 4)))
 
 
 @pytest.mark.parametrize("arguments", [
@@ -334,8 +332,7 @@ def refusals():
 
 @pytest.mark.parametrize("call, error, words", list(refusals()))
 def test_what_cannot_be_proved_or_projected_is_refused(call, error, words):
-    with pytest.raises(error, match=words):
-        call()
+    refuses(error, words, call)
 
 
 def test_losses_are_mean_squares_of_what_is_left():

@@ -123,7 +123,7 @@ def test_a_true_model_passes():
     assert found.simulation["y"].fit < found.one_step["y"].fit
     assert found.residuals[0].shape == (2000, 1) and found.simulated[0] == pytest.approx(simulation)
     text = str(found)
-    for words in ("rig", "one step", "simulation", "white", "independent of u", "looks Hammerstein"):
+    for words in ("rig", "one step", "simulation", "white", "independent of u", "consistent with a Hammerstein system"):
         assert words in text
 
 
@@ -184,7 +184,7 @@ def test_notes_are_warnings():
     assert found.outside["u"] == pytest.approx(1 / 800)
     with pytest.warns(DataWarning, match="unstable: its largest pole has radius 1.1"):
         validate(siso(a=[-1.1]), data)
-    with pytest.warns(DataWarning, match="does not look Hammerstein"):
+    with pytest.warns(DataWarning, match="not consistent with a Hammerstein system"):
         validate(siso(Triangular(5), a=[-0.5], dt=1.0), two_paths())
     with pytest.warns(DataWarning, match="No structure test"):
         short = validate(model, Data(data.u[:15], data.y[:15], dt=0.1))

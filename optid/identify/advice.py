@@ -1,6 +1,6 @@
-"""What would make a model better: sentences that each name the step to take and, where that is cheap to try, its gain.
+"""Advice on how to improve a model: steps with a reason and, where it is cheap to try, with their gain.
 
-The record is looked at first, since no structure mends a wrong one; then neighbouring structures are fitted.
+The record is checked first; then neighbouring structures are fitted.
 """
 
 import warnings
@@ -16,30 +16,29 @@ from optid.errors import OptidError
 from optid.identify.blocks import Blocks
 from optid.identify.delays import LagSums, linear, shown_delays
 from optid.identify.validation.checks import shares_outside
-from optid.identify.validation.predictions import fit_percent, simulated_or_nan
+from optid.identify.validation.predictions import SIMULATION, fit_percent, prediction_fit, simulated_or_nan
 from optid.models.functions import has_feedback
 
 MOST = 5
-WORTH = 0.1  # share of the error of the free run that a step has to save to be advised
+WORTH = 0.1  # reduction of the simulation error, as a share, from which a step is advised
 SPARED = 0.5  # points of fit that may be lost for a simpler structure
-JUMP = 4.0  # factor between the sizes of a channel's movements before and after a sample that is taken for a change
-APART = 15.0
-"""Points by which both halves of a record fit better alone than together, where the plant changes between them."""
-DRIVEN = 0.5  # log ratio of one-step errors that the past of the output saves of the input, where columns look swapped
+JUMP = 4.0  # ratio of the sizes of a channel's steps before and after a sample that counts as a change
+APART = 15.0  # points by which both halves of a record fit better alone, from which the plant counts as changed
+DRIVEN = 0.5  # log ratio by which past outputs reduce the error of the input, from which columns count as swapped
 TOO_FEW = 10  # samples per parameter at least
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
+# formulations with a static function of the input, by those without
 STATIC = {"arx": "hammerstein_arx.exact", "oe.exact": "hammerstein_oe.exact", "ss.exact": "hammerstein_ss.exact"}
-"""Formulations with a static function of the input, by those without."""
 
 
 @dataclass(frozen=True)
 class Advice:
-    """One step.
+    """A recommended step.
 
     Attributes:
-        sentence: what was seen, and what the step brings.
+        sentence: the finding, and the effect of the step.
         step: an option of the command line, or a call.
-        gain: points of simulation fit it brings where that was tried; NaN where not.
+        gain: points of simulation fit gained where that was tried; NaN where not.
     """
 
     sentence: str
@@ -51,28 +50,19 @@ class Advice:
 
 
 def advise(fit: Any) -> tuple[Advice, ...]:
-    """Return at most five steps, the most useful first.
-
-    Args:
-        fit: `optid.identify.fitting.Fit` of a record in memory.
-    """
+    """Return at most five steps for a fit of a record in memory, the most useful first."""
     if not isinstance(fit.data, Data) or fit.model is None:
         return ()
-    on_record = list(_on_record(fit))
+    steps = list(_on_record(fit))
     tried = list(_tried(fit)) if fit.data.n_samples <= LONG else []
+    while tried:  # of steps with nearly the same gain, the simplest, which was tried first
+        best = max(one.gain for one in tried)
+        tried.remove(first := next(one for one in tried if one.gain >= best - SPARED))
+        steps.append(first)
     found: dict[str, Advice] = {}
-    for one in (*on_record, *_best_first(tried), *_on_model(fit)):
+    for one in (*steps, *_on_model(fit)):
         found.setdefault(one.step, one)
     return tuple(found.values())[:MOST]
-
-
-def _best_first(tried: list[Advice]) -> Iterator[Advice]:
-    """Yield steps by their gain; of those that bring nearly the same, the simplest, which was tried first."""
-    rest = list(tried)
-    while rest:
-        best = max(one.gain for one in rest)
-        rest.remove(first := next(one for one in rest if one.gain >= best - SPARED))
-        yield first
 
 
 def _on_record(fit: Any) -> Iterator[Advice]:
@@ -81,14 +71,14 @@ def _on_record(fit: Any) -> Iterator[Advice]:
     for role, names in (("input", data.inputs), ("output", data.outputs)):
         for c, name in enumerate(names):
             yield from _jump(role, name, [(e.u if role == "input" else e.y)[:, c] for e in data.experiments])
-    wild = [sentence for sentence in fit.findings if " wild" in sentence]
-    if wild:
-        yield Advice(wild[0].partition(":")[0], "--loss huber, or mark them as missing")
+    outliers = [sentence for sentence in fit.findings if " outlier" in sentence]
+    if outliers:
+        yield Advice(outliers[0].partition(":")[0], "--loss huber, or mark them as missing")
     yield from _halves(fit)
 
 
 def _swapped(data: Data) -> Iterator[Advice]:
-    """Look for an input that the past of the outputs explains, while its own past explains nothing of them."""
+    """Detect an input that past outputs explain, while its own past does not explain them."""
     if data.m != 1 or data.l != 1:
         return
     turned = Data([e.y for e in data.experiments], [e.u for e in data.experiments], dt=data.dt, inputs=data.outputs,
@@ -98,12 +88,12 @@ def _swapped(data: Data) -> Iterator[Advice]:
     except OptidError:
         return
     if backward > DRIVEN and forward < 0.1 * backward:
-        yield Advice(f"the past of {data.outputs[0]!r} explains {data.inputs[0]!r}, and not the other way round: input "
-                     "and output look swapped", f"--inputs {data.outputs[0]} --outputs {data.inputs[0]}")
+        yield Advice(f"the past of {data.outputs[0]!r} explains {data.inputs[0]!r}, but not conversely: input and "
+                     "output may be swapped", f"--inputs {data.outputs[0]} --outputs {data.inputs[0]}")
 
 
 def _drive(data: Data) -> float:
-    """Return what the past of the input, without its present, saves of the log one-step error of the output."""
+    """Return the reduction of the log one-step error of the output by past inputs."""
     sums = LagSums(Blocks.of(data), linear(data), na=6, lags=8)
     with_input = sums.columns(sums.layout.na, sums.layout.nb[0] - 1, (1,))
     alone = np.concatenate([with_input[: sums.layout.na], with_input[-1:]])
@@ -111,7 +101,7 @@ def _drive(data: Data) -> float:
 
 
 def _jump(role: str, name: str, records: list[Array]) -> Iterator[Advice]:
-    """Look for a sample from which on a channel moves many times as much, or as little, as before."""
+    """Detect a sample from which on a channel varies many times as much, or as little, as before."""
     for i, x in enumerate(records):
         steps = np.abs(np.diff(x[np.isfinite(x)]))
         if steps.size < 128:
@@ -124,13 +114,13 @@ def _jump(role: str, name: str, records: list[Array]) -> Iterator[Advice]:
         if ratio > JUMP:
             factor, sample = np.median(sizes[at:]) / np.median(sizes[:at]), at * len(x) // 16
             where = f" of experiment {i + 1}" if len(records) > 1 else ""
-            yield Advice(f"{role} {name!r} moves {factor:.3g} times as much from about sample {sample}{where} on: its "
-                         "unit or its gain may have changed there", f"data.window(0, {sample}) fits the part before")
+            yield Advice(f"{role} {name!r} varies {factor:.3g} times as much from about sample {sample}{where} on: its "
+                         "unit or its gain may have changed there", f"data.window(0, {sample}) is the part before")
             return
 
 
 def _halves(fit: Any) -> Iterator[Advice]:
-    """Fit both halves alone: where both are much better then, the plant is not the same in both."""
+    """Fit both halves alone: where both fits are much better, the plant changes."""
     data: Data = fit.data
     if data.n_experiments > 1 or not 200 <= data.n_samples <= LONG:
         return
@@ -149,7 +139,7 @@ def _halves(fit: Any) -> Iterator[Advice]:
 
 
 def _tried(fit: Any) -> Iterator[Advice]:
-    """Fit neighbouring structures; those that save much of the error of the free run are advised."""
+    """Fit neighbouring structures; those that reduce the simulation error much are advised."""
     before = _score(fit.model, fit.data)
     for sentence, step, changes in _neighbours(fit):
         after = before if (found := _try(fit, **changes)) is None else _score(found.model, fit.data)
@@ -159,7 +149,7 @@ def _tried(fit: Any) -> Iterator[Advice]:
 
 
 def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield structures in words, as options, and as changes of the arguments of a fit."""
+    """Yield structures as a phrase, as options, and as changes of the arguments of a fit."""
     name, arguments, data = fit.formulation, fit.arguments, fit.data
     if hasattr(fit.model, "nk") and "nb" in arguments:
         sharp = [delay for delay in shown_delays(fit.model, data) if delay is not None]
@@ -182,7 +172,7 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
     if data.l == 1 and "arx" in name and "armax" not in name and "na" in arguments:
         other = "hammerstein_oe.exact" if static else "oe.exact"
         kept = {key: arguments[key] for key in ("na", "nb", "nk", "constraints", "basis") if key in arguments}
-        yield ("fitting the free run instead of the one-step prediction", f"--formulation {other}",
+        yield ("fitting the simulation instead of the one-step prediction", f"--formulation {other}",
                {"formulation": other, "replaced": kept})
     several = all(np.unique(e.u[:, c]).size > 2 for e in data.experiments for c in range(data.m))
     if name in STATIC and several:
@@ -210,18 +200,18 @@ def _on_model(fit: Any) -> Iterator[Advice]:
         yield Advice(f"{count} samples are few for {parameters} coefficients", "fewer lags or basis functions, or a "
                      "longer record")
     if float(fit.figures.get("condition", 1.0)) > 1e7:
-        yield Advice("the inputs move too little to tell the lags apart", "optid design proposes an input")
+        yield Advice("the inputs do not excite all lags (condition number above 1e7)", "optid design designs an input")
     plain = {other: name for name, other in STATIC.items()}.get(fit.formulation)
     if plain is None or has_feedback(model):
         return
     kept = {key: value for key, value in fit.arguments.items() if key in ("na", "nb", "nk", "nx", "offset")}
     found = _try(fit, formulation=plain, replaced=kept)
     if found is not None and _score(found.model, fit.data) > _score(model, fit.data) - SPARED:
-        yield Advice("a straight line does as well as the function of the input", f"--formulation {plain}")
+        yield Advice("a linear function of the input fits as well", f"--formulation {plain}")
 
 
 def _try(fit: Any, **changes: Any) -> Any:
-    """Fit again with changes; None where that is not possible."""
+    """Fit again with changes; None where that fails."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         try:
@@ -231,10 +221,8 @@ def _try(fit: Any, **changes: Any) -> Any:
 
 
 def _score(model: Any, data: Data) -> float:
-    """Return the fit of the free run in %, a mean over the outputs; minus infinity where there is none."""
-    raw = data.raw()
-    found = fit_percent(np.vstack([e.y for e in raw.experiments]), np.vstack(simulated_or_nan(model, raw)))
-    value = float(np.mean(found))
+    """Return the simulation fit in %, a mean over the outputs; minus infinity where there is none."""
+    value = float(np.mean(prediction_fit(model, data, SIMULATION)))
     return value if np.isfinite(value) else -np.inf
 
 

@@ -23,8 +23,7 @@ def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], lo
 def in_memory(data: Any, errors: str) -> Data:
     """Refuse a stream (`StructureError`); the message names the errors that the fit minimises."""
     if not isinstance(data, Data):
-        raise StructureError(f"{errors} need the record in memory, with every sample in order: read it with optid.read "
-                             "instead of a stream")
+        raise StructureError(f"{errors} require a record in memory: read it with optid.read instead of a stream")
     return data
 
 
@@ -36,22 +35,24 @@ def one_output(data: Any, errors: str) -> Data:
             f"a transfer-function model has one output; there are {data.l} ({', '.join(data.outputs)}). Fit each by "
             "itself (data.select(outputs=...)), or all of them with 'hammerstein_ss.exact'")
     if not any(np.isfinite(e.y).any() for e in data.experiments):
-        raise DataError(f"output {data.outputs[0]!r} has no sample that is present: there is nothing to fit")
+        raise DataError(f"output {data.outputs[0]!r} has no sample that is present")
     return data
 
 
 def enough_rows(rows: int, what: str, unknowns: int, remedy: str) -> None:
-    """Refuse a record with fewer than 1.1 rows, called `what`, per unknown, initial states included (`RankError`).
-
-    The remedy are the lags or states that a user could have fewer of, besides basis functions.
-    """
-    needed = ROWS_PER_UNKNOWN * unknowns
-    if rows < needed:
-        raise RankError(f"{rows} {what} for {unknowns} unknowns (initial states included): at least "
-                        f"{int(np.ceil(needed))} are needed. Use a longer record, fewer {remedy} or fewer basis "
-                        "functions")
+    """Refuse a record with fewer than 1.1 rows, called `what`, per unknown, initial states included (`RankError`)."""
+    least = ROWS_PER_UNKNOWN * unknowns
+    if rows < least:
+        raise RankError(f"{rows} {what} for {unknowns} unknowns (initial states included), fewer than "
+                        f"{int(np.ceil(least))}: use a longer record, fewer {remedy} or fewer basis functions")
 
 
 def outputs_present(data: Data) -> int:
-    """Number of output samples that are not missing."""
+    """Return the number of output samples that are not missing."""
     return sum(int(np.count_nonzero(~np.isnan(e.y))) for e in data.experiments)
+
+
+def violations(model: Any, rules: Sequence[Any]) -> list[str]:
+    """Return the violations of rules by a model, one sentence each; builders without `verify` are skipped."""
+    checks = [rule.verify for rule in rules if getattr(rule, "verify", None) is not None]
+    return [sentence for check in checks if (sentence := check(model))]

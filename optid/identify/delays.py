@@ -1,4 +1,4 @@
-"""Lags of autoregressions by the errors of blocks left out, exactly and at the cost of one pass over the record.
+"""Lags of autoregressions by the errors of blocks left out, from one pass over the record.
 
 The sums of products of a record without a block are those of the whole less those of the rows that touch the block:
 its own samples and as many after it as there are lags. All structures are columns of the largest one.
@@ -22,16 +22,13 @@ Places = NDArray[np.intp]
 
 ROWS_PER_COLUMN = 4
 RIDGE = 1e-12
-SHARP = 0.2  # share of the errors' energy that the first lag with an effect must save for a delay to be taken for real
-SLIGHT = 0.05  # what all the lags before it may save together, as a share of that
+SHARP = 0.2  # reduction of the log error by the first lag with an effect, from which a delay counts as certain
+SLIGHT = 0.05  # reduction by all lags before it, as a share of that, at most
 
 
 @dataclass(frozen=True)
 class Autoregression:
-    """Orders of an autoregression, with the mean squared error of one-step predictions of the blocks left out.
-
-    The error is in units of the variance of the outputs, a mean over them.
-    """
+    """Orders of an autoregression, and the mean squared one-step error of the blocks left out over the variance."""
 
     na: int
     nb: int
@@ -40,13 +37,7 @@ class Autoregression:
 
 
 class LagSums:
-    """Sums of products of lagged samples, of the whole record and of every block with what its rows reach.
-
-    Attributes:
-        layout: the largest structure.
-        whole: sums of the whole record.
-        blocks: by block, sums of the rows that touch it.
-    """
+    """Sums of products of lagged samples: of the `whole` record, and of the rows of every block (`blocks`)."""
 
     def __init__(self, blocks: Blocks, bases: tuple[Basis, ...], na: int = 8, lags: int = 16) -> None:
         data = blocks.data
@@ -106,10 +97,10 @@ def scan(sums: LagSums, delays: list[tuple[int, ...]]) -> list[Autoregression]:
 
 
 def sharp_delays(sums: LagSums) -> tuple[int, ...]:
-    """Return the delay of every input where one shows without doubt, 0 elsewhere.
+    """Return the delay of every input where it is certain, 0 elsewhere.
 
-    Lags are taken away from the first on. A delay is sharp where the last of them saves much of the errors and all
-    before it next to nothing: on a slow input neighbouring lags stand in for one another, and no lag is missed.
+    Lags are removed from the first on. A delay is certain where the last of them reduces the error much and all before
+    it next to nothing; for a slow input neighbouring lags replace one another.
     """
     layout, found = sums.layout, []
     lags = layout.nb[0]
@@ -123,10 +114,7 @@ def sharp_delays(sums: LagSums) -> tuple[int, ...]:
 
 
 def shown_delays(model: Any, data: Data) -> list[tuple[int, ...] | None]:
-    """Return the sharp delays of a record that straight lines show, and the functions of a model; None: too short.
-
-    What acts through an even function shows no delay in a linear model.
-    """
+    """Return the certain delays of a record with linear functions and with those of a model; None: too short."""
     found: list[tuple[int, ...] | None] = []
     for bases in (linear(data), tuple(f.basis for f in model.nonlinearities)):
         try:
@@ -143,9 +131,6 @@ def linear(data: Data) -> tuple[Basis, ...]:
 
 def _solved(gram: Array, columns: Places, y: Places) -> Array:
     """Solve the normal equations of some columns, scaled; directions without energy are left out."""
-    inner = gram[np.ix_(columns, columns)]
-    sizes = np.sqrt(np.maximum(np.diag(inner), 1e-300))
-    values, vectors = np.linalg.eigh(inner / np.outer(sizes, sizes))
-    kept = values > RIDGE * values[-1]
-    right = vectors[:, kept].T @ (gram[np.ix_(columns, y)] / sizes[:, None])
-    return (vectors[:, kept] @ (right / values[kept, None])) / sizes[:, None]
+    sizes = np.sqrt(np.maximum(np.diag(gram)[columns], 1e-300))
+    inverse = np.linalg.pinv(gram[np.ix_(columns, columns)] / np.outer(sizes, sizes), rcond=RIDGE, hermitian=True)
+    return inverse @ (gram[np.ix_(columns, y)] / sizes[:, None]) / sizes[:, None]

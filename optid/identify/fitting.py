@@ -1,4 +1,4 @@
-"""Fit a model: examine the record, pose the problem, solve it, judge and prove the answer, report it."""
+"""Fit a model: check the record, solve the problem, judge and prove the solution, report it."""
 
 import pickle
 import time
@@ -15,6 +15,7 @@ from optid.bases import Linear, fitted_bases
 from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
 from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError, nearest
+from optid.identify.arguments import violations
 from optid.identify.parameters import Parameters, criteria, parameters
 from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
@@ -28,15 +29,15 @@ from optid.solving.solve import Outcome, Procedure, run
 
 @dataclass(frozen=True, repr=False)
 class Fit(Rendered):
-    """A fitted model with the evidence for it: formulation, its arguments and the record lead to the outcome.
+    """A fitted model with its formulation, arguments, record and outcome.
 
-    A pickled fit keeps its results. Its programme is not among them: it is posed and solved again when it is asked for
-    (by `program`, `uncertainty` or `resolve`), which needs constraints that can be pickled.
+    A pickled fit keeps its results, but not its programme, which is built and solved again where it is needed (by
+    `program`, `uncertainty` or `resolve`); its constraints must then be picklable.
 
     Attributes:
-        outcome: what the formulation ended with; see `program`, `solution`, `model`, `figures` and `steps`.
+        outcome: of the formulation; see `program`, `solution`, `model`, `figures` and `steps`.
         prices: activity and price of every user constraint.
-        findings: what the examination of the record found, one sentence each.
+        findings: of the checks of the record, one sentence each.
         seconds: wall time of the whole call.
         settings: solver, accuracy and other settings of the solve.
     """
@@ -57,7 +58,7 @@ class Fit(Rendered):
 
     @cached_property
     def steps(self) -> tuple[tuple[str, Solution], ...]:
-        """Name and solution of every programme on the way."""
+        """Name and solution of every programme."""
         return self.outcome.steps
 
     @cached_property
@@ -79,17 +80,17 @@ class Fit(Rendered):
 
     @property
     def model(self) -> Any:
-        """The identified model in raw units, None without a point; its noise model is estimated at the first call."""
+        """The identified model in raw units, None without a point; its noise model is estimated on first use."""
         return self._completed[0]
 
     @property
     def figures(self) -> dict[str, Any]:
-        """Rows used, rows there are, condition number and method of the statistics; what a procedure measured."""
+        """Rows used and available, condition number and method of the statistics, and figures of the formulation."""
         return self._completed[1]
 
     @cached_property
     def values(self) -> dict[str, np.ndarray]:
-        """Values at the solution of everything a constraint may speak about, by name, in the units of ``data``."""
+        """Values at the solution of everything a constraint may refer to, by name, in the units of ``data``."""
         if not self.solution.has_point:
             return {}
         self.program.assign(self.solution.values)
@@ -97,9 +98,9 @@ class Fit(Rendered):
 
     @cached_property
     def one_step_fit(self) -> np.ndarray:
-        """One-step fit in % of every output: on the rows used for the estimate where the programme knows them.
+        """One-step fit in % of every output, on the rows of the estimate or else on all samples of the record.
 
-        Otherwise over the samples of the record that the model can predict; NaN for a stream then.
+        NaN for a stream whose statistics do not contain it.
         """
         compressed = self.program.compressed
         found = None if compressed is None else compressed.one_step_fit(self.solution.values)
@@ -109,8 +110,7 @@ class Fit(Rendered):
     def simulation_fit(self) -> np.ndarray:
         """Simulation fit in % of every output on the estimation record, initial conditions fitted.
 
-        NaN for a stream, where an input has missing samples (a simulation needs every one of them), and where the
-        simulation runs away.
+        NaN for a stream, where an input has missing samples, and where the simulation diverges.
         """
         return self._fit("simulation")
 
@@ -134,24 +134,21 @@ class Fit(Rendered):
 
     @cached_property
     def verdict(self) -> Any:
-        """What the model is worth on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
+        """Tests of the model on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
         from optid.identify.verdict import verdict
 
         return verdict(self.model, self.data) if isinstance(self.data, Data) and self.model is not None else None
 
     @cached_property
     def advice(self) -> tuple[Any, ...]:
-        """At most five steps that would make the model better (`optid.identify.advice.Advice`); some are tried."""
+        """At most five steps to improve the model (`optid.identify.advice.Advice`); some are tried."""
         from optid.identify.advice import advise
 
         return advise(self)
 
     def refit(self, *, data: Data | Stream | None = None, formulation: str | None = None,
               replaced: Mapping[str, Any] | None = None, **changes: Any) -> "Fit":
-        """Fit again, without a proof: with another record or formulation, and with changes of the arguments.
-
-        The arguments are those of this fit, or those that have `replaced` them.
-        """
+        """Fit again without a proof: the arguments of this fit, or `replaced`, with changes."""
         arguments = self.arguments if replaced is None else replaced
         return fit(self.data if data is None else data, formulation or self.formulation, prove=False,
                    **{**arguments, **changes})
@@ -162,7 +159,7 @@ class Fit(Rendered):
         return parameters(self)
 
     def conf_int(self, level: float = 0.95) -> Parameters:
-        """Return the parameters with intervals that contain the truth with this probability."""
+        """Return the parameters with intervals of this level."""
         return parameters(self, level)
 
     def predict(self, data: Data | None = None, horizon: int = 1) -> Any:
@@ -170,9 +167,9 @@ class Fit(Rendered):
         return self.model.predict(self._record() if data is None else data, horizon)
 
     def simulate(self, u: Any = None, x0: Any = None) -> Any:
-        """Compute the outputs from inputs (N, m) in raw units or a record, as `Model.simulate`; by default that fitted.
+        """Simulate from inputs (N, m) in raw units or a record, as `Model.simulate`; by default the record of the fit.
 
-        The initial state x0 is zero for inputs, and what fits best for a record, when it is not given.
+        By default the initial state x0 is zero for inputs, and fitted for a record.
         """
         given = self._record() if u is None else u
         return self.model.simulate(given, x0=x0 if x0 is not None else "fit" if isinstance(given, Data) else "zero")
@@ -204,7 +201,7 @@ class Fit(Rendered):
 
     def _record(self) -> Data:
         if not isinstance(self.data, Data):
-            raise DataError("the fit was made from a stream, whose samples are not kept: pass a record")
+            raise DataError("the fit is of a stream, whose samples are not kept: pass a record")
         return self.data
 
     def __copy__(self) -> "Fit":
@@ -230,13 +227,13 @@ class Fit(Rendered):
 
 @dataclass(frozen=True)
 class _Lost:
-    """Stands for a constraint that cannot be pickled."""
+    """Placeholder of a constraint that cannot be pickled."""
 
     name: str
 
     def __call__(self, view: Any) -> Any:
-        raise StructureError(f"constraint {self.name!r} was not pickled with the fit, since it is a function without a "
-                             "name of its own: use a rule of formulations.constraints, or a function of a module")
+        raise StructureError(f"constraint {self.name!r} was not pickled with the fit, since it is an anonymous "
+                             "function: use a rule of formulations.constraints, or a function of a module")
 
 
 def _kept(constraint: Any) -> Any:
@@ -256,20 +253,20 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     Args:
         data: the record; a `Stream` for files larger than memory.
         formulation_name: name of a registered formulation, or the callable itself.
-        solver: the back end's word, or "auto".
+        solver: name of the back end, or "auto".
         accuracy: requested relative accuracy.
-        time_limit: seconds for each programme; the solver then runs in a process of its own.
-        isolate: run the solver in a process of its own, so that a crash is an outcome.
+        time_limit: seconds for each programme; the solver then runs in a separate process.
+        isolate: run the solver in a separate process, so that a crash is an outcome.
         prove: ask for a proof of global optimality.
         constraints: builders (``formulations.constraints.shape``), callables of the named variables, or words such as
-            "monotone:increasing". They are stated in the units of ``data``.
+            "monotone:increasing", in the units of ``data``.
         solver_options: native options of the solver.
         raises: False returns failures as values (``fit.solution.status``) instead of raising.
         structure: arguments of the formulation (na, nb, nk, basis, loss, gauge, ...).
 
     Raises:
-        DataError, RankError: the record cannot determine the model.
-        StructureError, LookupFailed, SolverMissing: the request cannot be met; the message says what to change.
+        DataError, RankError: the record does not determine the model.
+        StructureError, LookupFailed, SolverMissing: an invalid request; the message gives the remedy.
         InfeasibleError: with the smallest conflicting subset of constraints found.
         UnboundedError, SolverFailed: no usable point, with the reason.
     """
@@ -294,10 +291,9 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
 
 def resolve(fit: Fit, parameters: Mapping[str, float], *, solver: Any = "auto", accuracy: float = 1e-8,
             raises: bool = True) -> Fit:
-    """Solve the programme of a fit again with other parameter values, starting from its solution.
+    """Solve the programme of a fit again with other parameter values, such as ``weight``, starting from its solution.
 
-    Nothing is compressed or compiled again. The parameters are those of the programme, such as ``weight`` of the
-    nuclear norm; another name is a `StructureError`. The other arguments are as in `fit`.
+    An unknown parameter is a `StructureError`. The other arguments are as in `fit`.
     """
     started = time.perf_counter()
     program = fit.program
@@ -321,8 +317,8 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     outcome = replace(outcome, solution=replace(outcome.solution, times=times))
     if raises:
         _raise_failure(outcome)
-    _in_raw_units(outcome.model, data)  # what raw units cannot express is refused here, not at the first use
-    findings = findings + _disobeyed(outcome.model, arguments.get("constraints", ()))
+    _in_raw_units(outcome.model, data)  # a model without an equivalent in raw units is refused here
+    findings = findings + _violated(outcome.model, arguments.get("constraints", ()))
     compressed, figures = outcome.program.compressed, dict(outcome.figures)
     if compressed is not None:
         figures |= {key: getattr(compressed.statistics, key) for key in ("rows", "candidates", "condition", "method")}
@@ -341,17 +337,16 @@ def _in_raw_units(model: Any, data: Data | Stream) -> Any:
 
 
 def _stand_in(arguments: Mapping[str, Any]) -> str:
-    """Say which constraint is replaced by another condition, and by which; "" where none is."""
+    """Return which constraint is replaced by another condition, and by which; "" where none is."""
     for rule in arguments.get("constraints", ()):
         if (stand_in := getattr(rule, "stand_in", None)) and (how := stand_in(arguments)):
             return f"constraint {rule.name!r} is imposed by {how}"
     return ""
 
 
-def _disobeyed(model: Any, constraints: Sequence[Any]) -> list[str]:
-    """What the constraints that can verify a model say of it; every sentence is also a `DataWarning`."""
-    checks = [rule.verify for rule in constraints if getattr(rule, "verify", None) is not None]
-    found = [sentence for check in checks if model is not None and (sentence := check(model))]
+def _violated(model: Any, constraints: Sequence[Any]) -> list[str]:
+    """Return the violations found by constraints that verify a model; every sentence is also a `DataWarning`."""
+    found = [] if model is None else violations(model, constraints)
     for sentence in found:
         warnings.warn(sentence, DataWarning, stacklevel=4)
     return found
@@ -365,7 +360,7 @@ def _raise_failure(outcome: Outcome) -> None:
         raise InfeasibleError(explain(program))
     if solution.status is Status.UNBOUNDED:
         raise UnboundedError(f"{program.name!r} has no minimum (according to {solution.solver}): the constraints or "
-                             "the penalty leave a direction in which the objective falls for ever")
+                             "the penalty leave a direction in which the objective falls without limit")
     if solution.status is Status.FAILED or not solution.has_point:
         raise SolverFailed(f"{solution.solver} gave no usable answer for {program.name!r}: "
                            f"{solution.reason or solution.claimed}. Try another solver (optid solvers)")

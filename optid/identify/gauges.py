@@ -1,4 +1,4 @@
-"""The scale between mu and b, which no prediction shows: how the formulations fix it."""
+"""The scale between mu and b, which is not identifiable: how the formulations fix it."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np
     """Return the constraint on the coefficients of B: norm one, unit static gain, or a first coefficient of one.
 
     The gauge is one of `FIXED`, b (nb,) or (nb, l) of one input, a that of A, None without poles. The norm is fixed in
-    the tangent of a reference (nb,), an iterate, if there is one. "gain" with several outputs is a `StructureError`.
+    the tangent of a reference (nb,), if given. "gain" with several outputs is a `StructureError`.
     """
     if gauge == "norm":
         return cp.sum_squares(b) == 1 if reference is None else reference @ b == float(reference @ reference)

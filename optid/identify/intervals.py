@@ -1,11 +1,10 @@
 """Intervals around an estimate that linear inequalities may hold.
 
 Near a fit the objective is ``‖v - centre‖² + constant`` in whitened coordinates v of the tangent space: the fit is
-v = 0, ``centre`` is where the minimum would be without the inequalities, and the centre scatters with covariance
-``scatter scatterᵀ``. Without inequalities in reach the intervals are the usual ones with Student's quantile. With them
-the estimate is the projection of the centre on a polyhedron; it is neither Gaussian nor unbiased, and treating the
-active rows as equalities gives intervals that cover too little. The interval used here is the hull of two that fail in
-opposite places: the percentiles of the projected posterior and the basic bootstrap at the constrained fit.
+v = 0, ``centre`` is the minimum without the inequalities, with covariance ``scatter scatterᵀ``. Without inequalities
+nearby the intervals are those of Student's quantile. With them the estimate is the projection of the centre on a
+polyhedron, neither Gaussian nor unbiased, and intervals that treat the active rows as equalities cover too little. The
+interval used here is the hull of the percentiles of the projected posterior and the basic bootstrap at the fit.
 """
 
 from dataclasses import dataclass
@@ -24,22 +23,16 @@ REACH = 8.0  # inequalities further away than this many standard deviations of t
 
 @dataclass(frozen=True, eq=False)
 class LocalEstimate:
-    """An estimate in whitened tangent coordinates v, and inequalities rows (r, n) @ v + slack (r,) >= 0, slack >= 0.
+    """An estimate in whitened tangent coordinates v, and inequalities rows (r, n) @ v + slack (r,) >= 0, slack >= 0."""
 
-    Attributes:
-        centre: (n,) minimum without the inequalities, relative to the fit.
-        scatter: (n, m) S, the centre has covariance S Sᵀ. Draws are made in the m coordinates, which should not depend
-            on how a basis of the tangent space was found: every machine then makes the same.
-        dof: degrees of freedom of the noise estimate inside S.
-        draws: number of random draws, at least 100 (`StructureError`); seed: their seed.
-    """
-
-    centre: Array
+    centre: Array  # (n,) minimum without the inequalities, relative to the fit
+    # (n, m) S, the centre has covariance S Sᵀ; draws are made in the m coordinates, which should not depend on the
+    # basis of the tangent space, to be reproducible
     scatter: Array
-    dof: float
+    dof: float  # degrees of freedom of the noise estimate inside S
     rows: Array
     slack: Array
-    draws: int = DRAWS
+    draws: int = DRAWS  # number of random draws, at least 100 (`StructureError`)
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -70,9 +63,8 @@ class LocalEstimate:
     def limits(self, slopes: Array, level: float) -> tuple[Array, Array, Array]:
         """Return the standard error (q,) and the two ends, lower <= 0 <= upper, of q functions of v with slopes (q, n).
 
-        The quantiles of the projected draws are corrected by what those of the draws themselves miss of Student's,
-        which are known: most of the noise of a finite number of draws is common to both. The level is the probability
-        inside.
+        The quantiles of the projected draws are corrected by the known error of those of the draws themselves (control
+        variates). The level is the probability inside.
         """
         error = np.linalg.norm(slopes @ self.scatter, axis=1)
         half = float(stdtrit(self.dof, 0.5 + level / 2)) * error
@@ -93,7 +85,7 @@ class LocalEstimate:
 def project(points: Array, rows: Array, slack: Array) -> Array:
     """Project points (K, n) on the polyhedron {v: rows @ v + slack >= 0}, which contains the origin.
 
-    Least-distance programming finds the active rows of one point; the same rows are then tried for all that are left.
+    Least-distance programming gives the active rows of one point; the same rows are tried for all other points.
     """
     size = max(float(np.max(np.linalg.norm(points, axis=1), initial=0.0)), np.finfo(float).tiny)
     lengths = np.linalg.norm(rows, axis=1)

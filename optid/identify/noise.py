@@ -1,13 +1,11 @@
 """Noise statistics of a state-space model: gain of the innovations, covariances, spectrum, colour.
 
-With A and C known, what the inputs and the measured feedback do not explain is ``r = (I + C (qI - A)^-1 K) e``. The
-gain K and the covariance of the innovations e minimise the prediction errors (`optid.models.innovation_gain`, started
-from several observers and from long autoregressions of their errors: Hannan and Rissanen 1982). The covariances
-reported are those of the residuals of the state and the output equation along the states of that predictor, ``w = K e``
-and ``v = e``: Q = K Re K', S = K Re, R = Re (Van Overschee and De Moor, Subspace Identification for Linear Systems,
-1996, chapter 3). They are positive semidefinite and belong to K by construction. Q, R and S are not unique: every
-process and measurement noise with the same spectrum gives the same outputs. What the data determine is the spectrum,
-hence K and Re.
+With A and C known, the part of the outputs not explained by inputs and measured feedback is
+``r = (I + C (qI - A)^-1 K) e``. The gain K and the covariance of the innovations e minimise the prediction errors
+(`optid.models.innovation_gain`, started from several observers and from long autoregressions of their errors: Hannan
+and Rissanen 1982). The covariances reported are those of ``w = K e`` and ``v = e``: Q = K Re K', S = K Re, R = Re (Van
+Overschee and De Moor, Subspace Identification for Linear Systems, 1996, chapter 3). Q, R and S are not unique; the data
+determine the spectrum, hence K and Re.
 """
 
 from collections.abc import Sequence
@@ -35,27 +33,24 @@ from optid.statistics.hankel import complete_runs
 ROUNDING = 1e-10  # residuals below this share of the outputs are rounding: there is no noise to describe
 LONGEST = 40  # lags of the autoregression of prediction errors at most
 EXACT = 1e-8  # prediction errors relative to the outputs below which a record shows no noise model
-NEARLY_MARGINAL = 1 - 1e-4
-"""Poles beyond this radius need an observer: without it the residuals would not settle within a record."""
-RATIOS = (1e-2, 1.0, 1e2)  # process over measurement noise of the observers behind the starts, in units of C
-TRIED = 2  # observers whose errors are whitened, and then starts that are refined, the best of all
+NEARLY_MARGINAL = 1 - 1e-4  # radius of the poles from which an observer is used
+RATIOS = (1e-2, 1.0, 1e2)  # process over measurement noise of the observers of the starts, in units of C
+TRIED = 2  # observers whose errors are whitened, and then starts that are refined
+# samples of a block, number of blocks, or samples per entry of K, in which a long record is searched first
 BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
-"""Samples in a row, and the number of such blocks, or the samples per entry of K, that a long record is first searched
-in."""
+# gain of the log-likelihood that is negligible in a part of a record, and difference between two optima of it
 NEARLY, ELSEWHERE = 0.1, 1.0
-"""Gain of the log-likelihood to be expected that is of no account in a part of a record, and the difference beyond
-which two gains are not the same optimum of it."""
 
 
 def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
-    """Return the model with the gain K, A - K C stable, and the noise covariances that a record shows.
+    """Return the model with the gain K, A - K C stable, and the noise covariances of a record.
 
-    The record is in the units of the model: a transform is not undone, since formulations call this before the model
-    returns to raw units. Samples may be missing. K and the noise of the model given do not matter.
+    The record is in the units of the model: a transform is not undone. Samples may be missing. K and the noise of the
+    given model are replaced.
 
     Raises:
         DataError: other channels than the model's, or no stretch long enough without a missing input.
-        StructureError: a pole on or outside the unit circle that the outputs do not see.
+        StructureError: an unobservable pole on or outside the unit circle.
     """
     observer = _observer(model)
     data = between_gaps(data.without_transform(), 2 * model.nx + 1)
@@ -67,7 +62,7 @@ def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
 
 
 def with_noise_or_reason(model: HammersteinSS, data: Data) -> tuple[HammersteinSS, dict[str, str]]:
-    """Return the model as of `with_noise`, or unchanged and a figure that says why the record shows no noise model."""
+    """Return the model as of `with_noise`, or unchanged with the reason as a figure."""
     outputs = [e.y for e in data.experiments]
     try:
         regression_lags([int(np.count_nonzero(~np.isnan(y))) // model.l for y in outputs], model.nx, model.l)
@@ -79,7 +74,7 @@ def with_noise_or_reason(model: HammersteinSS, data: Data) -> tuple[HammersteinS
                                       "missing"}
     spread = np.nanstd(np.concatenate(outputs), axis=0)
     if found.noise is None or np.all(np.diag(found.noise.innovation) <= (EXACT * spread) ** 2):
-        return model, {"noise model": "none: the prediction errors vanish, there is no noise to model"}
+        return model, {"noise model": "none: the prediction errors vanish"}
     return found, {}
 
 
@@ -103,10 +98,7 @@ def noise_spectrum(model: HammersteinSS, w: ArrayLike) -> Array:
 
 
 def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correlation]:
-    """Test the noise at every output for whiteness: of the simulation with measured feedback, without correction.
-
-    Returns {output: test up to so many lags}; one that fails says that the noise of that output is coloured.
-    """
+    """Return {output: whiteness test} of the errors of the simulation with measured feedback, up to so many lags."""
     raw = data.raw()
     rest = residuals(replace(model, K=_observer(model), noise=None), raw)
     lags = max(1, min(lags, int(np.sum(~np.isnan(np.vstack(rest)), axis=0).min()) // 4))
@@ -140,10 +132,7 @@ def _largest(signals: Sequence[Array]) -> float:
 
 
 def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Array]:
-    """Gain and covariance of the innovations of the largest likelihood; a long record is first searched in part.
-
-    The optimum of the part lies a few standard errors of the whole away, which two or three steps overcome.
-    """
+    """Gain and covariance of the innovations of the largest likelihood; a long record is first searched in part."""
     part = _part(rest, C.size)
     starts = _starts(A, C, part)[:TRIED]
     if part is rest:
@@ -168,10 +157,7 @@ def _part(rest: Sequence[Array], entries: int) -> Sequence[Array]:
 
 
 def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
-    """Gains to start from, the most promising first: of observers, and from the whitening of the errors of the best.
-
-    The observers are those of equal noise in all states and equal noise at all outputs.
-    """
+    """Gains to start from, the best first: of observers, and from the whitening of the errors of the best of them."""
     def measured(gain: Array) -> tuple[float, Array, list[Array]]:
         errors = whitened(A, C, gain, rest)
         return log_determinant(covariance_of(errors)), gain, errors
@@ -196,9 +182,8 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
 def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
     """Return the gain (n, l), A - K C stable, with the spectrum of a long autoregression of an observer's errors.
 
-    With F = A - L C the errors of the gain L obey r = e + C (qI - F)^-1 (K - L) e. The autoregression shows this
-    response, which is linear in K. The errors are (N, l), one array per experiment, NaN = missing; those that determine
-    no gain (too few, zero, or on the stability limit) are a `StructureError`.
+    With F = A - L C the errors of the gain L are r = e + C (qI - F)^-1 (K - L) e, a response linear in K. The errors
+    are (N, l), one array per experiment, NaN = missing; those that determine no gain are a `StructureError`.
     """
     n, l = gain.shape  # noqa: E741
     lags = regression_lags([len(run) for r in errors for run in complete_runs(r, 1)], n, l)
@@ -216,9 +201,9 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
 
 
 def regression_lags(lengths: Sequence[int], n: int, l: int) -> int:  # noqa: E741
-    """Return the lags of the autoregression of the errors of l outputs, in complete runs of some lengths, order n.
+    """Return the lags of the autoregression of the errors of l outputs; too few errors are a `StructureError`.
 
-    Too few for a noise model are a `StructureError`.
+    The lengths are those of complete runs, n is the order of the model.
     """
     total = sum(lengths)
     lags = int(min(LONGEST, max(4, 2 * n), max(1, total // (20 * l))))

@@ -1,9 +1,9 @@
-"""Find isolated wild readings, in a record before it is fitted and by the residuals of a model.
+"""Detect isolated outliers, in a record before it is fitted and by the residuals of a model.
 
-A reading is wild when it leaves the course of its channel by far more than the channel ever moves, and is back a few
-samples later: at most `LONGEST` of them in a row. More in a row are a step, which is a signal. Readings inside the
-scatter of the others are not wild, and neither are those of a heavy tail without a gap. Pulses of one to three samples
-on a noisy channel cannot be distinguished from wild readings; on a channel at rest they count as the signal.
+A sample is an outlier when it deviates from the running median of its channel by far more than the channel varies, for
+at most `LONGEST` samples in a row; more in a row are a step. Samples within the scatter of the others, and those of a
+heavy tail without a gap, are no outliers. Pulses of one to three samples count as outliers on a noisy channel, as the
+signal on a constant one.
 """
 
 from collections.abc import Sequence
@@ -13,59 +13,48 @@ from scipy.special import fdtrc, ndtri
 
 from optid.arrays import Array
 
-LONGEST = 3  # wild readings in a row that still count as isolated
-WINDOW = 15  # samples of the running median, the course that wild readings leave; more than half of them must be sound
+LONGEST = 3  # outliers in a row that still count as isolated
+WINDOW = 15  # samples of the running median
 SHORT = 10_000  # samples up to which sorting every window takes less time than the import of scipy.ndimage
-SAMPLED, GOLDEN = 2000, 0.6180339887  # samples that tell the scale first, and where the next one lies
-CAREFUL = 0.9  # share of the scale they tell that the whole record does not fall below
-MOST = 0.12  # share of wild readings up to which they are looked for
-LEAST_SAMPLES = 50  # samples of a channel below which nothing can be said
-FAR = 6.0  # robust standard deviations of the departures from the course that a wild reading is off at least
-GAP = 1.2
-"""Ratio at least of the smallest wild departure to the largest sound one, so that levels of a quantiser are no gap."""
-STEP = 1.5
-"""A wild departure is larger than a step between sound readings by this factor: a channel may switch to and fro."""
-
-SWITCHING = 0.25
-"""Larger steps, relative to the number of wild runs, from which on the channel switches and nothing is wild."""
-GAP_RISK, TAIL_RISK = 2e-3, 1e-4
-"""Probability of as wide a gap, and of as heavy a tail, where the tail goes on as it began."""
-
-FLATTEST = 0.1
-"""Least steepness of a tail: that of a Gaussian one at 3 standard deviations, for signals that are bounded."""
-TRIED = 20  # splits into wild and sound readings that are tried, those at the widest gaps
-TAIL = 0.05  # share of the departures that is the tail of any distribution
+MOST = 0.12  # largest share of outliers that is considered
+LEAST_SAMPLES = 50  # samples of a channel below which there is no test
+FAR = 6.0  # smallest deviation of an outlier, in robust standard deviations
+GAP = 1.2  # smallest ratio of the smallest outlier to the largest other deviation: levels of a quantiser are no gap
+STEP = 1.5  # ratio by which an outlier is larger than a step between other samples
+SWITCHING = 0.25  # larger steps, relative to the number of runs of outliers, from which on the channel switches
+GAP_RISK, TAIL_RISK = 2e-3, 1e-4  # probability of as wide a gap, and of as heavy a tail, where the tail continues
+FLATTEST = 0.1  # least steepness of a tail: that of a Gaussian one at 3 standard deviations, for bounded signals
+TRIED = 20  # splits that are tried, those at the widest gaps
+TAIL = 0.05  # share of the deviations that is the tail of any distribution
 NORMAL_MEDIAN = 0.6745  # median of the absolute value of a standard normal variable
-CHANCE = 1e-3  # probability that residuals of Gaussian noise show a wild reading anywhere in the record
-TIE = 1e-9
-"""Where one row alone tells, a reading that is a past output there counts as wild, for its leverage; the output not."""
+CHANCE = 1e-3  # probability that residuals of Gaussian noise show an outlier anywhere in the record
+TIE = 1e-9  # where a single row decides, a past output in it counts as the outlier, for its leverage, not the output
 
 
 def find_outliers(records: Sequence[Array]) -> list[np.ndarray]:
-    """Return the sample numbers of the isolated wild readings of one channel, one array per experiment.
+    """Return the sample numbers of the isolated outliers of one channel, one array per experiment.
 
-    The departures from a running median are sorted by size. With k of them split off, the logarithm of the gap there
-    times k is in a tail of Pareto's kind exponential (Renyi 1953), and the sum of the logarithms beyond it a gamma
-    variable, both with the steepness of the tail as scale; Hill's estimate (1975) takes it from the departures below.
-    A gap too wide or a tail too heavy for that parts wild readings from sound ones. Scale and course are medians,
-    which half of the readings may spoil (Hampel 1974).
+    The deviations from a running median are sorted by size. With k of them split off, the logarithm of the gap there
+    times k is exponential in a Pareto tail (Renyi 1953), and the sum of the logarithms beyond it a gamma variable, both
+    with the steepness of the tail as scale, by Hill's estimate (1975) from the deviations below. A gap too wide or a
+    tail too heavy for that separates outliers. Scale and running median are robust (Hampel 1974).
 
     Args:
-        records: (N,) samples of every experiment; NaN = missing. What is missing parts no neighbours.
+        records: (N,) samples of every experiment; NaN = missing, and its neighbours count as adjacent.
     """
     arrays = [np.asarray(x, dtype=float) for x in records]
     present = [~np.isnan(x) for x in arrays]
-    wild = _wild([x if kept.all() else x[kept] for x, kept in zip(arrays, present)])
-    return [np.flatnonzero(kept)[mask] if mask.any() else np.flatnonzero(mask) for kept, mask in zip(present, wild)]
+    masks = _outlying([x if kept.all() else x[kept] for x, kept in zip(arrays, present)])
+    return [np.flatnonzero(kept)[mask] if mask.any() else np.flatnonzero(mask) for kept, mask in zip(present, masks)]
 
 
 def find_additive_outliers(residuals: Sequence[Array], past: Array, spread: Array) -> list[np.ndarray]:
-    """Return which readings (N, l) of every experiment are wild by the one-step residuals of an ARX model.
+    """Return which outputs (N, l) of every experiment are outliers by the one-step residuals of an ARX model.
 
-    An output read wrong by h leaves h in its own residual and h times the coefficients of A in the following ones; a
-    disturbance of the plant leaves a single one. A reading is wild where the first explains the residuals better than
-    a disturbance at any of these samples does, and chance does not (Fox 1972; Chang, Tiao and Chen 1988). Of
-    neighbours within the lags only the likeliest is returned, so the search is to be repeated without it.
+    An error h of an output leaves h in its own residual and h times the coefficients of A in the following ones; a
+    disturbance of the plant leaves a single one. An output is an outlier where the first explains the residuals
+    significantly, and better than a disturbance at any of these samples (Fox 1972; Chang, Tiao and Chen 1988). Of
+    neighbours within the lags only the most likely is returned, so the search is to be repeated without it.
 
     Residuals are NaN where a row is not used; ``past[i - 1, o, p]`` of (na, l, l) is the coefficient of A of output o,
     lag i, in equation p; the spread (l,) are robust standard deviations of the residuals.
@@ -91,34 +80,8 @@ def _additive(r: Array, signature: Array, critical: float) -> np.ndarray:
     return peak & (size > np.maximum(critical, np.maximum(rival[:n] * (1 + TIE), later))[:, None])
 
 
-def _may_hold(parts: Sequence[Array]) -> bool:
-    """Tell whether a long record may have wild readings, by those that jump and a sample of the others; 8 times faster.
-
-    A wild reading is `FAR` robust standard deviations off its course, and over `FAR` / `STEP` off a neighbour.
-    """
-    if min(x.size for x in parts) <= SHORT:
-        return True
-    half = WINDOW // 2
-
-    def departures(x: Array, at: np.ndarray) -> Array:
-        windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
-        return np.abs(x[at] - np.partition(windows[at - half], half, axis=1)[:, half])
-
-    spread = (np.arange(SAMPLED) * GOLDEN) % 1  # even, and in step with no period of the record
-    some = [departures(x, half + ((x.size - 2 * half) * spread).astype(int)) for x in parts]
-    least = CAREFUL * FAR * float(np.median(np.concatenate(some))) / NORMAL_MEDIAN
-    for x in parts:
-        jumps = np.flatnonzero(np.abs(np.diff(x)) > least / STEP)
-        edge = jumps[(jumps < half) | (jumps >= x.size - half - LONGEST)]
-        runs = jumps[:-1][np.diff(jumps) <= LONGEST]  # there and back
-        near = runs[:, None] + np.arange(1, 1 + LONGEST)
-        if edge.size or near.size > SHORT or near.size and np.max(departures(x, near.ravel())) > least:
-            return True
-    return False
-
-
-def _departures(x: Array) -> Array:
-    """Distance of every sample from the running median, which goes on straight at the ends."""
+def _deviations(x: Array) -> Array:
+    """Distance of every sample from the running median, extrapolated linearly at the ends."""
     if x.size < WINDOW:
         return np.abs(x - np.median(x)) if x.size else x
     half, course = WINDOW // 2, x.copy()
@@ -135,27 +98,25 @@ def _departures(x: Array) -> Array:
     return np.abs(x - course)
 
 
-def _wild(parts: Sequence[Array]) -> list[np.ndarray]:
-    """Tell which samples of every experiment are wild, among those of all experiments together."""
+def _outlying(parts: Sequence[Array]) -> list[np.ndarray]:
+    """Mark the outliers of every experiment, by the deviations of all experiments together."""
     none = [np.zeros(x.size, dtype=bool) for x in parts]
-    if not _may_hold(parts):
-        return none
-    d = np.concatenate([_departures(x) for x in parts])
+    d = np.concatenate([_deviations(x) for x in parts])
     edges = np.cumsum([x.size for x in parts])[:-1]
     if d.size < LEAST_SAMPLES:
         return none
-    below = min(max(d.size // 12, 20), 1000)  # departures that tell the steepness of the tail
+    below = min(max(d.size // 12, 20), 1000)  # deviations from which the steepness of the tail is estimated
     count = int(MOST * d.size) + below + 1
     middle, fifth = d.size // 2, int(0.8 * d.size)
     ordered = np.partition(d, np.unique([middle, fifth, d.size - count]))
     scale = max(float(ordered[middle]) / NORMAL_MEDIAN, float(ordered[fifth]) / 1.2816)
     top = ordered[d.size - count :]
     if scale <= 8 * np.finfo(float).eps * max(float(np.max(np.abs(x), initial=0.0)) for x in parts):
-        return none  # at rest but for pulses: they are the signal
+        return none  # constant but for pulses: they are the signal
     if not np.max(top) > FAR * scale:
         return none
     top = np.sort(top)[::-1]
-    for k in _splits(top / scale, d.size, below):  # a split that parts no isolated readings may hide one that does
+    for k in _splits(top / scale, d.size, below):
         size = float(top[k - 1]) / STEP
         found = [_isolated(x, mask, size) for x, mask in zip(parts, np.split(d >= top[k - 1], edges))]
         steps = sum(int(np.count_nonzero(np.abs(np.diff(x[~mask])) > size)) for x, mask in zip(parts, found))
@@ -166,7 +127,7 @@ def _wild(parts: Sequence[Array]) -> list[np.ndarray]:
 
 
 def _splits(top: Array, n: int, below: int) -> np.ndarray:
-    """Return how many of the largest of n departures, in robust standard deviations, may be wild, the most first."""
+    """Return how many of the largest of n deviations, in robust standard deviations, may be outliers, most first."""
     logs = np.log(np.maximum(top, NORMAL_MEDIAN))
     k = np.arange(1, top.size - below)
     sums = np.concatenate([[0.0], np.cumsum(logs)])
@@ -185,7 +146,7 @@ def _splits(top: Array, n: int, below: int) -> np.ndarray:
 
 
 def _isolated(x: Array, mask: np.ndarray, size: float) -> np.ndarray:
-    """Keep the runs of at most `LONGEST` samples whose every sample is off from the sound ones before and behind."""
+    """Keep the runs of at most `LONGEST` samples that all differ from the other samples before and behind."""
     found, sound, at = np.zeros_like(mask), np.flatnonzero(~mask), np.flatnonzero(mask)
     if not sound.size:
         return found

@@ -1,4 +1,4 @@
-"""What a fit estimated, as a table: estimates with standard errors and intervals, and information criteria."""
+"""Estimated parameters as a table, with standard errors and intervals, and information criteria."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from optid.registry import Rendered
 
 
 class Parameter(NamedTuple):
-    """An estimate; NaN stands for an error or an interval that is not known."""
+    """An estimate; an unknown error or interval is NaN."""
 
     name: str
     estimate: float
@@ -24,9 +24,9 @@ class Parameter(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Parameters(Rendered, Sequence):
-    """Estimated parameters in their order, by place or by name: ``fit.params["a1"].estimate``.
+    """Estimated parameters in their order, by position or by name: ``fit.params["a1"].estimate``.
 
-    An interval contains the truth with probability `level`; the reason says why there are no standard errors.
+    An interval contains the truth with probability `level`; without standard errors `reason` is the reason.
     """
 
     rows: tuple[Parameter, ...]
@@ -40,7 +40,7 @@ class Parameters(Rendered, Sequence):
         return iter(self.rows)
 
     def __getitem__(self, key: Any) -> Any:
-        """Return the parameter of a name, or those at a place or slice; another name raises `LookupFailed`."""
+        """Return the parameter of a name, position or slice; an unknown name is a `LookupFailed`."""
         if not isinstance(key, str):
             return self.rows[key]
         for row in self.rows:
@@ -68,8 +68,7 @@ class Parameters(Rendered, Sequence):
 def parameters(fit: Any, level: float = 0.95) -> Parameters:
     """Return the parameters of a fit with intervals of a level: coefficients, then those of its static functions.
 
-    The matrices of a state-space model depend on the choice of its states; their place is taken by poles and static
-    gain where these have intervals.
+    Of a state-space model, whose matrices depend on the choice of the states, these are poles and static gain.
     """
     check_probability(level, "level")
     try:
@@ -97,10 +96,9 @@ def function_parameters(function: StaticFunction, known: Any) -> list[Parameter]
 
 
 def criteria(fit: Any) -> tuple[float, float]:
-    """Return AIC and BIC of a fit: minus twice the log likelihood of its one-step errors, plus the price of parameters.
+    """Return AIC and BIC of a fit, from the Gaussian likelihood of its one-step errors.
 
-    The errors count as Gaussian with the covariance they have; samples with a missing output are left out. A stream,
-    whose samples are gone, or fewer errors than outputs are a `DataError`.
+    Samples with a missing output are left out. A stream, or no more errors than outputs, is a `DataError`.
     """
     errors = np.vstack(fit.residuals if isinstance(fit.residuals, tuple) else (fit.residuals,))
     errors = errors[np.isfinite(errors).all(axis=1)]

@@ -25,12 +25,10 @@ from optid.program.program import Program
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.unknowns import Unknowns
 
-# singular value of the scaled sensitivities, relative to the largest, below which parameters cannot be told apart
-NO_EFFECT = 1e-7
+NO_EFFECT = 1e-7  # relative singular value of the scaled sensitivities below which parameters are not identifiable
 BINDING = 1e-6  # slack of a constraint, relative to the largest, below which it binds
 NAMED = 0.1  # share of the largest entry of a direction without effect from which on a parameter is named
-# errors and sensitivities, relative to the spread of the output, beyond which a run does not count as finite
-WILD = 1e50
+LIMIT = 1e50  # errors and sensitivities, relative to the spread of the output, beyond which a run is not finite
 FLOOR = 1e-14  # share of the energy of an output below which its errors are rounding
 SPREAD = 4.0  # factor by which random starts differ from the given one at most
 
@@ -57,16 +55,16 @@ class PhysicalErrors(Criterion):
     """The weighted simulation errors of equations on a record."""
 
     data: Data  # the record in raw units; no input is missing
-    equations: Equations  # the user's
+    equations: Equations
     weight: Array  # (l, l) diagonal weight of the errors
     usual: Array = field(repr=False)  # sizes of the states, then of the parameters
     gauge: ClassVar[str] = "none"  # pyright: ignore[reportIncompatibleVariableOverride]
 
     @classmethod
     def of(cls, data: Data, equations: Equations) -> "PhysicalErrors":
-        """Prepare a record; states and parameters are measured by their starts.
+        """Prepare a record; states and parameters are scaled by their starts.
 
-        Equations that cannot be read, or that have names of channels, raise a `StructureError`.
+        A state or parameter with the name of a channel is a `StructureError`.
         """
         raw = data.raw()
         for name in {*equations.states, *equations.parameters} & {*raw.inputs, *raw.outputs}:
@@ -86,7 +84,7 @@ class PhysicalErrors(Criterion):
 
     @cached_property
     def places(self) -> Places:
-        """Where named variables stand among the unknowns."""
+        """Positions of the named variables among the unknowns."""
         return Places.of(self)
 
     @cached_property
@@ -110,7 +108,7 @@ class PhysicalErrors(Criterion):
 
     @cached_property
     def measured(self) -> dict[str, int]:
-        """States that an output shows as they are, with its position."""
+        """States that are measured directly, with the position of the output."""
         by_id = {state.id: state.name() for state in self._scalars[0]}
         return {by_id[one.id]: o for o, name in enumerate(self.data.outputs)
                 if (one := self._evaluated[name]) is not None and getattr(one, "id", None) in by_id}
@@ -124,7 +122,7 @@ class PhysicalErrors(Criterion):
 
     @cached_property
     def runs(self) -> Runs:
-        """What runs the equations."""
+        """The simulator of the equations."""
         return Runs.of(self.code, self.bounds, self.steps, self.equations.hold, self.data.dt)
 
     @property
@@ -133,7 +131,7 @@ class PhysicalErrors(Criterion):
         return tuple(self.equations.interval(name) for name in self.equations.states)
 
     def in_words(self) -> tuple[str, ...]:
-        """Return the equations in words."""
+        """Return the equations as text."""
         following = "d{}/dt" if self.steps else "{}(k+1)"
         return tuple(f"{following.format(name) if name in self.equations.states else name} = {_in_words(expression)}"
                      for name, expression in self._evaluated.items())
@@ -163,11 +161,11 @@ class PhysicalErrors(Criterion):
                 for e, state in zip(self.data.experiments, states)]
 
     def gauge_rows(self, x: Array) -> Array:
-        """Return no directions: every one is meant to have an effect."""
+        """Return no directions."""
         return np.zeros((0, self.unknowns.shared))
 
     def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
-        """Return what yields the weighted rows [x0 | parameters | errors] of an experiment, zero where y is missing."""
+        """Return a generator of weighted rows [x0 | parameters | errors] of experiment i, zero if y is missing."""
         p, states = self.split(x)
         weigh = np.sqrt(np.diag(self.weight))
 
@@ -186,23 +184,23 @@ class PhysicalErrors(Criterion):
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x; of infinite size where they or their sensitivities are not finite."""
-        unknowns, blocks, wild = self.unknowns, self.blocks(x), []
+        unknowns, blocks, infinite = self.unknowns, self.blocks(x), []
 
-        def finite(i: int) -> Iterator[tuple[Array, int]]:
+        def bounded(i: int) -> Iterator[tuple[Array, int]]:
             for rows, count in blocks(i):
-                tame = np.abs(rows) < WILD
-                wild.extend([i] * (not tame.all()))
-                yield np.where(tame, rows, 0.0), count
+                finite = np.abs(rows) < LIMIT
+                infinite.extend([i] * (not finite.all()))
+                yield np.where(finite, rows, 0.0), count
 
-        found = linearised(finite, unknowns.experiments, unknowns.n, unknowns.shared, method=method)
-        return replace(found, remainder=np.inf) if wild else found
+        found = linearised(bounded, unknowns.experiments, unknowns.n, unknowns.shared, method=method)
+        return replace(found, remainder=np.inf) if infinite else found
 
     def value(self, x: Array) -> float:
         """Return the weighted sum of squared errors."""
         errors = np.vstack(self.residuals(x)) * np.sqrt(np.diag(self.weight))
         there = np.isfinite(np.vstack([e.y for e in self.data.experiments]))
         used = np.where(there, errors, 0.0)
-        return float(np.sum(used**2)) if np.all(np.abs(used) < WILD) else np.inf
+        return float(np.sum(used**2)) if np.all(np.abs(used) < LIMIT) else np.inf
 
     def admissible(self, x: Array) -> bool:
         """Whether the parameters are within their bounds."""
@@ -213,12 +211,12 @@ class PhysicalErrors(Criterion):
             for low, high in [self.equations.interval(name)])
 
     def key(self, name: str, number: int) -> str:
-        """Name a parameter: its own name is made of both."""
+        """Return the name of a parameter that ends in a number."""
         return f"{name}{number}"
 
     @property
     def unit(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What one unit of the weighted errors is in squared units of the output; one where there are several."""
+        """One unit of the weighted errors in squared units of the output; one for several outputs."""
         return float(1 / self.weight[0, 0]) if self.data.l == 1 else 1.0
 
     def reweighted(self, x: Array) -> "PhysicalErrors":
@@ -243,7 +241,7 @@ class PhysicalErrors(Criterion):
     # -- starts --------------------------------------------------------------------------------------------------
 
     def starts(self, count: int, seed: int) -> Iterator[tuple[str, Array]]:
-        """Yield named points to descend from: the one given, then random parameters within their bounds."""
+        """Yield named starts: the one given, then random parameters within their bounds."""
         given, rng = np.array(list(self.equations.parameters.values()), dtype=float), np.random.default_rng(seed)
         low, high = np.array([self.equations.interval(name) for name in self.equations.parameters]).T
         n, states = self.unknowns.n, np.array(list(self.equations.states.values()), dtype=float)
@@ -259,7 +257,7 @@ class PhysicalErrors(Criterion):
     def course(self, i: int) -> Array:
         """Return states (N, n) of an experiment to start from: measured, simulated, or as given, within their bounds.
 
-        An equation that has no value there, such as the root of a negative number, raises a `StructureError`.
+        An equation without a value there, such as the root of a negative number, is a `StructureError`.
         """
         e, states = self.data.experiments[i], self.equations.states
         given = np.array(list(states.values()), dtype=float)
@@ -286,7 +284,7 @@ class PhysicalErrors(Criterion):
 
 
 def _in_words(expression: Any) -> str:
-    """Write an expression of scalars as one writes it by hand."""
+    """Return an expression of scalars in mathematical notation."""
     name, args = type(expression).__name__, getattr(expression, "args", ())
     if not args or name not in ("AddExpression", "NegExpression", "multiply", "MulExpression", "Power", "PowerApprox"):
         return str(expression)
@@ -304,7 +302,7 @@ def _in_words(expression: Any) -> str:
 
 
 class CompressedPhysical(CompressedStates):
-    """The errors at the optimum, from when `settle` has been told of it."""
+    """The errors at the optimum, once `settle` was called."""
 
     criterion: PhysicalErrors  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -312,21 +310,21 @@ class CompressedPhysical(CompressedStates):
         self.criterion, self.outward = errors, Transform.identity(errors.data.m, errors.data.l)
 
     def settle(self, program: Program) -> None:
-        """Linearise the errors where the variables of the programme stand; refuse a run that explodes there."""
+        """Linearise the errors at the values of the variables; a run that diverges there is a `StructureError`."""
         super().settle(program)
         if not np.isfinite(self.at.value):
             names, (p, _) = self.criterion.unknowns.names, self.criterion.split(self.reference)
             at = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, p))
-            raise StructureError(f"the run of the equations, or its slope, leaves the range of numbers where the "
-                                 f"solver ended: {at}. Start parameters nearer to the truth, or bound them")
+            raise StructureError(f"the run of the equations, or its slope, leaves the range of numbers at the solution "
+                                 f"of the solver: {at}. Give better starts of the parameters, or bounds")
 
     def spread(self, z: Array, moves: Array) -> Spread:
-        """Return the scatter, which may be coloured, with the noise in units of the objective."""
+        """Return the scatter, with the noise in units of the objective."""
         found = super().spread(z, moves)
         return replace(found, noise=found.noise / self.criterion.unit)
 
     def refuse_undetermined(self, program: Program) -> None:
-        """Refuse what neither the record nor binding constraints determine (`RankError`)."""
+        """Refuse parameters that neither the record nor binding constraints determine (`RankError`)."""
         equal, above, slack = constraint_rows(program, tuple(self.places.names))
         rows = np.vstack([equal, above[slack <= BINDING * (1 + np.abs(slack).max(initial=0.0))]])
         matrix, errors = self.at.whole[0], self.criterion

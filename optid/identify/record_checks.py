@@ -1,4 +1,4 @@
-"""Examine a record before solving: what makes the answer meaningless is an error, what weakens it a warning."""
+"""Checks of a record before solving: a property that invalidates the result is an error, a weakness a warning."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -17,19 +17,19 @@ from optid.identify.outliers import find_outliers
 LEAST_KEPT = 0.5
 FEW_DIGITS = 8.0  # beside the level of an output
 NAMED = 5  # samples that a finding names
-EXAMINED = "wild readings"  # of the figures of a fit with a robust loss
-BY_RESIDUALS = "readings wild by their residuals"
+EXAMINED = "outliers"  # of the figures of a fit with a robust loss
+BY_RESIDUALS = "outliers by the residuals"
 BLOCK_ROWS = 10  # of a subspace method that chooses them itself
 
 
 def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | None = None) -> list[str]:
-    """Return what weakens an answer, one sentence each, and issue every sentence as a `DataWarning`, too.
+    """Return the weaknesses of a record, one sentence each, and issue every sentence as a `DataWarning`.
 
     Args:
         data: the record.
         bases: one fitted basis per input.
-        arguments: of the formulation; its lags (nb, or block_rows of a subspace method) are held against the spectral
-            lines of the inputs. A tolerance among them says that a singular regressor is wanted: it is then a warning.
+        arguments: of the formulation; its lags (nb, or block_rows of a subspace method) are compared with the spectral
+            lines of the inputs. With a tolerance among them a singular regressor is only a warning.
 
     Raises:
         DataError: a constant or missing channel, too few levels to determine the basis, or too few spectral lines to
@@ -55,20 +55,19 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
         digits = -np.log10(np.finfo(float).eps * max(level / size, 1.0))
         if digits < FEW_DIGITS:
             found.append(f"output {name!r} varies by {size:.1e} around {level:.1e}, which leaves {digits:.1f} decimal "
-                         "digits of its variation: no result is more accurate; record it about its level")
+                         "digits of its variation: record it relative to its level")
     return _warned(found)
 
 
 def examine_figures(figures: Mapping[str, Any]) -> list[str]:
-    """Say how the compressed problem stands, and which readings a robust loss has left out by their residuals.
+    """Return findings about the figures of a fit: conditioning, rows lost, and outliers left out by a robust loss.
 
-    The figures are those of a fit, as far as they are there: rows used, the candidates there would be without missing
-    samples, estimated condition number of the column-scaled expanded regressor, and that of R11, the regressors of a
-    subspace method projected on its instruments.
+    The figures, where present, are the rows used, the `candidates` without missing samples, the condition number of the
+    column-scaled expanded regressor, and that of R11, the regressors of a subspace method projected on its instruments.
     """
     checks = {"condition": check_condition, "condition of R11": check_instruments}
     found = [sentence for key in checks if key in figures for sentence in _sentences(checks[key](figures[key]))]
-    found += [f"{key}, {samples}, were left out with every row that holds one"
+    found += [f"{key}, {samples}, were left out with every row that contains one"
               for key, samples in figures.items() if key.startswith(BY_RESIDUALS)]
     found = _warned(found)
     rows, candidates = figures.get("rows", 0), figures.get("candidates", 0)
@@ -78,12 +77,12 @@ def examine_figures(figures: Mapping[str, Any]) -> list[str]:
 
 
 def list_outside(role: str, name: str, share: float, basis: Basis) -> list[str]:
-    """Say which share of the samples of a channel lies outside the interval of its basis; nothing where none does."""
+    """Return a finding about the share of the samples of a channel outside the interval of its basis, if any."""
     if not share or basis.interval is None:
         return []
     low, high = basis.interval
-    return [f"{100 * share:.2g} % of {role} {name!r} lies outside the interval [{low:g}, {high:g}] of its basis; there "
-            f"the basis is set to {basis.outside!r}"]
+    return [f"{100 * share:.2g} % of {role} {name!r} lies outside the interval [{low:g}, {high:g}] of its basis, where "
+            f"outside={basis.outside!r} applies"]
 
 
 def list_samples(found: Sequence[np.ndarray]) -> str:
@@ -94,39 +93,36 @@ def list_samples(found: Sequence[np.ndarray]) -> str:
 
 
 def _sentences(check: Check) -> list[str]:
-    """Return the sentence of a warning, nothing of what is fine; an error is raised."""
+    """Return the sentence of a warning; raise an error."""
     if check.severity == "error":
         raise DataError(check.sentence)
     return [check.sentence] if check.severity == "warning" else []
 
 
 def _warned(found: list[str]) -> list[str]:
-    """Issue every sentence as a warning, too."""
     for sentence in found:
         warnings.warn(sentence, DataWarning, stacklevel=5)
     return found
 
 
 def _present(role: str, name: str, records: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the samples of a channel that are present; there must be two different ones."""
+    """Return the samples of a channel that are present, at least two different ones."""
     x = np.concatenate(records)
     missing = np.isnan(x)
     x = x[~missing] if missing.any() else x
     if x.size == 0:
-        raise DataError(f"{role} {name!r} has no sample at all; choose another column or drop the {role}")
+        raise DataError(f"{role} {name!r} has no samples; choose another column or drop the {role}")
     width = np.ptp(x)
     if width == 0:
-        remedy = ("nothing can be identified from it; excite the input or drop the channel" if role == "input" else
-                  "there is nothing to explain; check the column")
-        raise DataError(f"{role} {name!r} is constant ({x[0]:g}): {remedy}")
+        raise DataError(f"{role} {name!r} is constant ({x[0]:g}): check the column, or drop the channel")
     if width < 1 / LARGEST:
-        raise DataError(f"{role} {name!r} varies by {width:.1e}, whose square is zero in floating point: give it "
-                        "in another unit")
+        raise DataError(f"{role} {name!r} varies by {width:.1e}, whose square is zero in floating point: change its "
+                        "unit")
     return x
 
 
 def _lags(arguments: Mapping[str, Any], c: int) -> int | None:
-    """Number of lags at which the functions of input c are regressors, as far as the arguments tell."""
+    """Number of lags at which the functions of input c are regressors, None where the arguments do not contain it."""
     given, nx = arguments.get("block_rows", arguments.get("nb")), arguments.get("nx")
     if "block_rows" in arguments and given is None:
         given = max(BLOCK_ROWS, 2 * nx if isinstance(nx, int) else 0)
@@ -143,10 +139,9 @@ def _outliers(role: str, name: str, records: Sequence[np.ndarray], arguments: Ma
     loss = str(arguments.get("loss", "")).partition(":")[0]
     advice = f"mark {'it' if count == 1 else 'them'} as missing (NaN)"
     if role == "output" and loss in ("huber", "l1"):
-        advice = f"loss={loss!r} leaves out every row that holds one, as output or as past output"
+        advice = f"loss={loss!r} leaves out every row that contains one, as output or as past output"
     elif role == "output" and loss:
-        advice += ", or use loss='huber', which leaves out every row that holds one"
+        advice += ", or use loss='huber', which leaves out every row that contains one"
     else:
         advice = f"check the record and {advice}"
-    return [f"{'1 reading' if count == 1 else f'{count} readings'} of {role} {name!r} ({list_samples(found)}) "
-            f"{'is' if count == 1 else 'are'} wild, isolated and far off the others: {advice}"]
+    return [f"{count} outlier{'s' * (count > 1)} in {role} {name!r} ({list_samples(found)}): {advice}"]

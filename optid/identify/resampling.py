@@ -1,9 +1,8 @@
 """Intervals from refits: the residual bootstrap of an ARX model.
 
-The outputs are simulated again from the fitted model with its own residuals drawn with replacement, and every record so
-made is fitted with the same formulation, penalties and constraints (Efron and Tibshirani, An Introduction to the
-Bootstrap, 1993, chapters 8 and 13). It needs no linearisation and no least squares, so it also serves robust losses
-and curved constraints, at the price of as many fits.
+The outputs are simulated by the fitted model with its residuals drawn with replacement, and every such record is fitted
+with the same formulation, penalties and constraints (Efron and Tibshirani, An Introduction to the Bootstrap, 1993,
+chapters 8 and 13). Without a linearisation, it also applies to robust losses and curved constraints.
 """
 
 import warnings
@@ -25,16 +24,16 @@ from optid.models.functions import free_parameters
 from optid.models.recursions import autoregression
 from optid.progress import track
 
-FAILED = 0.1  # share of refits without a point above which the user is told
+FAILED = 0.1  # share of refits without a point above which a warning is given
 
 
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
-    """The outcome of a residual bootstrap; its intervals are quantiles of the refits, ``percentile.source.models``.
+    """The result of a residual bootstrap; its intervals are quantiles of the refits, ``percentile.source.models``.
 
     Attributes:
-        basic: the same reflected at the estimate, which undoes a bias instead of doubling it.
-        failed: refits that gave no point.
+        basic: the same reflected at the estimate, which corrects a bias.
+        failed: refits without a point.
     """
 
     percentile: Uncertainty
@@ -46,8 +45,8 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
     """Refit to records simulated with resampled residuals.
 
     Rows of residuals are drawn together for all outputs, centred and inflated by the degrees of freedom. The first
-    samples of every experiment and the pattern of missing samples are those of the record; where an input is missing
-    the simulation interpolates it, and the rows it touches stay out of the refits.
+    samples of every experiment and the missing samples are those of the record; missing inputs are interpolated in the
+    simulation only.
 
     Args:
         fit: a fit to a record in memory.
@@ -57,8 +56,8 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
         solver: back end of the refits.
 
     Raises:
-        StructureError: a fit to a stream, too few runs, an impossible level.
-        DataError: the fitted model is so unstable that its simulation leaves the range of numbers.
+        StructureError: a fit to a stream, too few runs, an invalid level.
+        DataError: the simulation of the fitted model leaves the range of numbers.
 
     Warns:
         DataWarning: more than a tenth of the refits gave no point.
@@ -73,7 +72,7 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
     check_probability(level, "level")
     models, failed = [], 0
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # they speak of the record and were given at the fit
+        warnings.simplefilter("ignore", DataWarning)  # given at the fit
         for record in track(_records(fit, runs, seed), "bootstrap", runs):
             again = refit(record, fit.formulation, solver=solver, prove=False, raises=False, **fit.arguments)
             if again.model is None:
@@ -81,8 +80,7 @@ def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, sol
             else:
                 models.append(aligned(again.model, fit.model))
     if failed > FAILED * runs:
-        warnings.warn(f"{failed} of {runs} refits gave no point: the intervals rest on the others", DataWarning,
-                      stacklevel=2)
+        warnings.warn(f"{failed} of {runs} refits gave no point and are left out", DataWarning, stacklevel=2)
     if len(models) < 2:
         raise StructureError(f"{failed} of {runs} refits gave no point: there is no scatter to report")
     percentile, basic = (Uncertainty(fit.model, float(level), Refits(fit.model, tuple(models), kind))
@@ -106,7 +104,7 @@ def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
 
 
 def _simulated(model: HammersteinTF, u: Array, y: Array, errors: Array) -> Array:
-    """Outputs of A y = B f(u) + d + errors that start like the record and miss what the record misses."""
+    """Outputs of A y = B f(u) + d + errors with the first and the missing samples of the record."""
     n = model.largest_lag
     u, start = interpolated(u), interpolated(y)[:n]
     right = model.driven(u[n:]) + errors[n:]

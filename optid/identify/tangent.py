@@ -1,8 +1,7 @@
-"""The least-squares problem behind a fit, linearised at its solution in the tangent space of its constraints.
+"""The least-squares problem of a fit, linearised at its solution in the tangent space of its constraints.
 
-A rank-one matrix ``mu bᵀ`` has one scale too many; the gauge of the programme fixes it. The tangent space is what the
-gauge and the user's equalities leave free, in coordinates where the information is the identity. Whatever does not
-depend on the gauge, such as ``mu bᵀ`` or a prediction, then has a covariance that does not depend on it either.
+The tangent space is that of the gauge and the user's equalities, in coordinates where the information is the identity.
+The covariance of gauge-free quantities, such as ``mu bᵀ`` or a prediction, does not depend on the gauge.
 """
 
 from collections.abc import Callable
@@ -39,28 +38,19 @@ Quantity = Callable[[Any], ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """A fit as a local linear regression, the source of intervals that need no refit.
+    """A fit as a local linear regression, the source of intervals without refits."""
 
-    Attributes:
-        rebuild: from the values of the variables, by name, to the model in the units, gauge and signs of the fit.
-        shapes: of the variables of the programme by name, in the order of x.
-        x: (n_x,) solution, every variable flattened column by column.
-        directions: (n_x, n) dx/dv, v the whitened tangent coordinates.
-        local: the estimate in these coordinates.
-        noise: (l, l) covariance of the equation error e, in raw units.
-        meaning: what the intervals are, one of `MEANINGS`.
-    """
-
+    # from the values of the variables, by name, to the model in the units, gauge and signs of the fit
     rebuild: Callable[[dict[str, Array]], Any]
-    shapes: dict[str, tuple[int, ...]]
-    x: Array
-    directions: Array
-    local: LocalEstimate = field(repr=False)
-    noise: Array
-    meaning: str
+    shapes: dict[str, tuple[int, ...]]  # of the variables of the programme by name, in the order of x
+    x: Array  # (n_x,) solution, every variable flattened column by column
+    directions: Array  # (n_x, n) dx/dv, v the whitened tangent coordinates
+    local: LocalEstimate = field(repr=False)  # the estimate in these coordinates
+    noise: Array  # (l, l) covariance of the equation error e, in raw units
+    meaning: str  # of the intervals, one of `MEANINGS`
 
     def __getstate__(self) -> dict[str, Any]:
-        _ = self._neighbours  # what `rebuild`, which holds the programme, is called for
+        _ = self._neighbours  # `rebuild`, which holds the programme, is not needed afterwards
         return {**vars(self), "rebuild": None}
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
@@ -133,7 +123,7 @@ def _unpacked(shapes: dict[str, tuple[int, ...]], x: Array) -> dict[str, Array]:
 
 def _refuse(fit: Any) -> None:
     if not fit.solution.has_point:
-        raise StructureError("the fit has no point, so there is nothing to put intervals around")
+        raise StructureError("the fit has no point, so that there are no intervals")
     if fit.program.compressed is None:
         advice = "; use optid.bootstrap" if fit.model is not None and fit.model.structure == "arx" else ""
         raise StructureError("they follow from compressed least squares, which "

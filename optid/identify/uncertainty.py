@@ -1,10 +1,9 @@
-"""How well a fit knows what it says: standard errors, intervals and bands in the units and gauge of its model.
+"""Standard errors, intervals and bands of a fit, in the units and gauge of its model.
 
-Every quantity, a coefficient or a whole curve, is a function of the model. Its derivative is taken through the model
-itself (unit changes, gauge and rank-one split included), and its error follows from the estimate in the tangent space
-of the rank-one manifold. With inequality constraints in reach the interval is that of `optid.identify.intervals`, which
-keeps its coverage where treating active constraints as equalities loses it. `optid.identify.resampling` offers the
-same quantities from refits.
+Every quantity, a coefficient or a whole curve, is a function of the model, and is differentiated through it (unit
+changes, gauge and rank-one split included); its error follows from the estimate in the tangent space of the rank-one
+manifold. Near inequality constraints the interval is that of `optid.identify.intervals`. `optid.identify.resampling`
+gives the same quantities from refits.
 """
 
 from dataclasses import dataclass, field, replace
@@ -50,7 +49,7 @@ class Refits:
 
     @property
     def meaning(self) -> str:
-        """What the intervals are, in words."""
+        """Description of the intervals."""
         return f"{self.kind} intervals of {len(self.models)} refits to resampled residuals"
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
@@ -78,7 +77,7 @@ class Uncertainty:
 
     @property
     def meaning(self) -> str:
-        """What the intervals are, in words."""
+        """Description of the intervals."""
         return self.source.meaning
 
     def at_level(self, level: float) -> "Uncertainty":
@@ -122,8 +121,8 @@ class Uncertainty:
         Args:
             channel: index of the input, or of the function in its family.
             at: (k,) values of the input; the 201 points of ``basis.grid()`` when not given.
-            offset: include the offset of f where the model knows it (``model.c0``); where it does not, or with False,
-                the band is that of f without constant, which has no width where the basis vanishes.
+            offset: include the offset of f where it is determined (``model.c0``); otherwise the band is that of f
+                without constant, which has no width where the basis vanishes.
             family: "nonlinearities", "feedback" or "latent": functions of inputs, outputs and latent signals.
         """
         model = self.model

@@ -1,4 +1,4 @@
-"""Experiment design: rules an excitation has to obey, the response a record shows, excitations."""
+"""Experiment design: rules of excitation, frequency responses, excitations."""
 
 from optid.identify.design.excitation import Excitation, design
 from optid.identify.design.response import FrequencyResponse, frequency_response

@@ -25,16 +25,14 @@ REFUSED = {"prbs": TWO_LEVELS, "binary": TWO_LEVELS,
            "sinusoid": "a sinusoid through a polynomial of degree p has p harmonics and excites 2 p + 1 regressors"}
 SWEEPS = 4  # sweeps of a chirp
 FAINT = 0.05  # a frequency belongs to the band when its measured gain is above this share of the largest
-TRUSTED = 0.5  # coherence below which the measured gain says more of the disturbance than of the plant
-WANTED, WIDER = 1e4, 1.3  # a band that was not asked for grows by this factor until the condition number is no larger
-BOOST = 4.0
-"""Shaping raises no frequency by more than this factor over another: what is left of a resonance would drown in dead
-zone and noise."""
+TRUSTED = 0.5  # smallest coherence of a frequency in the band
+WANTED, WIDER = 1e4, 1.3  # a band that is not given grows by this factor until the condition number is no larger
+BOOST = 4.0  # largest ratio of the spectral weights of shaping
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """An excitation (N, m) of a kind, read-only, and what may be expected of a record taken with it.
+    """An excitation (N, m) of a kind, read-only, and the expected properties of a record taken with it.
 
     Attributes:
         condition: expected condition number of the windows of the expanded regressor, columns scaled.
@@ -42,8 +40,8 @@ class Excitation:
         functions: signals in the expanded regressor.
         band: lowest and highest frequency aimed at, 1/unit of dt.
         outputs: expected standard deviation of each output.
-        checks: the rules of design, held against this excitation.
-        how: how the condition number was computed.
+        checks: results of the rules of design.
+        how: computation of the condition number.
     """
 
     u: Array
@@ -95,8 +93,8 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         n: samples; as many as the longest experiment of the record when not given.
         levels: number of equally spaced values that each input takes; any value when not given.
         band: lowest and highest frequency (1/unit of dt); when not given, from the lowest line to the last one with a
-            measured gain above 5 % of its largest and a coherence above one half, and further where the lags of slow
-            signals would be too much alike (condition number above 10,000).
+            measured gain above 5 % of its largest and a coherence above one half, wider where the condition number
+            would exceed 10,000.
         amplitude: (low, high) for all inputs or one pair per input; the ranges of the record when not given.
         shaped: weight the spectrum (multisine) or the envelope (chirp) by the inverse of the measured gain, so that the
             outputs move alike at every frequency.
@@ -115,15 +113,14 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         DataError: a record that shows no frequency response.
 
     Warns:
-        DataWarning: an excitation that weakens the answer.
+        DataWarning: a weak excitation.
     """
     _check(kind, band, shaped, candidates=candidates, rows=rows, levels=levels)
     n = max(e.n_samples for e in like.experiments) if n is None else n
     ranges = _ranges(like, amplitude)
     measured = frequency_response(like)
-    # held levels have the spectrum that holding gives them
     limits = (0.0, 0.5 / (hold * like.dt)) if kind == "levels" else _band(band, measured)
-    few = rules.FEW_LEVELS if levels is None else 0  # who asks for a number of levels is not warned of it
+    few = rules.FEW_LEVELS if levels is None else 0  # no warning about a given number of levels
     top = 0.9 * float(measured.frequency[-1])
 
     def weight(c: int, frequency: Array) -> Array:
@@ -162,7 +159,7 @@ def _check(kind: str, band: Any, shaped: bool, **counts: int | None) -> None:
     if kind not in KINDS:
         raise StructureError(f"no excitation {kind!r}. {nearest(kind, KINDS)}")
     if band is not None and kind == "levels":
-        raise StructureError("levels have the band that holding gives them; set hold, or use kind 'noise'.")
+        raise StructureError("the band of levels follows from their holding time; set hold, or use kind 'noise'.")
     if shaped and kind not in ("multisine", "chirp"):
         raise StructureError(f"shaping changes the spectrum of a multisine or the envelope of a chirp, not {kind!r}.")
     for name, value in counts.items():
@@ -175,8 +172,8 @@ def _ranges(like: Data, amplitude: Any) -> list[tuple[float, float]]:
         given = np.transpose(like.ranges()) if amplitude is None else np.asarray(amplitude, dtype=float)
         return [(float(low), float(high)) for low, high in np.broadcast_to(given, (like.m, 2))]
     except (TypeError, ValueError):
-        raise StructureError(f"amplitude = {amplitude!r}: (low, high), or one such pair for each of the {like.m} "
-                             "inputs, is needed.") from None
+        raise StructureError(f"amplitude = {amplitude!r} must be (low, high), or one such pair for each of the "
+                             f"{like.m} inputs.") from None
 
 
 def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tuple[float, float]:
@@ -186,13 +183,13 @@ def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tupl
         f = measured.frequency
         gains = np.stack([measured.gain(f, c) for c in range(measured.response.shape[2])])
         gain = np.max(gains / gains.max(axis=1, keepdims=True), axis=0)
-        heard = (gain > FAINT) & (measured.coherence.max(axis=1) > TRUSTED)
-        if not heard.any():
+        inside = (gain > FAINT) & (measured.coherence.max(axis=1) > TRUSTED)
+        if not inside.any():
             raise DataError("no frequency at which the inputs explain half of the power of an output: the record shows "
                             "no band; give one (band=, --band), or a record with more excitation.")
-        return 0.0, float(min(f[np.flatnonzero(heard)[-1]], 0.9 * top))
+        return 0.0, float(min(f[np.flatnonzero(inside)[-1]], 0.9 * top))
     if len(band) != 2 or not 0 <= band[0] < band[1] <= top:
-        raise StructureError(f"band = {band}: two rising frequencies from 0 to half the sampling rate, {top:g}.")
+        raise StructureError(f"band = {band} must be two rising frequencies from 0 to half the sampling rate, {top:g}.")
     return float(band[0]), float(band[1])
 
 
@@ -220,7 +217,7 @@ def _signal(kind: str, n: int, span: tuple[float, float], dt: float, band: tuple
 
 def _expected(u: Array, kind: str, like: Data, measured: FrequencyResponse, band: tuple[float, float], basis: Bases,
               feedback_basis: FeedbackBases, rows: int, few: int, seed: int) -> Excitation:
-    """Predict what a record taken with u (N, m) would be like and hold it against the rules."""
+    """Predict a record taken with u (N, m) and check it by the rules."""
     y = _predicted(u, like, measured, seed)
     record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
     with warnings.catch_warnings():
@@ -232,7 +229,7 @@ def _expected(u: Array, kind: str, like: Data, measured: FrequencyResponse, band
               *(rules.check_lines(name, [x], one, rows) for name, x, one in channels),
               *(rules.check_feedback(like.outputs[family.output], family.share) for family in expansion.feedback),
               rules.check_condition(condition))
-    how = "from the designed signal itself, which the plant does not change"
+    how = "from the designed signal"
     if expansion.feedback:
         how = (f"from the designed signal and outputs predicted through the frequency response of "
                f"{like.name or 'the record'} ({measured.segments} segments) with its disturbance; a plant that is far "

@@ -1,4 +1,4 @@
-"""The frequency response a record shows, nonlinear plant or not: the best linear approximation for that excitation."""
+"""The frequency response of a record: the best linear approximation for its excitation."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from optid.arrays import Array, check_integer
 from optid.data.record import Data
 from optid.errors import DataError
 
-SILENT = 1e-4  # input power, relative to its largest over frequency, below which nothing is read off
+SILENT = 1e-4  # input power, relative to its largest over frequency, below which there is no estimate
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,25 +38,20 @@ class FrequencyResponse:
         return found
 
     def gain(self, frequency: Array, c: int) -> Array:
-        """Return how strongly input c moves the outputs at some frequencies (K,), each relative to its largest.
-
-        The root mean square over the outputs of |G| / max |G|.
-        """
+        """Return the root mean square over the outputs of |G| / max |G| of input c at some frequencies (K,)."""
         largest = np.nanmax(np.abs(self.response[:, :, c]), axis=0)
         return np.sqrt(np.mean((np.abs(self.at(frequency)[:, :, c]) / largest) ** 2, axis=1))
 
 
 def frequency_response(data: Data, segment: int | None = None) -> FrequencyResponse:
-    """Measure the frequency response by averaged spectra (Welch 1967; Bendat and Piersol, Random Data, for coherence).
+    """Measure the frequency response G = S_yu S_uu^-1 by averaged spectra (Welch 1967; Bendat and Piersol).
 
-    Hann windows that overlap by half; segments that touch a missing sample are left out; experiments are averaged.
-    G = S_yu S_uu^-1 at every frequency. A segment has a quarter of the samples of the longest experiment when it is not
-    given (less with four inputs or more), and at least 32. Resonances narrower than its inverse are flattened, and
-    leave disturbance behind.
+    Hann windows overlap by half; segments with a missing sample are left out; experiments are averaged. By default a
+    segment has a quarter of the samples of the longest experiment (less with four inputs or more), at least 32.
 
     Raises:
         StructureError: a segment of fewer than 8 samples.
-        DataError: fewer than 2 m complete segments, or inputs that cannot be told apart at any frequency.
+        DataError: fewer than 2 m complete segments, or inputs that are collinear at every frequency.
     """
     longest = max(e.n_samples for e in data.experiments)
     size = max(32, longest // max(4, data.m + 1)) if segment is None else check_integer(segment, "segment", 8)
@@ -73,19 +68,19 @@ def frequency_response(data: Data, segment: int | None = None) -> FrequencyRespo
             sums += spectrum[:, :, None] * np.conj(spectrum[:, None, :])
             count += 1
     if count < 2 * m:
-        raise DataError(f"{count} complete segments of {size} samples: at least {2 * m} are needed for {m} inputs. "
-                        "Use a longer record without gaps or a smaller segment.")
+        raise DataError(f"{count} complete segments of {size} samples, fewer than {2 * m} for {m} inputs: use a longer "
+                        "record without gaps or a smaller segment.")
     spectra = sums[1:] * (2 * data.dt / (count * np.sum(window**2)))
     frequency = np.arange(1, size // 2 + 1) / (size * data.dt)
     uu, yu = spectra[:, :m, :m], spectra[:, m:, :m]
     yy = np.real(np.diagonal(spectra[:, m:, m:], axis1=1, axis2=2))
     power = np.real(np.diagonal(uu, axis1=1, axis2=2))
-    heard = np.flatnonzero((power > SILENT * power.max(axis=0)).all(axis=1))
-    scale = np.sqrt(power[heard])
-    values = np.linalg.svd(uu[heard] / (scale[:, :, None] * scale[:, None, :]), compute_uv=False)
-    k = heard[values[:, 0] < 1e6 * values[:, -1]]  # where every input has power of its own
+    excited = np.flatnonzero((power > SILENT * power.max(axis=0)).all(axis=1))
+    scale = np.sqrt(power[excited])
+    values = np.linalg.svd(uu[excited] / (scale[:, :, None] * scale[:, None, :]), compute_uv=False)
+    k = excited[values[:, 0] < 1e6 * values[:, -1]]  # where the inputs are not collinear
     if not k.size:
-        raise DataError("the inputs cannot be told apart at any frequency: they are collinear or hardly move.")
+        raise DataError("the inputs are collinear or without power at every frequency.")
     response = np.full((frequency.size, l, m), np.nan, dtype=complex)
     coherence, disturbance = np.zeros((frequency.size, l)), yy.copy()
     response[k] = np.linalg.solve(uu[k].swapaxes(1, 2), yu[k].swapaxes(1, 2)).swapaxes(1, 2)

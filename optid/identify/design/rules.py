@@ -1,7 +1,6 @@
-"""The rules of experiment design as checks of a record: each has the number, the limit and the remedy.
+"""The rules of experiment design as checks of a record or an excitation: each has the number, the limit and the remedy.
 
-They hold for the record to be fitted and for the excitation to be applied alike. What makes the answer meaningless is
-an error, what weakens it a warning.
+What invalidates the result is an error, a weakness a warning.
 """
 
 from collections.abc import Sequence
@@ -22,18 +21,14 @@ FEW_LEVELS = 20  # below this many distinct values a curve between them is inter
 HIDDEN, DOMINANT = 1e-3, 1e-2  # share of the variance beside a few sinusoids: noise on a singular record, or weak
 WORST_CONDITION = 1e7  # condition number beyond which the estimates keep less than half of their digits
 
-LONGEST = 4096  # samples looked at; more would tell nothing new about a few lines
-LOBE = 5  # bins that hold a line: all but a thousandth of it, after a Hann window
-JOINT, STEPS = 6, 3
-"""The first few frequencies are refined together after each new one, so many times; later ones stay where they are."""
+LONGEST = 4096  # samples of an experiment that are used
+LOBE = 5  # bins of a line after a Hann window, all but a thousandth of its power
+JOINT, STEPS = 6, 3  # frequencies that are refined together after each new one, and steps
 
 
 @dataclass(frozen=True)
 class Check:
-    """What one rule says of one channel or record: the number that was measured, the finding with its remedy.
-
-    The rules are "levels", "lines", "feedback", "excitation" and "instruments".
-    """
+    """The result of a rule, "levels", "lines", "feedback", "excitation" or "instruments": number, finding, remedy."""
 
     rule: str
     number: float
@@ -45,10 +40,10 @@ class Check:
 
 
 def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Check:
-    """Hold the number of distinct values of an input (N,), none missing, against the functions of its fitted basis.
+    """Compare the number of distinct values of an input (N,), none missing, with the functions of its fitted basis.
 
-    n levels determine n - 1 functions besides the constant; a binary signal shows a straight line whatever f is. With
-    fewer than `few` the curve between them counts as interpolation.
+    n levels determine n - 1 functions besides the constant. With fewer than `few` the curve between them counts as
+    interpolation.
     """
     severity, sentence = "fine", f"input {name!r} takes many levels"
     levels = count_levels(u[:4096])
@@ -71,17 +66,16 @@ def check_levels(name: str, u: Array, basis: Basis, few: int = FEW_LEVELS) -> Ch
 
 
 def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) -> Check:
-    """Hold the sinusoids that the functions of an input consist of against the regressors they are to excite.
+    """Compare the sinusoids in the functions of an input with the number of regressors.
 
-    A sinusoid through a polynomial of degree p has p harmonics, and L sinusoids excite 2 L + 1 regressors, however
-    many lags there are. Noise and quantisation of the record hide that singularity, they do not cure it.
+    A sinusoid through a polynomial of degree p has p harmonics, and L sinusoids excite 2 L + 1 regressors for any
+    number of lags; the number of the check. Noise and quantisation only hide that singularity.
 
     Args:
         name: of the input.
-        records: (N,) samples per experiment; NaN = missing. The longest stretch of each without one is looked at.
+        records: (N,) samples per experiment; NaN = missing. The longest complete stretch of each is used.
         basis: the fitted basis.
         lags: regressors per function: block rows of a subspace method, coefficients of B of an equation-error one.
-            The number of the check is the regressors excited, by all experiments together at most.
     """
     needed = lags * basis.size
     most = max(1, -(-(needed - 1) // 2) - 1)  # with one line more there are enough
@@ -104,50 +98,43 @@ def check_lines(name: str, records: Sequence[Array], basis: Basis, lags: int) ->
     share = f"{100 * (1 - remaining):.2f} %"
     sentence = (
         f"input {name!r} {kind}: its functions have {lines} spectral lines ({share} of their variance), which excite "
-        f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Noise hides "
-        "this, it does not cure it: add lines (optid design --kind multisine), or use fewer lags or functions")
+        f"{excited} regressors; {needed} are to be determined ({lags} lags of {basis.size} functions). Add lines "
+        "(optid design --kind multisine), or use fewer lags or functions")
     return Check("lines", excited, "error" if remaining <= HIDDEN else "warning", sentence)
 
 
 def check_feedback(name: str, share: float) -> Check:
-    """Hold the share of the spread of feedback functions of an output that is orthogonal to 1 and y against limits.
+    """Check the share of the spread of feedback functions of an output that is orthogonal to 1 and y.
 
-    A linear feedback cannot be told from the dynamics: (A, B, linear part of E g) and (A - L C, B - L D, that part
-    + L y) behave alike for every L. See `optid.statistics.expansion.Feedback.share`.
+    A linear feedback is not distinguishable from the dynamics: (A, B, linear part of E g) and (A - L C, B - L D, that
+    part + L y) are equivalent for every L. See `optid.statistics.expansion.Feedback.share`.
     """
     severity, remedy = "fine", ""
     if share < LINEAR:
-        severity, remedy = "error", (": no feedback can be told from the dynamics. Leave the feedback basis out, or "
-                                     "excite larger amplitudes")
+        severity, remedy = "error", (": the feedback is not distinguishable from the dynamics. Leave the feedback "
+                                     "basis out, or excite larger amplitudes")
     elif share < NEARLY_LINEAR:
-        severity, remedy = "warning", (": little beside the noise. Excite larger amplitudes, or leave the feedback "
-                                       "basis out")
+        severity, remedy = "warning", ". Excite larger amplitudes, or leave the feedback basis out"
     return Check("feedback", share, severity, f"{100 * share:.2g} % of the spread of the functions of output {name!r} "
                                               f"is not linear in the outputs{remedy}")
 
 
 def check_condition(number: float) -> Check:
-    """Hold the condition number of the expanded regressor (columns scaled) against what leaves half of the digits.
-
-    Persistent excitation is required of the functions of inputs and outputs at all lags, not of the input. The number
-    is inf where they are singular.
-    """
-    return _held("excitation", number, "condition number of the expanded regressor: ",
-                 f"the expanded regressor is poorly excited: condition number {number:.1e}; use fewer functions or "
-                 "lags, or a richer input")
+    """Check the condition number of the expanded regressor (columns scaled), inf where it is singular."""
+    return _conditioned("excitation", number, "condition number of the expanded regressor: ",
+                        f"the expanded regressor is poorly excited: condition number {number:.1e}; use fewer functions "
+                        "or lags, or a richer input")
 
 
 def check_instruments(number: float) -> Check:
-    """Hold the condition number of R11, the regressors projected on the instruments, against the same limit.
-
-    With instruments that do not reach the regressors it grows with the root of the number of samples.
-    """
-    return _held("instruments", number, "cond(R11) = ",
-                 f"the instruments hardly reach the regressors: cond(R11) = {number:.1e}. Use augmented instruments "
-                 "(hammerstein_ss.asivid), fewer block rows or functions, or an input with more lines and levels")
+    """Check the condition number of R11, the regressors projected on the instruments."""
+    return _conditioned("instruments", number, "cond(R11) = ",
+                        f"the instruments hardly explain the regressors: cond(R11) = {number:.1e}. Use augmented "
+                        "instruments (hammerstein_ss.asivid), fewer block rows or functions, or an input with more "
+                        "lines and levels")
 
 
-def _held(rule: str, number: float, words: str, warning: str) -> Check:
+def _conditioned(rule: str, number: float, words: str, warning: str) -> Check:
     poor = number > WORST_CONDITION
     return Check(rule, number, "warning" if poor else "fine", warning if poor else f"{words}{number:.2g}")
 
@@ -160,11 +147,10 @@ def many_lines(x: Array, most: int, tolerance: float) -> bool:
 
 
 def remaining_shares(signals: Array, most: int, enough: float) -> Array:
-    """Return the share of variance that 0, 1, 2, ... common sinusoids leave, greedily chosen and fitted jointly.
+    """Return the share of variance (L + 1,) that 0, 1, 2, ... common sinusoids of signals (N, s) do not explain.
 
-    Each step adds the frequency that explains most of what is left of all signals (N, s) together, every one of which
-    counts alike (orthogonal matching pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993), and refines the first few
-    between the bins. The shares (L + 1,) fall, up to L = most sinusoids or a share that is enough.
+    Each step adds the frequency that explains most of the rest of all standardised signals (orthogonal matching
+    pursuit; Pati, Rezaiifar, Krishnaprasad, Asilomar 1993), up to L = most sinusoids or a share that is small enough.
     """
     x = signals - signals.mean(axis=0)
     size = np.linalg.norm(x, axis=0)

@@ -32,26 +32,16 @@ from optid.structures.rank_one import RankOne
 
 @dataclass(frozen=True)
 class EquationError:
-    """Least squares in z, ``‖R z - s‖² + remainder`` with one rank-one block per input, and the names to read it.
+    """Least squares in z, ``‖R z - s‖² + remainder`` with one rank-one block per input, with the names of its parts."""
 
-    Attributes:
-        statistics: of one pass over the record.
-        columns: (n_columns, l) position in z of every coefficient of the regressor.
-        meta: dt, names and units for the model.
-        units: from those of the problem (`optid.program.units`) to those of the record.
-        bases: one per input, in the units of the record.
-        unit: size of one unit of the objective in units of the record.
-        unweighted: statistics of the same rows without weights, where ``statistics`` has weights.
-    """
-
-    statistics: Statistics
+    statistics: Statistics  # of one pass over the record
     problem: RankOne
-    columns: np.ndarray
-    meta: Mapping[str, Any]
-    units: Transform
-    bases: tuple[Basis, ...]
-    unit: float = 1.0
-    unweighted: Statistics | None = None
+    columns: np.ndarray  # (n_columns, l) position in z of every coefficient of the regressor
+    meta: Mapping[str, Any]  # dt, names and units for the model
+    units: Transform  # from those of the problem (`optid.program.units`) to those of the record
+    bases: tuple[Basis, ...]  # one per input, in the units of the record
+    unit: float = 1.0  # size of one unit of the objective in units of the record
+    unweighted: Statistics | None = None  # of the same rows without weights, where ``statistics`` has weights
 
     @property
     def layout(self) -> Layout:
@@ -94,7 +84,7 @@ class EquationError:
         return found
 
     def matrices(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        """Return Theta_c (P_c, nb_c l) of every input, whatever variables the formulation uses."""
+        """Return Theta_c (P_c, nb_c l) of every input, for any variables of a formulation."""
         found = []
         for shape, *keys in zip(self.problem.blocks, *map(self.keys, ("Theta", "mu", "b"))):
             theta, mu, b = (values.get(key) for key in keys)
@@ -104,7 +94,7 @@ class EquationError:
         return found
 
     def lifted(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return z of named values, whatever variables the formulation uses."""
+        """Return z of named values, for any variables of a formulation."""
         parts = [values[name] for name in ("a", "offset") if name in values]
         return np.concatenate([np.ravel(part, order="F") for part in [*parts, *self.matrices(values)]])
 
@@ -114,10 +104,7 @@ class EquationError:
 
     @property
     def energy(self) -> np.ndarray:
-        """Sum of squares (l,) of every output about its mean over the rows used, in the units of the problem.
-
-        A one-step fit of 0 % leaves this much.
-        """
+        """Sum of squares (l,) of every output about its mean over the rows used, in the units of the problem."""
         statistics, n = self.unweighted or self.statistics, self.layout.n_columns
         columns = statistics.root[:, n:]
         return np.sum(columns**2, axis=0) - (statistics.root[:n, n - 1] @ columns[:n]) ** 2 / statistics.rows
@@ -156,7 +143,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
              basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
              weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2, prior: str = "none"
              ) -> EquationError:
-    """Read the record once and return the compressed problem, posed in the record's own units (`optid.program.units`).
+    """Read the record once and return the compressed problem in the record's own units (`optid.program.units`).
 
     Args:
         data: the record.

@@ -2,8 +2,8 @@
 
 The lags of every past output and of every function of every input are a priori normal with covariance c K(decay)
 (Chen, Ohlsson and Ljung, On the estimation of transfer functions, Automatica 48, 2012). The hyperparameters, and the
-variance of the noise, maximise the likelihood of the outputs with all coefficients integrated out; the constant has a
-flat prior. The triangular factor of the record is all that this needs.
+variance of the noise, maximise the marginal likelihood, computed from the triangular factor of the record; the constant
+has a flat prior.
 """
 
 from dataclasses import dataclass
@@ -16,14 +16,10 @@ from optid.arrays import Array
 from optid.models.layout import Layout
 from optid.statistics import Statistics
 
-DECAYS, NOISES = (0.3, 0.6, 0.9), (-4.0, -1.0)
-"""Decays per lag, and logarithms of the noise, from which the likelihood is climbed; from small sizes a climb may end
-where nothing but noise is left."""
-FLOOR = 1e-9  # variance, as a share of the largest, that no coefficient falls below: beyond it K would be singular
+DECAYS, NOISES = (0.3, 0.6, 0.9), (-4.0, -1.0)  # starts: decays per lag, and logarithms of the noise
+FLOOR = 1e-9  # smallest relative variance of a coefficient, so that K is regular
+# of logarithms of variances relative to the output's, decays and correlations
 BOUNDS = {"size": (-25.0, 12.0), "decay": (0.05, 0.998), "correlation": (-0.98, 0.98), "noise": (-30.0, 3.0)}
-"""Of logarithms of variances relative to the output's, decays and correlations."""
-
-
 KERNELS = ("tc", "dc", "ss")
 
 
@@ -51,7 +47,7 @@ class Prior:
     noise: Array
 
     def rows(self, places: np.ndarray) -> Array:
-        """Return the rows that the prior adds to the least squares in z, those of every output below one another.
+        """Return the rows that the prior adds to the least squares in z, output by output.
 
         The places (n_columns, l) are the positions in z of every coefficient of the regressor.
         """
@@ -63,10 +59,7 @@ class Prior:
 
 
 def families(layout: Layout) -> list[list[np.ndarray]]:
-    """Return groups of columns that share hyperparameters, each of arrays of columns lag by lag.
-
-    The past of every output, then the functions of every input.
-    """
+    """Return groups of columns that share hyperparameters, lag by lag: the past of outputs, functions of inputs."""
     found = [[np.arange(layout.na) * layout.l + o] for o in range(layout.l)] if layout.na else []
     for c, (basis, lags) in enumerate(zip(layout.bases, layout.nb)):
         start = layout.block(c).start
@@ -75,7 +68,7 @@ def families(layout: Layout) -> list[list[np.ndarray]]:
 
 
 def likeliest(word: str, statistics: Statistics) -> Prior:
-    """Return the prior of a kernel, one of `KERNELS`, under which the record is most likely."""
+    """Return the prior of a kernel, one of `KERNELS`, with the largest marginal likelihood of the record."""
     from scipy.optimize import minimize
 
     layout, n = statistics.layout, statistics.layout.n_columns

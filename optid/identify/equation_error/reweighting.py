@@ -1,15 +1,14 @@
 """Robust losses as reweighted least squares: every pass is a programme over weighted statistics.
 
-Each pass minimises a quadratic that touches the loss at the residuals of the pass before (majorise-minimise), so the
-loss never rises. For the convex formulations the weighted residuals of the last pass are a dual point, which gives a
-lower bound on the loss itself.
+Each pass minimises a quadratic that majorises the loss at the residuals of the pass before, so the loss never rises.
+For the convex formulations the weighted residuals of the last pass are a dual point, which gives a lower bound on the
+loss itself.
 
-A loss of the residuals bounds the influence of a disturbance, not that of a wrong reading of an output: as a past
-output it spoils the next ``na`` rows, in which it is a leverage point (Hampel et al., Robust Statistics, 1986, section
-6.1; Maronna, Martin and Yohai, Robust Statistics, 2006, section 8.4). Rows that hold a wild reading are therefore left
-out, as if it were missing: those that the examination of the record finds, and those that the residuals of a robust
-fit show. The fit names all of them among its findings and figures. The loss, its bound and the one-step fit are those
-of the rows that are left. ``loss="squares"`` leaves nothing out.
+A robust loss bounds the influence of a disturbance, not that of an outlier in an output: as a past output it is a
+leverage point in the next ``na`` rows (Hampel et al., Robust Statistics, 1986, section 6.1; Maronna, Martin and Yohai,
+Robust Statistics, 2006, section 8.4). Rows that contain an outlier, found in the record or by the residuals of a robust
+fit, are therefore left out, as if it were missing; findings and figures list them. Loss, bound and one-step fit are
+those of the remaining rows. ``loss="squares"`` leaves nothing out.
 """
 
 from collections.abc import Callable, Iterable
@@ -89,7 +88,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
     scale = base.scale  # the weights of a pass are no unit of the data
 
     def weighted(sizes: list[np.ndarray], start: Any) -> tuple[Program, list[np.ndarray]]:
-        """Pose a pass, and return its weights: the answer before is the best start, and no proof belongs to it."""
+        """Return the programme and the weights of a pass, which starts from the solution of the pass before."""
         weights = used.only(_weights(r, kind, width) for r in sizes)
         compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics)
         return replace(pose(compressed), start=start, certify=None, scale=scale), weights
@@ -133,29 +132,28 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
 
 
 class _Rows:
-    """The rows of a record without those that hold a wild reading of an output, now or among its past outputs."""
+    """The rows of a record without those that contain an outlier as output or as past output."""
 
     def __init__(self, data: Data, layout: Layout) -> None:
         self._data, self._layout = data, layout
-        self._wild = [np.zeros(e.y.shape, dtype=bool) for e in data.experiments]
+        self._outliers = [np.zeros(e.y.shape, dtype=bool) for e in data.experiments]
         for o in range(layout.l):
-            for wild, samples in zip(self._wild, find_outliers([e.y[:, o] for e in data.experiments])):
-                wild[samples, o] = True
-        self._examined = [wild.copy() for wild in self._wild]
+            for mask, samples in zip(self._outliers, find_outliers([e.y[:, o] for e in data.experiments])):
+                mask[samples, o] = True
+        self._examined = [mask.copy() for mask in self._outliers]
 
     @property
     def count(self) -> int:
-        """Number of wild readings."""
-        return sum(int(wild.sum()) for wild in self._wild)
+        """Number of outliers."""
+        return sum(int(mask.sum()) for mask in self._outliers)
 
     def only(self, weights: Iterable[np.ndarray]) -> list[np.ndarray]:
         """Return weights with zeros in the rows that do not count."""
         return [w * ~touched for w, touched in zip(weights, self._touched())]
 
     def _touched(self) -> list[np.ndarray]:
-        """Tell the rows whose output, or one of its past outputs, is wild."""
-        return [np.convolve(np.any(wild, axis=1), np.ones(self._layout.na + 1))[: len(wild)] > 0
-                for wild in self._wild]
+        return [np.convolve(np.any(mask, axis=1), np.ones(self._layout.na + 1))[: len(mask)] > 0
+                for mask in self._outliers]
 
     def residuals(self, problem: EquationError, solution: Solution) -> list[np.ndarray]:
         """Return the one-step residuals (N, l), NaN in rows that do not count."""
@@ -165,22 +163,22 @@ class _Rows:
         return errors
 
     def leave_out(self, errors: list[np.ndarray], theta: np.ndarray) -> bool:
-        """Leave out the readings that are wild by these residuals; tell whether there are any."""
+        """Leave out the outliers by these residuals; return whether there are any."""
         na, l = self._layout.na, self._layout.l  # noqa: E741
         spread = np.nanmedian(np.abs(np.concatenate(errors)), axis=0) / NORMAL_MEDIAN
         found = find_additive_outliers(errors, theta[: na * l].reshape(na, l, l), np.maximum(spread, 1e-300))
-        found = [new & ~wild & ~np.isnan(e.y) for new, wild, e in zip(found, self._wild, self._data.experiments)]
+        found = [new & ~mask & ~np.isnan(e.y) for new, mask, e in zip(found, self._outliers, self._data.experiments)]
         more = sum(int(new.sum()) for new in found)
         if not 0 < more <= MOST * self._data.n_samples - self.count:
             return False
-        for wild, new in zip(self._wild, found):
-            wild |= new
+        for mask, new in zip(self._outliers, found):
+            mask |= new
         return True
 
     def figures(self, kind: str, width: float) -> dict[str, Any]:
-        """Return the figures that the fit prints: the threshold of the loss, and the readings left out."""
+        """Return the figures that the fit prints: the threshold of the loss, and the outliers."""
         found: dict[str, Any] = {"threshold of the loss": width} if kind == "huber" else {}
-        by_residuals = [wild & ~known for wild, known in zip(self._wild, self._examined)]
+        by_residuals = [mask & ~known for mask, known in zip(self._outliers, self._examined)]
         for o, name in enumerate(self._layout.outputs):
             for word, masks in ((EXAMINED, self._examined), (BY_RESIDUALS, by_residuals)):
                 samples = [np.flatnonzero(mask[:, o]) for mask in masks]

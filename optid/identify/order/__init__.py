@@ -1,4 +1,4 @@
-"""Orders and lags before a model: singular values and their distribution, criteria, hold-out, scan of lags."""
+"""Estimation of orders and lags: test of singular values, criteria, hold-out, scan of lags."""
 
 from optid.identify.order.lags import Lags, LagScan, scan_lags
 from optid.identify.order.ranks import RankTest, order_test, rank_test

@@ -1,8 +1,8 @@
 """Lags of ARX and Hammerstein-ARX models: every (na, nb, nk) from the statistics of the largest layout.
 
-A smaller layout is a subset of the columns, so its least squares come from the triangular factor of the largest one
-and the record is read once. With a basis, the nonlinearities are taken from the rank-one fit of the largest layout;
-then every lag of an input has one column, f(u(k - lag)), and one coefficient.
+A smaller layout is a subset of the columns: its least squares follow from the triangular factor of the largest one.
+With a basis, the nonlinearities are those of the rank-one fit of the largest layout; every lag of an input then has one
+column, f(u(k - lag)).
 """
 
 from collections.abc import Sequence
@@ -42,20 +42,20 @@ class Lags:
 
 @dataclass(frozen=True)
 class LagScan:
-    """All structures that were compared, in the order of the scan, on rows that they share."""
+    """All structures compared, in the order of the scan, on common rows."""
 
     candidates: tuple[Lags, ...]
     rows: int
 
     @property
     def at_the_edge(self) -> tuple[str, ...]:
-        """Which of na, nb and nk are the largest ones compared, so that larger ones may be better."""
+        """Which of na, nb and nk are the largest ones compared; larger ones may be better."""
         best = self.best()
         return tuple(name for name in ("na", "nb", "nk")
                      if np.max(getattr(best, name)) == max(np.max(getattr(c, name)) for c in self.candidates))
 
     def best(self, criterion: str = "bic") -> Lags:
-        """The best by "aic", "aicc", "bic" or "fit"; of fits within 0.1 points the one with the least BIC."""
+        """Return the best by "aic", "aicc", "bic" or "fit"; of fits within 0.1 points the one with the least BIC."""
         if criterion == "fit":
             most = max(c.fit for c in self.candidates)
             return min((c for c in self.candidates if c.fit >= most - CLOSE), key=lambda c: c.bic)
@@ -69,10 +69,10 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
     Args:
         data: the record; NaN = missing. All candidates use the rows of the largest one.
         bases: one basis per input, with an interval; `Linear` for an ARX model.
-        na: largest number of output lags; fewer where the record is short.
-        nb: of input lags; likewise.
+        na: largest number of output lags; smaller where the record is short.
+        nb: largest number of input lags; likewise.
         nk: largest delay; likewise.
-        test: a part held out, judged by the coefficients of `data`; None for none.
+        test: a part held out, predicted with the coefficients of `data`; None for none.
 
     Raises:
         StructureError: orders that are not integers, na, nk >= 0 and nb >= 1.
@@ -89,8 +89,7 @@ def scan_lags(data: Data, bases: Sequence[Basis], *, na: int = 8, nb: int = 6, n
     if test is not None:
         long = [i for i, e in enumerate(test.experiments) if e.n_samples > layout.first_row]
         if not long:
-            raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or "
-                            "nothing.")
+            raise RankError(f"The part held out is shorter than the {layout.first_row} lags: hold out more, or none.")
         part = accumulate(test.select(experiments=long), layout)  # it need not determine the parameters
         held_out = change.T @ part.gram @ change / part.rows
     judge = partial(_judge, layout, statistics.root @ change, statistics.rows, held_out)
@@ -132,10 +131,7 @@ def _judge(layout: Layout, root: Array, rows: int, held_out: Array | None, na: i
 
 
 def _contraction(statistics: Statistics) -> Array:
-    """Matrix that turns the columns of the layout into one per lag of every input, f_c from the rank-one fit.
-
-    That fit takes every output in units of its residual, which only changes the scale of its coefficients.
-    """
+    """Matrix that turns the columns of the layout into one per lag of every input, f_c from the rank-one fit."""
     from optid.structures.bilinear import minimise
 
     layout = statistics.layout
@@ -154,7 +150,7 @@ def _contraction(statistics: Statistics) -> Array:
 
 
 def residual_weights(statistics: Statistics) -> Array:
-    """Return what puts every output (l,) into units of its residual; one where there is one output."""
+    """Return the factors (l,) to units of the residual of every output; one for a single output."""
     n, root = statistics.layout.n_columns, statistics.root
     rest, energy = np.sum(root[n:, n:] ** 2, axis=0), np.sum(root[:, n:] ** 2, axis=0)
     size = np.maximum(np.maximum(rest / statistics.rows, 1e-24 * energy), 1e-300)

@@ -1,7 +1,7 @@
-"""How many singular values are more than noise: largest ratio, and a threshold from their distribution.
+"""Test of the number of significant singular values: largest ratio, and a threshold from their distribution.
 
 With the instruments orthonormal and the regressors removed, R22 = Gamma X + noise / sqrt(j). If the order is n0, the
-trailing singular vectors U2, V2 of R22 see noise alone:
+trailing singular vectors U2, V2 of R22 belong to noise alone:
 
     T(n0) = sum_{i > n0} s_i^2 = |(1/j) sum_t e_t z_t^T|_F^2 + higher terms,
 
@@ -33,16 +33,16 @@ Positions = Sequence[int] | NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class RankTest:
-    """Singular values (r,) of R22 / sqrt(j) and what they would be, were the order n0 = 0, 1, ..., r - 1.
+    """Tests of the hypotheses n0 = 0, 1, ..., r - 1 about the singular values (r,) of R22 / sqrt(j).
 
-    They are in units of the output, or without unit where the outputs are scaled.
+    These are in units of the output, or without unit where the outputs are scaled.
 
     Attributes:
-        statistics: (r,) T(n0), the sum of the squares of those after the first n0.
-        expected, thresholds, p_values: (r,) expectation of T(n0) if the order is n0, which falls like 1 / j; its
-            quantile at the level; the probability of a larger one.
+        statistics: (r,) T(n0), the sum of the squares of the singular values after the first n0.
+        expected, thresholds, p_values: (r,) expectation of T(n0) if the order is n0; its quantile at the level; the
+            probability of a larger one.
         floor: singular values up to here are rounding.
-        level: probability with which a true order is to be rejected.
+        level: probability of rejecting a true order.
         windows: number j of windows.
         largest: largest order that the shift of the block rows can show.
     """
@@ -65,9 +65,9 @@ class RankTest:
 
     @property
     def choice(self) -> tuple[int, str]:
-        """The order, at least 1, and the reason: the rule behind nx="auto"."""
+        """The order for nx="auto", at least 1, and the reason."""
         if self.order == 0:
-            return 1, "1: no singular value is more than noise; the outputs may not depend on the inputs at all"
+            return 1, "1: no singular value is significant; the outputs may not depend on the inputs"
         return self.order, self.reason
 
     @property
@@ -95,14 +95,14 @@ class RankTest:
 
     @property
     def reason(self) -> str:
-        """The decision in words."""
+        """The reason of the decision."""
         n = self.order
         if self.exact:
             return f"{n}: singular value {n + 1} is rounding ({self.singular_values[n]:.1e})"
         if self.exhausted:
             return f"{n}: every smaller order is rejected and the block rows show no larger one; use more block rows"
         before = f", order {n - 1} is rejected (p = {self.p_values[n - 1]:.1g})" if n else ""
-        return f"{n}: the singular values after it are noise (p = {self.p_values[n]:.2g}){before}"
+        return f"{n}: the following singular values are noise (p = {self.p_values[n]:.2g}){before}"
 
 
 def ratios_of(values: Array, floor: float) -> Array:
@@ -120,11 +120,9 @@ def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, in
                offset: bool = True, level: float | None = None) -> RankTest:
     """Test the ranks of the projected outputs; several outputs count relative to their sizes.
 
-    The records are raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs. The past
-    has as many block rows as the future, alpha, and so has the reach of the serial correlation. Instruments are as in
-    `Expansion.positions`, with a constant among them and the regressors where there is an offset: noise of any colour
-    leaves past and future inputs valid, and functions of outputs simulated from them. Level and errors are as in
-    `rank_test`.
+    The records are raw channels [u | y], or [u | y | simulated y] where the expansion reads simulated outputs. Past,
+    future and serial correlation span alpha block rows each. Instruments are as in `Expansion.positions`, level and
+    errors as in `rank_test`.
     """
     statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
@@ -140,7 +138,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
 
     Args:
         statistics: moments of windows of `rows` + reach samples; the reach is the largest lag between windows whose
-            correlation counts. The future block rows suffice: noise windows further apart share no sample.
+            correlation counts, at most the number of future block rows.
         instruments: positions of Z in the first `rows` block rows (`HankelStatistics.at`; 0 is the constant).
         regressors: of Phi there.
         outputs: of Y there.
@@ -157,8 +155,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
 
     if statistics.rows <= rows:
         raise StructureError(f"The windows have {statistics.rows} block rows and {rows} are used: take windows that "
-                             "are longer by the number of future block rows, so that they tell the correlation between "
-                             "windows.")
+                             "are longer by the number of future block rows.")
     z, phi, y = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors, outputs))
     width = 1 + rows * statistics.d
     if max(z.max(), phi.max(), y.max()) >= width:
@@ -171,7 +168,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
                         "longer record, fewer block rows or fewer basis functions.")
     sizes = np.ones(y.size) if scale is None else np.asarray(scale, dtype=float)
     if sizes.shape != (y.size,) or not (sizes > 0).all():
-        raise StructureError(f"scale: {y.size} positive numbers are needed, one per row of the outputs.")
+        raise StructureError(f"scale must be {y.size} positive numbers, one per row of the outputs.")
     r22, noise, shocks, floor = _projections(statistics, z, phi, y, width, sizes)
     left, values, right = np.linalg.svd(r22)
     covariance_e, covariance_z = lagged_covariances(statistics, rows, noise @ left, shocks @ right.T, z.size)
@@ -223,10 +220,9 @@ def lagged_covariances(statistics: HankelStatistics, rows: int, noise: Array, sh
 
 
 def moments_of_sum(covariance_e: Sequence[Array], covariance_z: Sequence[Array]) -> tuple[float, float]:
-    """Mean and variance of |(1/sqrt j) sum_t e_t z_t^T|^2, which is Gaussian with Omega = sum_tau R_z(tau) x R_e(tau).
+    """Mean and variance of |(1/sqrt j) sum_t e_t z_t^T|^2, the sum Gaussian with Omega = sum_tau R_z(tau) x R_e(tau).
 
-    All lags have weight one, which is exact for noise that windows share; where the estimate is not a covariance,
-    Bartlett's weights, which always give one.
+    All lags have weight one, or Bartlett's weights where the estimate is not a covariance.
     """
     reach = len(covariance_e) - 1
     e = np.array([m.ravel() for m in [*covariance_e, *(m.T for m in covariance_e[1:])]])

@@ -1,11 +1,9 @@
 """Criteria for the number of states: prediction errors of every order from one matrix of moments.
 
 The state of order n is the best n combinations of past inputs and outputs for predicting the future (canonical
-variates). Its errors when it predicts 1, ..., alpha samples ahead are a quadratic form of the same moments, on the
-record itself and on a part held out. One step ahead would not do: one combination of the past, the predictor itself,
-predicts one sample of one output as well as the whole state does.
-Windows that do not overlap are independent given their states, so that N / alpha times the log determinant of the
-errors of a window is the likelihood. Source: Larimore 1990; small-sample correction: Hurvich and Tsai 1989.
+variates). Its errors 1, ..., alpha samples ahead are a quadratic form of the same moments, on the record itself and on
+a part held out. Windows that do not overlap are independent given their states: N / alpha times the log determinant of
+the errors of a window is the likelihood. Source: Larimore 1990; small-sample correction: Hurvich and Tsai 1989.
 """
 
 from dataclasses import dataclass
@@ -37,7 +35,7 @@ class StateCriteria:
     windows: int
 
     def best(self) -> dict[str, int]:
-        """The order that each criterion prefers; hold-out takes the smallest within 0.1 points of the best."""
+        """Return the best order by each criterion; by hold-out the smallest within 0.1 points of the best."""
         found = {name: int(np.argmin(getattr(self, name))) for name in ("aic", "aicc", "bic")}
         if np.isfinite(self.fit).any():
             found["hold-out"] = int(np.flatnonzero(self.fit >= np.nanmax(self.fit) - 0.1)[0])
@@ -55,8 +53,7 @@ def state_criteria(statistics: HankelStatistics, expansion: Expansion, alpha: in
                    train: HankelStatistics | None = None, test: HankelStatistics | None = None) -> StateCriteria:
     """Compare the orders 0 ... largest by moments of windows of at least 2 alpha samples, alpha past and future ones.
 
-    `train` are the moments of the part that is fitted, with the same centre, `test` those of the part held out; None
-    for no hold-out.
+    `train` and `test` are the moments, with the same centre, of the part fitted and the part held out, if any.
     """
     l = expansion.l  # noqa: E741
     covariances, j = _errors(statistics, statistics, expansion, alpha, largest), statistics.windows

@@ -1,4 +1,4 @@
-"""One study of the order of a record: states, lags, and a recommendation with its reasons."""
+"""Study of the order of a record: states, lags, and a recommendation with its reasons."""
 
 import warnings
 from collections.abc import Sequence
@@ -23,15 +23,15 @@ FEWEST, PER_ROW = 2, 1.5  # block rows at least; windows per row of the longest 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OrderStudy(Rendered):
-    """What `order` found on the record named `data`; `print` it.
+    """The result of `order` on the record named `data`; `print` it.
 
     Attributes:
         block_rows: future block rows.
         ranks: test of the singular values.
         states: criteria by number of states, on prediction errors.
-        lags: scan of na, nb, nk, the best of which is recommended; None when `notes` says why.
+        lags: scan of na, nb, nk, the best of which is recommended; None for a reason in `notes`.
         nx: recommended number of states, for these reasons.
-        notes: what weakens the result; each was also given as a DataWarning.
+        notes: limitations of the result; each is also a DataWarning.
     """
 
     data: str
@@ -47,26 +47,25 @@ class OrderStudy(Rendered):
 def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBases = None,
           block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6, nk: int = 8,
           holdout: float = 0.3, level: float | None = None) -> OrderStudy:
-    """Find the order of a record without a model of its noise.
+    """Estimate the order of a record without a model of its noise.
 
-    The number of states comes from the singular values of the future outputs on past inputs: the smallest order whose
-    trailing singular values are no larger than noise makes them (`optid.identify.order.ranks`). Criteria on prediction
-    errors, a part held out and a scan of lags stand beside it.
+    The number of states is the smallest order whose trailing singular values are noise (`optid.identify.order.ranks`).
+    It is compared with criteria on prediction errors, a part held out, and a scan of lags.
 
     Args:
         data: the record; NaN = missing, several experiments of any lengths.
         basis: functions of the inputs, one basis or one per input; linear when not given.
         feedback_basis: functions of the outputs that are fed back, one basis or one per output; none when not given.
         block_rows: future block rows, larger than the order; 10, or fewer on a short record.
-        nx: largest order of interest; sees to it that the block rows can show it.
+        nx: largest order of interest, which the block rows must be able to show.
         na: largest number of output lags of the scan.
         nb: largest number of input lags of the scan.
         nk: largest delay of the scan.
-        holdout: share of every experiment, from its end, on which orders and lags are judged; 0 for none.
+        holdout: share of every experiment, from its end, that is held out; 0 for none.
         level: probability of rejecting the true order; min(0.01, 10 / N) when not given.
 
     Raises:
-        StructureError: arguments that cannot be.
+        StructureError: an argument out of its range.
         DataError: duplicated or constant channels, or no complete sample.
         RankError: too short a record or experiment, or inputs that do not excite the block rows.
 
@@ -74,7 +73,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
         DataWarning: no scan of lags or no hold-out is possible; also in `OrderStudy.notes`.
     """
     if not 0 <= holdout < 1:
-        raise StructureError(f"holdout is a share from 0 to below 1; got {holdout!r}.")
+        raise StructureError(f"holdout must be a share from 0 to below 1; got {holdout!r}.")
     if nx is not None:
         check_integer(nx, "nx")
     data = data.raw()
@@ -104,8 +103,8 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
 def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:
     """Return the future block rows: as given, or 10, or more for a large order, or fewer on a short record.
 
-    Fewer than 2, or not more than the order asked for per output, are a `StructureError`; an experiment shorter than
-    three times the block rows, which is named, is a `RankError`.
+    Fewer than 2, or too few for nx, are a `StructureError`; an experiment shorter than three times as many samples is a
+    `RankError`.
     """
     alpha = check_integer(given, "block_rows", FEWEST) if given is not None else expansion.block_rows(
         records, nx, spans=3, per_row=PER_ROW, least=FEWEST)
@@ -121,10 +120,10 @@ def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | 
 
 
 def with_simulated_outputs(records: Sequence[Array], expansion: Expansion, alpha: int) -> tuple[list[Array], Expansion]:
-    """Append outputs simulated from the inputs alone: least squares on the functions of the last 2 alpha samples.
+    """Append outputs simulated from the inputs: least squares on the functions of the last 2 alpha samples.
 
-    They are free of noise, so that functions of them are valid instruments for functions of measured outputs. The
-    first 2 alpha - 1 samples of an experiment, and those after a missing input, are missing.
+    Functions of them are instruments, since they are free of noise. They are NaN in the first 2 alpha - 1 samples of an
+    experiment, and after a missing input.
     """
     rows = 2 * alpha
     open_loop = expansion.without_feedback()
@@ -174,23 +173,22 @@ def _lags(data: Data, train: Data | None, test: Data | None, bases: Sequence[Bas
 def _reasons(ranks: RankTest, states: StateCriteria, lags: LagScan | None) -> tuple[str, ...]:
     n = ranks.choice[0]
     found = [f"singular values: {ranks.reason}" if ranks.order else
-             "no singular value is more than noise: the outputs may not depend on the inputs; nx = 1 is the least"]
-    voices = {"the largest ratio of singular values": ranks.ratio_order}
-    voices |= {{"hold-out": "hold-out", "aic": "AIC", "aicc": "AICc", "bic": "BIC"}[k]: v
-               for k, v in states.best().items()}
-    agree = [name for name, value in voices.items() if value == n]
-    differ = [f"{name} says {value}" for name, value in voices.items() if value != n]
+             "no singular value is significant: the outputs may not depend on the inputs; nx = 1 is the minimum"]
+    others = {"the largest ratio of singular values": ranks.ratio_order}
+    others |= {{"aic": "AIC", "aicc": "AICc", "bic": "BIC"}.get(k, k): v for k, v in states.best().items()}
+    agree = [name for name, value in others.items() if value == n]
+    differ = [f"{name} gives {value}" for name, value in others.items() if value != n]
     if agree:
         found.append(f"{', '.join(agree)} agree{'s' if len(agree) == 1 else ''}")
     if differ:
         found.append("; ".join(differ) + ": criteria on prediction errors also count states of the noise, and hold-out "
-                     "asks what predicts, not what is there")
+                     "depends on the prediction only")
     if lags is not None:
         best, other = lags.best("bic"), lags.best("fit") if any(np.isfinite(c.fit) for c in lags.candidates) else None
         found.append(f"lags: {best} has the least BIC of {len(lags.candidates)} structures on {lags.rows} rows")
         if edge := lags.at_the_edge:
-            found.append(f"{' and '.join(edge)} {'is' if len(edge) == 1 else 'are'} the largest compared: look "
-                         "further, or let states carry the dynamics")
+            found.append(f"{' and '.join(edge)} {'is' if len(edge) == 1 else 'are'} the largest compared: compare "
+                         "larger ones, or use a state-space model")
         if other is not None and other != best:
             found.append(f"{other} predicts the part held out {other.fit - best.fit:.2f} points better")
     return tuple(found)

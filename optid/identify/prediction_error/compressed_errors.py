@@ -1,9 +1,9 @@
-"""The compressed errors of a model near its optimum, and how far they let the estimate scatter.
+"""The compressed errors of a model near its optimum, and the scatter of its estimate.
 
-What the errors of a state-space model leave open, changes of the states and of the scale between mu and b, has weight
-in the factor and no part in the scatter: intervals hold for whatever does not depend on it. Errors of a free run are
-coloured where noise enters before the output; their long autoregression makes the sandwich form of the covariance
-(Ljung, System Identification, 1999, chapter 9).
+Directions without effect on the errors of a state-space model, changes of the states and of the scale between mu and b,
+have weight in the factor and no part in the scatter: intervals hold for quantities that do not depend on them.
+Simulation errors are coloured where noise enters before the output; their long autoregression gives the sandwich form
+of the covariance (Ljung, System Identification, 1999, chapter 9).
 """
 
 from collections.abc import Mapping
@@ -60,7 +60,7 @@ class CompressedErrors:
 
     @cached_property
     def places(self) -> Places:
-        """Where the variables stand in z."""
+        """Positions of the variables in z."""
         return Places.of(self.criterion)
 
     @property
@@ -117,7 +117,7 @@ class CompressedStates(CompressedErrors):
     fixed: bool = False  # whether the programme fixes by rows what changes no output
 
     def settle(self, program: Program) -> None:
-        """Linearise the errors anew, where the variables of the programme stand."""
+        """Linearise the errors again, at the values of the variables of the programme."""
         self.reference = self.places.pack(program.values())
         self.at = self.criterion.linearise(self.reference)
 
@@ -131,10 +131,7 @@ class CompressedStates(CompressedErrors):
 
     @property
     def free(self) -> Array:
-        """Directions (k, n) in which functions of latent signals change into each other, as rows of weight.
-
-        Polynomials of z are polynomials of a z + b, too: two directions per signal change no output.
-        """
+        """Directions (k, n) without effect on the outputs, as rows of weight: two per latent signal, z to a z + b."""
         if not self.criterion.unknowns.latent:
             return np.zeros((0, len(self.reference)))
         sizes, values, vectors = self._scaled

@@ -1,8 +1,8 @@
 """The search for functions of latent signals, one after another: directions of z by the gain of one Gauss-Newton step.
 
-With Ez and Fz at zero the errors are linear in both, for every direction of z. The rank-one part of the step that the
-best directions promise starts a short descent; the better half of those goes on, until one is left. Splines begin on
-few cells, which are halved with the function kept; long records begin with a part of their samples.
+With Ez and Fz at zero the errors are linear in both, for every direction of z. The rank-one parts of the best steps
+start short descents, of which the best continue. Splines begin with few cells, which are halved; long records begin
+with a part of their samples.
 """
 
 import warnings
@@ -25,29 +25,25 @@ from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
 
 CANDIDATES = 32  # directions of z that are ranked, at least
 RANKED = 3_000  # samples on which directions are ranked and tried
-# samples of the descents before the one on the whole record; the model without functions is fitted to the first
-STAGES = (8_000, 20_000)
+STAGES = (8_000, 20_000)  # samples of the descents before the one on the whole record
 MARGIN = 1.15  # interval of a basis, as a multiple of the range of z at the start
-CELLS = 12  # cells up to which a spline is searched as it is; of more, half as many
+CELLS = 12  # largest number of cells of a spline in the search
 # states of a model up to which its factors are tried; modulus from which a zero is one at infinity; radius at which
-# responses are compared, off the poles that lie on the unit circle
+# responses are compared
 LARGEST, FAR, OFF = 8, 1e3, 1.05
 SAME = 0.999  # ratio of the gains of two directions above which they count as the same
 SHORT = 12
-# number of descents that the best directions start, or that go on, and their steps
-HEATS = ((10, SHORT), (5, 30), (2, 60))
-# where one more function promises a larger share of the errors, a search has likely gone astray
-LEFT = 0.1
+HEATS = ((10, SHORT), (5, 30), (2, 60))  # numbers of descents, and their steps
+LEFT = 0.1  # share of the errors by one more function, from which the search is repeated
 # relative fall over a few steps below which descents stop: in the search, on the whole of a long or short record
 PACE = {"search": 1e-2, "long": 3e-3, "short": 0.0}
 SIZES = (1.0, 0.3, 0.05)  # shares of the Gauss-Newton step from which a descent may start
-# what a function is shrunk to where a longer record would take the run out of its range
-SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)
+SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)  # sizes of a function where a longer record would leave its range
 
 
 def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, seed: int = 0,
                  iterations: int = 60, tries: int = 2) -> tuple[StateErrors, Descent, dict[str, Any]]:
-    """Give a model functions of latent signals and descend to an optimum with all of them.
+    """Add functions of latent signals to a model; return the criterion with them, its optimum, and figures.
 
     Args:
         errors: the criterion of the model without them.
@@ -55,11 +51,8 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         channels: the functions, each on the interval [-1, 1] of its argument.
         seed: of the random directions.
         iterations: of a descent at most.
-        tries: searches for every function; those after the first know the other functions. Where one more function
-            promises much, all of them are searched again from other directions, ``2 tries - 1`` times at most.
-
-    Returns:
-        The criterion with the functions, its optimum, and figures of the search.
+        tries: searches for every function, after the first with the other functions present. Where one more function
+            would gain much, all of them are searched again from other directions, ``2 tries - 1`` times at most.
 
     Raises:
         RankError: no direction of z leads to a model whose run stays finite.
@@ -71,13 +64,13 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         except RankError as error:
             refusal = error
             continue
-        if _promised(searches[-1][0], searches[-1][1].x, channels[0], rng) <= LEFT:
+        if _expected(searches[-1][0], searches[-1][1].x, channels[0], rng) <= LEFT:
             break
     if not searches:
         assert refusal is not None
         raise refusal
     part, end, figures = min(searches, key=lambda one: one[1].value)
-    if iterations:  # without a descent nothing can be said of what the functions are worth
+    if iterations:
         figures |= _idle(errors, best.x, part, end)
     return part, end, figures
 
@@ -90,10 +83,10 @@ def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rn
     x, steps = best.x, best.steps
     for number, latent in enumerate(channels, start=1):
         try:
-            part, end, promise = _added(part, x, _coarse(latent), rng, iterations)
+            part, end, expected = _added(part, x, _coarse(latent), rng, iterations)
         except RankError as error:
             raise RankError(f"latent signal {number}: {error}") from error
-        figures[f"gain promised by latent signal {number}"] = promise
+        figures[f"expected gain of latent signal {number}"] = expected
         x, steps = end.x, steps + end.steps
     for number in [*range(len(channels))] * (tries - 1):
         part, end, more = _exchanged(part, end, number, rng, iterations)
@@ -111,8 +104,8 @@ def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rn
     return part, replace(end, steps=steps), figures
 
 
-def _promised(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator) -> float:
-    """Return the gain that one more function promises beyond twice what it would take of white errors."""
+def _expected(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator) -> float:
+    """Return the gain expected of one more function beyond twice that for white errors."""
     part = replace(errors, data=first_samples(errors.data, RANKED // errors.unknowns.l))
     more = _coarse(latent)
     by_chance = (errors.unknowns.n + errors.unknowns.l) * more.size / outputs_present(part.data)
@@ -121,14 +114,13 @@ def _promised(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Gene
 
 def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator, iterations: int
            ) -> tuple[StateErrors, Descent, float]:
-    """Add the function of a latent signal; also return the share of the errors that its best direction promised."""
+    """Add the function of a latent signal; also return the expected gain of its best direction."""
     x = whitened(part, x)
     ranked = sorted(_ranked(part, x, latent, rng), key=lambda one: -one[0])
     ranked = [one for one, before in zip(ranked, [None, *ranked]) if before is None or one[0] < SAME * before[0]]
     ends = [one for _, *chosen in ranked[: HEATS[0][0]] if (one := _short(part, x, latent, *chosen)) is not None]
     if not ends:
-        raise RankError("no direction leads to a model that stays finite: use fewer latent signals, another basis, or "
-                        "latent='states'.")
+        raise RankError("no direction gives a finite run: use fewer latent signals, another basis, or latent='states'.")
     part, steps = _widened(part, (latent,)), sum(one.steps for one in ends)
     ends.sort(key=lambda one: one.value)
     starts = []
@@ -144,7 +136,7 @@ def _added(part: StateErrors, x: Array, latent: Latent, rng: np.random.Generator
 
 def _exchanged(part: StateErrors, end: Descent, number: int, rng: np.random.Generator, iterations: int
                ) -> tuple[StateErrors, Descent, int]:
-    """Search anew for one function, found without the others, beside them; the better model stays. Also count steps."""
+    """Search again for one function with the others present; return the better model, and the steps taken."""
     point, latent = part.unknowns.unpack(end.x), part.unknowns.latent
     kept = np.delete(np.arange(len(latent)), number)
     rest = replace(part, unknowns=replace(part.unknowns, latent=tuple(latent[i] for i in kept)))
@@ -170,9 +162,9 @@ def _coarse(latent: Latent) -> Latent:
 
 
 def _renewed(errors: StateErrors, x: Array, cells: int = 1) -> tuple[StateErrors, Array]:
-    """Divide the cells of every function, and let z fill its interval again where it has left it or shrunk.
+    """Divide the cells of every function, and rescale z to its interval where it has left it or shrunk.
 
-    What is affine in the functions then moves to the matrices and offsets. A division alone changes nothing.
+    The affine parts of the functions move to the matrices and offsets. A division alone changes nothing.
     """
     unknowns, finer, cs, affine = errors.unknowns, [], [], []
     point, known = unknowns.unpack(x), np.linspace(-1, 1, 1001)
@@ -207,9 +199,9 @@ def _renewed(errors: StateErrors, x: Array, cells: int = 1) -> tuple[StateErrors
 
 def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[Latent, ...], iterations: int = 60
                          ) -> tuple[StateErrors, Descent, dict[str, Any]]:
-    """Let every output be a function of what it was: y_o = h_o(z_o) + constant, z_o the output of the model so far.
+    """Make every output a function of the former output z_o: y_o = h_o(z_o) + constant.
 
-    Arguments and errors as `add_channels`; ``functions`` has one for every output, of basis functions as they are.
+    Arguments and errors as `add_channels`; ``functions`` has one for every output.
     """
     linear, point, n = errors, errors.unknowns.unpack(best.x), errors.unknowns.n
     signals = np.hstack([np.vstack(errors.visited(point)), np.vstack([e.u for e in errors.data.experiments])])
@@ -232,16 +224,15 @@ def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[La
 
 
 def _idle(before: StateErrors, x: Array, after: StateErrors, found: Descent) -> dict[str, Any]:
-    """Say, and warn, where functions save less of the errors than their parameters would of white noise (BIC)."""
+    """Return a figure, with a warning, where functions reduce the errors insignificantly (BIC)."""
     rows, more = outputs_present(after.data), after.unknowns.size - before.unknowns.size
     without, left = before.value(x), found.value
     if not np.isfinite(without) or rows * np.log(max(without, 1e-300) / max(left, 1e-300)) > more * np.log(rows):
         return {}
-    said = (f"they lower the squared errors by {max(100 * (1 - left / max(without, 1e-300)), 0.0):.2g} %, less than "
-            f"their {more} parameters are worth (BIC): leave them out")
-    warnings.warn(f"The functions of latent signals have no effect that the record shows: {said}.", DataWarning,
-                  stacklevel=2)
-    return {"effect of latent signals": said}
+    effect = (f"they lower the squared errors by {max(100 * (1 - left / max(without, 1e-300)), 0.0):.2g} %, "
+              f"insignificant for {more} parameters (BIC): leave them out")
+    warnings.warn(f"The functions of latent signals have no significant effect: {effect}.", DataWarning, stacklevel=2)
+    return {"effect of latent signals": effect}
 
 
 def whitened(errors: StateErrors, x: Array) -> Array:
@@ -258,23 +249,20 @@ def whitened(errors: StateErrors, x: Array) -> Array:
 
 
 def first_samples(data: Data, size: int) -> Data:
-    """Return the first samples of a long record, which other experiments are not part of."""
+    """Return the first samples of a long record; several experiments stay as they are."""
     return data if data.n_samples <= size or data.n_experiments > 1 else data.window(0, size)
 
 
 def _finite(errors: StateErrors, start: Array) -> Array:
-    """Return a start whose run stays in its range, with a smaller last function where it must be.
-
-    More samples may take a signal to where a function was not known.
-    """
+    """Return a start whose run stays in its range, with a smaller last function if necessary."""
     at, last = errors.unknowns.slices, len(errors.unknowns.latent) - 1
     for share in (1.0, *SHARES):
         x = np.array(start)
         x[at[f"g{last}"]] *= share
         if np.isfinite(errors.value(x)):
             return x
-    raise RankError("a model that stays finite on the first samples of the record leaves its range on the rest, "
-                    "however small its last latent function: use fewer latent signals, or another basis.")
+    raise RankError("a model with a finite run on the first samples leaves the range of the record on the rest: use "
+                    "fewer latent signals, or another basis.")
 
 
 def _widened(errors: StateErrors, latent: tuple[Latent, ...]) -> StateErrors:
@@ -290,7 +278,7 @@ def _with(point: StatePoint, rows: Array, cs: tuple[Array, ...], Ez: Array, Fz: 
 
 
 def _directions(errors: StateErrors, point: StatePoint, latent: Latent, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield rows [Cz, Dz, constant] whose z fills [-1, 1]: states, inputs, outputs, parts of them, random ones."""
+    """Yield rows [Cz, Dz, constant] with z in [-1, 1]: states, inputs, outputs, factors of responses, random ones."""
     n, m = errors.unknowns.n, errors.unknowns.expansion.m
     states = np.vstack(errors.visited(point))
     signals = np.hstack([states, np.vstack([e.u for e in errors.data.experiments])])
@@ -346,7 +334,7 @@ def _subsets(groups: Sequence[Any]) -> list[Any]:
 
 def _ranked(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator
             ) -> Iterator[tuple[float, Array, Array]]:
-    """Yield (share of the errors that a Gauss-Newton step takes away, row of z, matrix [Ez; Fz] (n + l, r) of it)."""
+    """Yield (relative gain of a Gauss-Newton step, row of z, matrix [Ez; Fz] (n + l, r) of the step)."""
     point, n = errors.unknowns.unpack(x), errors.unknowns.n
     r, outputs = latent.size, errors.unknowns.l
     for row in _directions(errors, point, latent, rng):
@@ -367,7 +355,7 @@ def _ranked(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Genera
 
 
 def _short(errors: StateErrors, x: Array, latent: Latent, row: Array, matrix: Array) -> Descent | None:
-    """Descend a little from the rank-one part of a Gauss-Newton step; None where no share of it stays finite."""
+    """Descend briefly from the rank-one part of a Gauss-Newton step; None where no share of it stays finite."""
     point, trial, n = errors.unknowns.unpack(x), _widened(errors, (latent,)), errors.unknowns.n
     left, values, right = np.linalg.svd(matrix, full_matrices=False)
     before = errors.linearise(x).value

@@ -1,8 +1,8 @@
 """The search for the best optimum of a transfer-function model over starts of many kinds, and the entry to constraints.
 
-Starts of the plant: equation error, Steiglitz-McBride, refined instruments, subspace, perturbed poles. All give a
-stable A; poles outside the unit circle are reflected into it, and what belongs to a given A follows by a few steps in
-which A is held. With a noise model: extended least squares (ARMAX), what a plant leaves of the output (Box-Jenkins).
+Starts of the plant: equation error, Steiglitz-McBride, refined instruments, subspace, perturbed poles. Poles outside
+the unit circle are reflected into it, and the other unknowns fitted by a few steps with A fixed. With a noise model:
+extended least squares (ARMAX), the residuals of a plant (Box-Jenkins).
 """
 
 import warnings
@@ -31,17 +31,15 @@ from optid.statistics.unknowns import TransferPoint, TransferUnknowns
 from optid.structures.bilinear import minimise
 from optid.structures.lifted_regression import lifted_problem, positions
 
-# samples, from the middle of the record, on which starts are compared; the winner descends on the whole record
-SEARCH = 5_000
-# starts of different methods that may make further ones unnecessary without a noise filter, see `descent.best_of`
-SUFFICIENT = 3
+SEARCH = 5_000  # samples, from the middle of the record, on which starts are compared
+SUFFICIENT = 3  # starts of different methods that may suffice without a noise filter, see `descent.best_of`
 # radii tried to bring the poles of a start into the region of the constraints
 PULLS = (1.0, 0.999, 0.99, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.3, 0.1, 0.0)
 ENTRIES = 3  # different optima from which the constrained iteration may start
-PASSES = 8  # passes of Steiglitz-McBride and of the instruments; they settle in fewer or not at all
-WIDE = 6  # functions, over all inputs, up to which the subspace start is worth its cost
-RADIUS = 0.98  # poles of a start lie inside this radius, so that its simulation forgets within the record
-MORE = 8  # lags that a long model has beyond those of the model whose innovations it is to show
+PASSES = 8  # passes of Steiglitz-McBride and of the instruments
+WIDE = 6  # functions, over all inputs, up to which the subspace start is used
+RADIUS = 0.98  # largest modulus of the poles of a start
+MORE = 8  # lags of a long model beyond those of the model whose innovations it approximates
 PLANTS = 4  # starts, at most, of the output-error fit whose plant is the start of a Box-Jenkins model
 
 
@@ -49,14 +47,14 @@ def search(criterion: TransferErrors, starts: Callable[[TransferErrors], Iterabl
            ) -> tuple[Descent, list[Descent], dict[str, Any]]:
     """Descend from every start and return the best optimum, the other ones, and the figures of the comparison.
 
-    On long records the starts (name, point) of a criterion are compared on a part, and the winner descends on the
-    whole. Where no start has a stable predictor a `RankError` is raised.
+    On long records the starts (name, point) are compared on a part, and the best one descends on the whole. No start
+    with a stable predictor is a `RankError`.
     """
     part, filtered = _part(criterion), criterion.unknowns.innovations
     found = best_of(part, starts(part), enough=None if filtered else SUFFICIENT)
     if not found:
         raise RankError(f"no start has a stable {'predictor' if filtered else 'simulation'}; use other orders")
-    while True:  # what arrived as far as starts are compared may still end at the border of stability
+    while True:  # on the whole record the best start may end at the border of stability
         best, x = found[0], np.zeros(criterion.unknowns.size)
         x[: criterion.unknowns.shared] = best.x[: criterion.unknowns.shared]
         final = descend(criterion, best.x if part is criterion else x, start=best.start)
@@ -96,9 +94,9 @@ def _complete(data: Data) -> float:
 
 
 def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) -> Array:
-    """Return where to start under the constraints: the best of the optima whose poles are pulled into the region.
+    """Return the start under the constraints: the best of the optima with their poles moved into the region.
 
-    What belongs to the pulled poles is estimated anew; without constraints on the poles alone they stay.
+    The other unknowns are fitted again; without constraints on the poles alone they stay.
     """
     if not fit.constraints:
         return fit.signed(found[0].x)
@@ -160,13 +158,13 @@ def _armax_plant(plain: TransferErrors, nc: int) -> Array | None:
 def extended_least_squares(criterion: TransferErrors) -> dict[str, Array]:
     """Return starts of an ARMAX model: the equation error alone, and extended least squares with its innovations.
 
-    The innovations of a long ARX model (Hannan and Rissanen 1982), later those of the estimate, stand as regressors for
-    the noise (Ding and Chen 2005); every pass is the rank-one least-squares problem itself. The best pass counts: they
-    do not descend by rule. What the record does not determine is refused as in `equation_error`.
+    The innovations of a long ARX model (Hannan and Rissanen 1982), later those of the estimate, are regressors for the
+    noise (Ding and Chen 2005); every pass is the rank-one least-squares problem, and the best pass is returned. Errors
+    are those of `equation_error`.
     """
     unknowns = criterion.unknowns
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # what gaps cost the starts is no finding about the fit
+        warnings.simplefilter("ignore", DataWarning)  # rows lost in a start
         arx = unknowns.pack(_arx(criterion))
         best, least, e = None, np.inf, _long_innovations(criterion)
         for _ in range(PASSES if unknowns.nc else 0):
@@ -208,7 +206,7 @@ def _long_innovations(criterion: TransferErrors) -> list[Array] | None:
 
 
 def _other_zeros(unknowns: TransferUnknowns, x: Array, seed: int) -> Iterator[tuple[str, Array]]:
-    """Yield a point with other zeros of C, again and again; nothing without zeros."""
+    """Yield points with other zeros of C without end; nothing without zeros."""
     rng, nc = np.random.default_rng(seed), unknowns.nc
     for i in count(1) if nc else ():
         pairs = RADIUS * np.sqrt(rng.random(nc // 2)) * np.exp(1j * np.pi * rng.random(nc // 2))
@@ -246,7 +244,7 @@ def _regression(records: Sequence[Array], terms: Sequence[tuple[int, int]]) -> A
 
 
 def plant_starts(criterion: TransferErrors, seed: int) -> Iterator[tuple[str, Array]]:
-    """Yield starts, each estimated when it is asked for: those of other methods, then moved poles again and again."""
+    """Yield starts, each estimated on demand: those of other methods, then perturbed poles without end."""
     base = arx_start(criterion)
     yield "ARX", base.x
     for name in ("Steiglitz-McBride", "instruments"):
@@ -264,7 +262,7 @@ def arx_start(criterion: TransferErrors) -> Descent:
     """Return the model of the equation error with its poles contained, a guess where the rows do not suffice."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # rows lost here are not lost to the simulation error
+            warnings.simplefilter("ignore", DataWarning)  # rows lost in a start
             point = equation_error(criterion)
     except OptidError:
         point = _guess(criterion.unknowns)
@@ -273,10 +271,10 @@ def arx_start(criterion: TransferErrors) -> Descent:
 
 
 def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | None = None) -> TransferPoint:
-    """Return the rank-one least squares of the equation error (ARX); initial states are zero.
+    """Return the rank-one least squares of the equation error (ARX), initial states zero.
 
-    The coefficients of given innovations (N,) are those of C, which is one without them. What the record does not
-    determine, and innovations of zero, are refused (`StructureError`, `RankError`, `DataError`).
+    The coefficients of given innovations (N,) are those of C. What the record does not determine, and innovations of
+    zero, are refused (`StructureError`, `RankError`, `DataError`).
     """
     data, unknowns, layout = criterion.data, criterion.unknowns, criterion.unknowns.layout
     if innovations is not None:
@@ -295,11 +293,10 @@ def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | Non
 
 
 def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None:
-    """Return the best point on the way of "Steiglitz-McBride" or of the refined instrumental variable ("instruments").
+    """Return the best pass of "Steiglitz-McBride" or of the refined instrumental variable ("instruments").
 
-    Both linearise as Gauss-Newton does in everything but a, whose columns hold the measured output: as regressors in
-    the first case, as regressors against simulated instruments in the second (Steiglitz and McBride 1965; Young 1976).
-    Neither descends by rule, so the best pass counts. None without poles.
+    Both are Gauss-Newton steps with columns of the measured output for a: as regressors in the first case, with
+    simulated instruments in the second (Steiglitz and McBride 1965; Young 1976). None without poles.
     """
     unknowns = criterion.unknowns
     p, na = unknowns.shared, unknowns.layout.na
@@ -328,17 +325,14 @@ def iterated(criterion: TransferErrors, x: Array, method: str) -> Descent | None
 
 
 def _subspace(data: Data, layout: Layout) -> Array | None:
-    """Return A from the subspace of the expanded inputs (past instruments); None where the record does not carry it.
-
-    Wide expansions are left out: their block Hankel matrices cost more than all other starts together.
-    """
+    """Return A from the subspace of the expanded inputs (past instruments); None where it is wide or fails."""
     if not layout.na or sum(basis.size for basis in layout.bases) > WIDE:
         return None
     records = data.records
     try:
         expansion = expand(data, layout.bases)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # as in `arx_start`
+            warnings.simplefilter("ignore", DataWarning)
             found = project(records, expansion, expansion.block_rows(records, layout.na), instruments="past")
         poles = np.linalg.eigvals(realise(found.gamma(layout.na), 1)[0])
     except (OptidError, np.linalg.LinAlgError):
@@ -348,7 +342,7 @@ def _subspace(data: Data, layout: Layout) -> Array | None:
 
 
 def _guess(unknowns: TransferUnknowns) -> TransferPoint:
-    """Return a start without any estimate: real poles, identity-like nonlinearities."""
+    """Return a start without any estimate: real poles, nearly linear nonlinearities."""
     layout, mus = unknowns.layout, []
     for basis, free in zip(layout.bases, unknowns.free):
         points = basis.grid()
@@ -360,7 +354,7 @@ def _guess(unknowns: TransferUnknowns) -> TransferPoint:
 
 
 def _perturbed(rng: np.random.Generator, a: Array) -> Array:
-    """Return coefficients of A with its poles moved: in turn nearby, or anywhere in the disc in conjugate pairs."""
+    """Return coefficients of A with its poles moved at random: nearby, or anywhere in the disc in conjugate pairs."""
     roots = roots_of(contained(a, RADIUS))
     if rng.random() < 0.5:
         upper = roots[np.imag(roots) >= 0]

@@ -1,11 +1,9 @@
 """The errors of a state-space model, simulation (K = 0) or innovation form, and their sensitivities, chunk by chunk.
 
-Unknowns live in the full matrices; the directions along which a change of states moves them, and the scale between mu
-and b, are projected out at every iterate (data-driven local coordinates, McKelvey, Helmersson and Ribarits 2004).
-
-A stretch is run by the simulator of the criterion; the derivatives of the state are carried along that run
-(`optid.models.state_kernels`), and what leaves a chunk is a factor of [sensitivities | errors]. Where an output is
-missing its error is left out, nothing is corrected by it, and the model's own output is fed back.
+The unknowns are full matrices; changes of the states, and the scale between mu and b, are projected out at every
+iterate (data-driven local coordinates, McKelvey, Helmersson and Ribarits 2004). Sensitivities are recursions along the
+run of the simulator (`optid.models.state_kernels`), and a chunk is reduced to a factor of [sensitivities | errors]. The
+error of a missing output is left out, without a correction, and the model output is fed back.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -40,15 +38,15 @@ class StateErrors(Criterion):
     """The weighted sum of squared errors of all outputs."""
 
     data: Data  # the record
-    unknowns: StateUnknowns  # their order, and whose errors are meant
+    unknowns: StateUnknowns  # their order, and the criterion
     weight: Array  # (l, l) weight of the errors
     limit: float = STABLE  # modulus below which the poles that carry the state must stay
-    # constraints on poles that every iterate obeys: model -> what is wrong, "" where nothing is
+    # constraints on poles that every iterate satisfies: model -> violation, "" for none
     checks: tuple[Callable[[Any], str], ...] = ()
     gauge: ClassVar[str] = "norm"
 
     def key(self, name: str, number: int) -> str:
-        """Name a quantity of an input, or of a family of feedback functions."""
+        """Return the name of a quantity of an input, a family of feedback functions or a latent signal."""
         x = self.unknowns.expansion
         if name in ("c", "g", "z"):
             word = {"c": "mu latent", "g": "b latent", "z": "z"}[name]
@@ -65,7 +63,7 @@ class StateErrors(Criterion):
 
     @cached_property
     def limits(self) -> tuple[Any, ...] | None:
-        """Ranges that runs must not leave, where outputs act on states, or latent signals do."""
+        """Ranges that runs must not leave, where outputs or latent signals act on states."""
         unknowns = self.unknowns
         if unknowns.innovations or not (unknowns.expansion.feedback or unknowns.latent):
             return None
@@ -81,10 +79,7 @@ class StateErrors(Criterion):
             return Linearised(np.eye(p), np.zeros(p), (nothing,) * experiments, np.inf, 0, 1.0, "gram")
 
     def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
-        """Return what yields the weighted rows [x0 | shared | error] of an experiment, and their number, by its index.
-
-        A missing output has a row of zeros.
-        """
+        """Return a generator of the weighted rows [x0 | shared | error] of experiment i, zero where y is missing."""
         unknowns, covariance = self.unknowns, np.linalg.inv(self.weight)
         point, model = self._placed(x)
         chunk = max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
@@ -158,7 +153,7 @@ class StateErrors(Criterion):
         return replace(self, weight=np.linalg.inv(covariance))
 
     def level(self, x: Array, full: bool = False) -> float:
-        """Return the logarithm of what `reweighted` lowers, by which points of different weights are compared."""
+        """Return the log determinant that `reweighted` lowers, which compares points of different weights."""
         return -float(np.linalg.slogdet(self.reweighted(x, full).weight)[1])
 
     def _placed(self, x: Array) -> tuple[StatePoint, HammersteinSS]:
@@ -189,8 +184,8 @@ class StateErrors(Criterion):
         """Return the point of a model of the same structure, initial states zero; refuse others (`StructureError`)."""
         unknowns, x = self.unknowns, self.unknowns.expansion
         if model.nx != unknowns.n or model.m != x.m or model.l != x.l or len(model.nonlinearities) != x.m:
-            raise StructureError(f"a start has {model.nx} states, {model.m} inputs and {model.l} outputs; "
-                                 f"{unknowns.n}, {x.m} and {x.l} are needed")
+            raise StructureError(f"a start has {model.nx} states, {model.m} inputs and {model.l} outputs, the fit "
+                                 f"{unknowns.n}, {x.m} and {x.l}")
         pairs = [(f.basis, basis) for f, basis in zip(model.nonlinearities, x.inputs)]
         pairs += [(g.basis, family.basis) for g, family in zip(model.feedback, x.feedback)]
         same = [one.to_dict() == other.to_dict() or isinstance(one, Linear) and isinstance(other, Linear)
@@ -207,7 +202,7 @@ class StateErrors(Criterion):
             constant += model.E[:, f] * (nu @ family.intercept)
             injection += np.outer(model.E[:, f], nu @ family.slope)
             nus[f], columns[:, f] = (nu, model.E[:, f]) if family.size > 1 else (np.ones(1), model.E[:, f] * nu[0])
-        # what is left of L goes into A; the constant of the state into that of the output
+        # the rest of L goes into A, the constant of the state into that of the output
         A, b = model.A + injection @ model.C, (model.B + injection @ model.D) * scale
         constant = constant + injection @ model.offset_y
         shift = np.linalg.lstsq(np.eye(unknowns.n) - A, constant)[0]

@@ -1,7 +1,7 @@
 """The search for the best optimum of a state-space model, the errors weighted by their own covariance."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +14,7 @@ from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
 from optid.identify.prediction_error.state_errors import WILD, StateErrors
+from optid.identify.validation.predictions import one_step, simulated, simulated_or_nan
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.roots import spectral_radius
 from optid.models.state_simulation import allowed_range
@@ -21,19 +22,18 @@ from optid.models.state_space import balancing
 from optid.program.solution import Status
 from optid.solving.solve import Evidence, Procedure
 
-ROUNDS = 10  # times the errors are weighted anew at most
+ROUNDS = 10  # updates of the weights at most
 SAME_WEIGHT = 1e-4
 FINALISTS = 2
-
 RADII = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)  # spectral radii tried to make a start stable
 
 
 def search_states(errors: StateErrors, starts: Mapping[str, Array], weighting: str, iterations: int = STEPS
                   ) -> tuple[StateErrors, Descent, dict[str, Any]]:
-    """Descend from every start, then weight the errors anew until the weights stay; the best end wins.
+    """Descend from every start and update the weights until they converge; return errors, best optimum and figures.
 
     With the determinant every start is weighted by its own errors from the first step on: weights from the outputs
-    lead a third of short records to a zero of the noise on the unit circle, from where no step leads back.
+    lead on a third of short records to a zero of the noise on the unit circle, where descents end.
 
     Args:
         errors: weighted by the variances of the outputs.
@@ -41,12 +41,9 @@ def search_states(errors: StateErrors, starts: Mapping[str, Array], weighting: s
         weighting: "scale" (keep the weights), "variance", "determinant", or "auto": "determinant" for prediction,
             "variance" for simulation.
         iterations: of a descent at most.
-
-    Returns:
-        The errors as weighted at last, the best optimum, and the figures of the comparison.
     """
     if errors.unknowns.l == 1:
-        weighting = "scale"  # one output has nothing to be weighed against
+        weighting = "scale"
     elif weighting == "auto":
         weighting = "determinant" if errors.unknowns.innovations else "variance"
     full = weighting == "determinant"
@@ -67,14 +64,14 @@ def search_states(errors: StateErrors, starts: Mapping[str, Array], weighting: s
     ends = [(own.level(one.x, full) if weighting != "scale" else one.value, own, one) for own, one in weighted]
     _, final, best = min(ends, key=lambda end: (end[2].border, end[0]))
     agreed = [one.start for one, same in zip(found, smallest) if same]
-    figures = {"starts": f"{len(agreed)} of {len(found)} starts arrive at the smallest error ({', '.join(agreed)})",
+    figures = {"starts": f"{len(agreed)} of {len(found)} starts converged to the smallest error ({', '.join(agreed)})",
                "starts that agree": len(agreed), "errors of the starts": np.sort(values)[::-1]}
     return final, best, figures
 
 
 def _weighted(errors: StateErrors, start: str, x: Array, weighting: str, iterations: int, steps: int = 0
               ) -> tuple[StateErrors, Descent]:
-    """Descend, the errors weighted by their own (co)variance until it stays; steps taken before are counted."""
+    """Descend and weight the errors by their own (co)variance until it converges; add the steps taken before."""
     for _ in range(ROUNDS):
         new = errors if weighting == "scale" else errors.reweighted(x, full=weighting == "determinant")
         change = np.linalg.norm(new.weight - errors.weight) / np.linalg.norm(new.weight)
@@ -87,9 +84,9 @@ def _weighted(errors: StateErrors, start: str, x: Array, weighting: str, iterati
 
 
 def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
-    """Return an admissible vector of unknowns near a model; None without one.
+    """Return an admissible vector of unknowns near a model, contracted where it is unstable, with fitted states.
 
-    A model whose state is not carried stably is contracted; the initial states are those that fit best.
+    None where no contraction is admissible.
     """
     point = errors.point_of(_balanced(errors, model))
     still, largest = np.zeros_like(point.K), spectral_radius(point.A)
@@ -111,7 +108,7 @@ def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
 
 
 def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
-    """Balance the states, if possible, for the signals and weights of the fit, so that all of A is of one size."""
+    """Balance the states, if possible, for the signals and weights of the fit."""
     data = errors.data
     f = model.expanded(np.vstack([e.u for e in data.experiments]))
     y = np.vstack([e.y for e in data.experiments])
@@ -124,56 +121,48 @@ def _balanced(errors: StateErrors, model: HammersteinSS) -> HammersteinSS:
 
 
 def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
-    """Add the noise model, and the Hankel bound to errors linear in functions of signals that the record shows.
+    """Add the noise model, and the Hankel bound where the errors are linear in functions of measured signals.
 
-    Those are errors, as weighted at last, with one weight per output of models whose functions see inputs and measured
-    outputs alone. One squared unit of the outputs is ``unit`` in units of the record.
+    The weights of the errors must be diagonal. One squared unit of the outputs is ``unit`` in units of the record.
     """
     weight, unknowns, reason = errors.weight, errors.unknowns, evidence.reason
     model, remarks = _with_noise(evidence.model, errors)
     bound = evidence.bound
-    shown = unknowns.criterion == "measured feedback" or (
+    linear = unknowns.criterion == "measured feedback" or (
         unknowns.criterion == "simulation" and not unknowns.expansion.feedback)
-    if shown and not unknowns.latent and not np.any(weight - np.diag(np.diag(weight))):
+    if linear and not unknowns.latent and not np.any(weight - np.diag(np.diag(weight))):
         records = errors.data.records
         bound = simulation_bound(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
                                  2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several "
                                  "starts are compared")
         reason = bound.reason if evidence.status is Status.LOCAL else reason
     figures = {**evidence.figures, "weight of the outputs": weight / unit, **remarks}
-    if unknowns.expansion.feedback and unknowns.criterion != "simulation" and (wild := _runs_away(model, errors.data)):
-        figures["free run"] = wild
-        reason = f"{reason}; its free run {wild}"
+    if unknowns.expansion.feedback and unknowns.criterion != "simulation" and _diverges(model, errors.data):
+        figures["free run"] = (
+            f"leaves {WILD:g} times the range of the record: use the model where outputs are measured, or "
+            "criterion='simulation', which minimises the error of the free run")
+        reason = f"{reason}; its free run {figures['free run']}"
     return replace(evidence, model=model, bound=bound, reason=reason, figures=figures)
 
 
-def _runs_away(model: HammersteinSS, data: Data) -> str:
-    """Say where the free run of a model leaves the range of the record, "" where it stays; no criterion sees it."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
-            found = model.simulate(data, x0="fit")
-    except DataError:
-        found = None
-    runs = found if isinstance(found, tuple) else (found,)
-    for y, e in zip(runs, data.experiments):
-        low, high = allowed_range([e.y], WILD)
-        if y is None or not np.all((low <= y) & (y <= high)):
-            return (f"leaves {WILD:g} times the range of the record: use the model where outputs are measured, or "
-                    "criterion='simulation', which minimises the error of the free run")
-    return ""
+def _diverges(model: HammersteinSS, data: Data) -> bool:
+    """Whether the simulation of a model leaves the range of the record."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        runs = simulated_or_nan(model, data)
+    ranges = [allowed_range([e.y], WILD) for e in data.experiments]
+    return not all(np.all((low <= y) & (y <= high)) for y, (low, high) in zip(runs, ranges))
 
 
 def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinSS, dict[str, Any]]:
-    """Add the covariances of the noise, K as fitted or from simulation errors; or say why there are none."""
+    """Add the covariances of the noise, K as fitted or from simulation errors, or a figure with the reason."""
     data = errors.data
     try:
         if not errors.unknowns.innovations and not errors.unknowns.latent:
             return with_noise(model, data), {}
-        # what no gain is fitted to counts as white: with latent functions the optimal one would depend on the state
-        found: Any = model.predict(data) if errors.unknowns.innovations else model.simulate(data, x0="fit")
-        predicted: Sequence[Array] = found if isinstance(found, tuple) else [found]
-        rest = np.vstack([e.y for e in data.experiments]) - np.vstack(predicted)
+        # errors without a fitted gain count as white: with latent functions the optimal gain depends on the state
+        found = one_step(model, data) if errors.unknowns.innovations else simulated(model, data)
+        rest = np.vstack([e.y for e in data.experiments]) - np.vstack(found)
         rest = rest[~np.isnan(rest).any(axis=1)]
         covariance = rest.T @ rest / max(len(rest), 1)
         return replace(model, noise=NoiseCovariances.of_innovations(model.K, covariance)), {}
@@ -182,7 +171,7 @@ def _with_noise(model: HammersteinSS, errors: StateErrors) -> tuple[HammersteinS
 
 
 def quietly(procedure: Procedure) -> Procedure:
-    """Run a procedure that only provides a start: its warnings are about an answer nobody sees."""
+    """Run a procedure that only provides a start, without its warnings."""
     answer: Any = None
     while True:
         with warnings.catch_warnings():

@@ -65,7 +65,7 @@ class TransferErrors(TransferPredictor, Criterion):
         return not self.unknowns.apart or roots.radius(x[at["a"]]) < STABLE
 
     def scale(self, x: Array, b: str) -> float:
-        """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge."""
+        """Return the divisor of a part b of x, and factor of its mu, to reach the gauge."""
         if self.gauge == "norm":
             return super().scale(x, b)
         at, channel = self.unknowns.slices, self.unknowns.layout.inputs[int(b[1:])]
@@ -86,10 +86,9 @@ class TransferErrors(TransferPredictor, Criterion):
         return np.array(rows).reshape(-1, self.unknowns.shared)
 
     def levels_before(self, a: Any, thetas: Sequence[Any]) -> Any:
-        """Return what x0 lacks in the record's own units, in which the time before the record is at the levels.
+        """Return the part of the initial states by the levels of the channels before the record, in the model's units.
 
-        In the units of the model it is at zero, as x0 has it. a (na,) and Theta (P, nb) of every input may be
-        expressions.
+        a (na,) and Theta (P, nb) of every input may be expressions.
         """
         units, memory, layout = self.units, self.unknowns.memory, self.unknowns.layout
         rows, total = np.arange(memory)[:, None], np.zeros(memory)
@@ -108,11 +107,9 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
                     offset: bool) -> TransferErrors:
     """Check the arguments of a fit, and return its criterion on the record in its own units (`optid.program.units`).
 
-    Unless D is A the initial states are unknown, and the record is cut where inputs are missing: every stretch is an
-    experiment with an initial state of its own.
-
-    Arguments and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A and ``gauge``
-    for a linear model. Without ``offset`` nothing is centred.
+    Unless D is A the initial states are unknown, and a record with missing inputs is cut into experiments. Arguments
+    and errors as in `formulations.prediction_error.hammerstein_bj`; ``nd`` is None where D is A and ``gauge`` for a
+    linear model. Without ``offset`` nothing is centred.
     """
     data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
     layout = Layout(check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),
@@ -134,7 +131,7 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
 
 
 def _check_inputs(data: Data, layout: Layout) -> None:
-    """Refuse a basis function without energy, and inputs of whose expansions one column depends on another, by name."""
+    """Refuse a basis function without energy, and dependent columns of the expanded inputs, by name."""
     outputs = [e.u[:, :1] for e in data.experiments]  # any without gaps
     complete = Data([e.u for e in data.experiments], outputs, data.dt, list(data.inputs), list(data.outputs))
     if not all(isinstance(basis, Linear) for basis in layout.bases):

@@ -1,9 +1,8 @@
 """Compiled loop of the recursive least squares: rows are rotated into a triangular factor, one sample after the other.
 
-Square-root information form (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter V;
-Haykin, Adaptive Filter Theory, QR-decomposition-based recursive least squares). The factor R of [Phi | Y] replaces the
-covariance P = (R^T R)^-1 of the textbook recursion: rotations are orthogonal, so P stays symmetric and positive
-definite however long the run is, and P_0 = infinity is simply R = 0.
+Square-root information form (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, chapter V). The
+factor R of [Phi | Y] replaces the covariance P = (R^T R)^-1 of the textbook recursion: rotations are orthogonal, so P
+stays symmetric and positive definite, and P_0 = infinity is R = 0.
 """
 
 import numpy as np
@@ -12,21 +11,17 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 
-FADED = 1e-120
-"""Diagonal entry of R below which a row is not forgotten any further: a direction that is never excited again keeps
-its last estimate instead of ending as zero over zero."""
-NOTHING = 1e-250  # entries of R below this are set to zero, before they slow the processor down as subnormal numbers
-UNDETERMINED = 1e-12
-"""Share of a column, or of a row, outside the span of what came before below which it counts as rounding."""
+FADED = 1e-120  # diagonal entry of R below which forgetting stops: a direction without excitation keeps its estimate
+NOTHING = 1e-250  # entries of R below this are set to zero: subnormal numbers are slow
+UNDETERMINED = 1e-12  # share of a column, or of a row, outside the span of those before that counts as rounding
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def rotate(root: Array, row: Array, first: int, last: int, fade: float) -> float:
-    """Rotate a row into some rows of an upper triangular factor, which are multiplied by `fade` before.
+    """Rotate a row (s,) into rows `first` to `last` - 1 of an upper triangular factor (s, s) after scaling by `fade`.
 
-    The root (s, s), diagonal >= 0, and the row (s,) change in place: what remains of the row is orthogonal to the
-    columns from `first` to `last` - 1. The product of the cosines is returned, (1 + phi^T P phi)^(-1/2) for a regressor
-    phi and P after forgetting.
+    Both change in place; the row keeps its part orthogonal to these columns. The product of the cosines is returned,
+    (1 + phi^T P phi)^(-1/2) for a regressor phi and P after forgetting.
     """
     kept, size = 1.0, row.size
     for i in range(first, last):

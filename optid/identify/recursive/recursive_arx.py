@@ -5,9 +5,8 @@ The recursion minimises, after every sample,
     sum_t lambda^(rows used after t) a(t) |y(t) - theta^T phi(t)|^2
         + lambda^(rows used) (theta - theta_0)^T P_0^-1 (theta - theta_0),
 
-where phi(t) holds y(t-1), .. and eta(u(t - nk)), .. and meets y(t), and the first row is the first one with all its
-lags. It is carried in square-root information form (`optid.identify.recursive.kernel`), which is Algorithm 3.2 in exact
-arithmetic and does not lose symmetry or definiteness in long runs.
+where phi(t) contains y(t-1), .. and eta(u(t - nk)), .., and the first row is the first one with all its lags. The
+square-root information form (`optid.identify.recursive.kernel`) equals Algorithm 3.2 in exact arithmetic.
 """
 
 from collections.abc import Sequence
@@ -42,10 +41,9 @@ COUNTS = ("samples", "candidates", "rows", "since_restart")
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The estimate over time: theta (K, n, l) after `samples` (K,), NaN while the rows do not determine it.
+    """The estimate over time: theta (K, n, l) after `samples` (K,), NaN while undetermined, and innovations (N, l).
 
-    Its rank-one factors are those of Luo, Algorithm 3.1 (Bai, Automatica 34, 1998); the innovations (N, l) are those of
-    every sample of the block.
+    The rank-one factors are those of Luo, Algorithm 3.1 (Bai, Automatica 34, 1998).
     """
 
     layout: Layout
@@ -61,11 +59,10 @@ class Trace:
     def split(self, c: int = 0, beta: float = 1.0) -> tuple[Array, Array, Array]:
         """Split Theta of input c by the plain SVD in the gauge of Algorithm 3.1: mu = beta s_1 u_1, b = v_1 / beta.
 
-        The gauge beta is not zero, and the first coefficient of b has its sign. Returns mu (K, P), b (K, nb l) and
-        s_2 / s_1 (K,), 0 where there is no second one.
+        The first coefficient of b has the sign of beta. Returns mu (K, P), b (K, nb l) and s_2 / s_1 (K,).
         """
         if beta == 0:
-            raise StructureError("beta=0: the gauge is a number other than zero.")
+            raise StructureError("beta=0: the gauge must not be zero.")
         known = np.asarray(np.isfinite(self.theta).all(axis=(1, 2)))
         left, size, right = np.linalg.svd(_theta_matrices(self.theta[known], self.layout)[c], full_matrices=False)
         sign = np.where(right[:, :1, 0] < 0, -1.0, 1.0)
@@ -78,16 +75,15 @@ class Trace:
 
 
 class RecursiveARX(SavedState):
-    """A Hammerstein-ARX model that is updated as samples arrive.
+    """A Hammerstein-ARX model that is updated as samples arrive; `update` changes it.
 
-    It is a state: `update` changes it. The estimate is over-parametrised, one matrix Theta_c per input; `model` splits
-    off the rank-one factors. A row that touches a missing sample, or has weight zero, leaves the information as it is,
-    while the lags move on.
+    The estimate is over-parametrised, one matrix Theta_c per input; `model` splits off the rank-one factors. A row with
+    a missing sample, or with weight zero, leaves the information unchanged.
 
     Attributes:
         layout: the columns of phi.
         samples: samples seen.
-        candidates: rows there would have been, had no sample been missing.
+        candidates: rows without regard to missing samples.
         rows: rows used.
         root: (n + l, n + l) the information, upper triangular R of [Phi | Y]: P = (R^T R)^-1 of its first n columns.
         past_u: (reach, m) the last inputs, for the lags.
@@ -104,7 +100,7 @@ class RecursiveARX(SavedState):
         dt: float = 1.0, forgetting: float = 1.0, theta0: ArrayLike = 0.0, P0: ArrayLike = np.inf,
         input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
     ) -> None:
-        """Start from what is known before the first sample.
+        """Start from a prior estimate.
 
         Args:
             na: number of past outputs.
@@ -116,14 +112,14 @@ class RecursiveARX(SavedState):
             dt: sampling time.
             forgetting: lambda in (0, 1]; 1 forgets nothing, lambda remembers about 1 / (1 - lambda) rows.
             theta0: prior estimate: a number, (n,) or (n, l) in the order of `layout.names()`.
-            P0: prior covariance over the noise variance: a number, (n,) diagonal or (n, n). Infinity is no prior at
-                all, and then the estimate is that of the batch least squares.
+            P0: prior covariance over the noise variance: a number, (n,) diagonal or (n, n); infinity (no prior) gives
+                the batch least squares.
             input_units: units of the inputs.
             output_units: units of the outputs.
 
         Raises:
-            StructureError: impossible orders, a basis without interval, a forgetting factor outside (0, 1], a P0 that
-                is not positive.
+            StructureError: invalid orders, a basis without interval, a forgetting factor outside (0, 1], a P0 that is
+                not positive.
         """
         names_u, names_y = listed(inputs) or [], listed(outputs) or []
         m = len(names_u)
@@ -133,8 +129,8 @@ class RecursiveARX(SavedState):
         for channel, one in zip(names_u, bases):
             if one.interval is None and type(one).__name__ != "Linear":
                 raise StructureError(
-                    f"The basis of input {channel!r} has no interval: a recursion does not know the range of the input "
-                    f"beforehand. Give it, as in {type(one).__name__}(..., interval=(lower, upper)).")
+                    f"The basis of input {channel!r} has no interval, which a recursion needs: give it, as in "
+                    f"{type(one).__name__}(..., interval=(lower, upper)).")
         self.forgetting = forgetting_factor(forgetting)
         self.dt = sampling_time(dt)
         self.input_units, self.output_units = names["input_units"], names["output_units"]
@@ -146,17 +142,17 @@ class RecursiveARX(SavedState):
     def like(cls, data: Data | Stream, *, basis: Any, **settings: Any) -> "RecursiveARX":
         """Start with the channels, units and sampling time of a record, and the range of its inputs as intervals.
 
-        The samples are not used (see `read`); detrended or scaled data are a `DataError`. A basis without interval
-        takes the range of its input; the settings are na, nb and the other arguments of the class.
+        The samples are not used otherwise (see `read`); detrended or scaled data are a `DataError`. The settings are
+        na, nb and the other arguments of the class.
         """
         _check_raw(data)
         return cls(basis=fitted_bases(data, basis), inputs=data.inputs, outputs=data.outputs,
                    dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
 
     def update(self, u: ArrayLike, y: ArrayLike, weights: ArrayLike = 1.0) -> Array:
-        """Take in the next sample, or the next block of them, and return the innovations y(t) - theta(t-1)^T phi(t).
+        """Process the next sample or block, and return the innovations y(t) - theta(t-1)^T phi(t).
 
-        They are (N, l), NaN where the row was not used and where the past did not determine the prediction.
+        They are (N, l), NaN where the row was not used or the prediction was not determined.
 
         Args:
             u: (N, m) inputs, or (N,) for one input; one sample as (m,), or a number for one input. NaN = missing.
@@ -170,9 +166,9 @@ class RecursiveARX(SavedState):
         return self._absorb(u, y, weights, 0)[0]
 
     def trace(self, u: ArrayLike, y: ArrayLike, every: int = 1, weights: ArrayLike = 1.0) -> Trace:
-        """Take in a block as `update` does, and record the estimate after every so many samples.
+        """Process a block as `update` does, and record the estimate after every so many samples since the start.
 
-        They are counted from the first one seen. The other arguments are those of `update`.
+        The other arguments are those of `update`.
         """
         first, every = self.samples, check_integer(every, "every")
         innovations, theta = self._absorb(u, y, weights, every)
@@ -180,9 +176,9 @@ class RecursiveARX(SavedState):
         return Trace(self.layout, after[after % every == 0], theta, innovations)
 
     def read(self, data: Data | Stream) -> list[Array]:
-        """Take in a whole record, every experiment with lags of its own; return the innovations of each.
+        """Process a whole record, every experiment with its own lags; return the innovations of each.
 
-        Other channels than the model's, detrended or scaled data are a `DataError`; and as `update`.
+        Other channels than the model's, and detrended or scaled data, are a `DataError`.
         """
         _check_raw(data)
         if data.inputs != self.layout.inputs or data.outputs != self.layout.outputs:
@@ -232,13 +228,13 @@ class RecursiveARX(SavedState):
 
     @property
     def statistics(self) -> Statistics:
-        """Everything the rows say, the prior included, as the batch statistics of the same layout."""
+        """The information of the rows, the prior included, as the batch statistics of the same layout."""
         root = self.root.copy()
         return Statistics(self.layout, root.T @ root, self.rows, self.candidates, root)
 
     @property
     def theta(self) -> Array:
-        """The estimate (n, l), in the order of `layout.names()`; a `RankError` names a column not determined yet."""
+        """The estimate (n, l), in the order of `layout.names()`; an undetermined column is a `RankError`."""
         from scipy.linalg import solve_triangular
 
         return solve_triangular(self._determined(), self.root[: self.layout.n_columns, self.layout.n_columns :])
@@ -250,7 +246,7 @@ class RecursiveARX(SavedState):
         return inverse @ inverse.T
 
     def _determined(self) -> Array:
-        """Return the factor R (n, n) of the information, or refuse when it is singular."""
+        """Return the factor R (n, n) of the information; a singular one is a `RankError`."""
         n = self.layout.n_columns
         column = dependent_column(self.root, n, "qr")
         if column is not None:
@@ -261,14 +257,11 @@ class RecursiveARX(SavedState):
 
     @property
     def matrices(self) -> tuple[Array, ...]:
-        """Theta_c (P_c, nb_c l) of every input, lags inner, outputs outer; refused as `theta`.
-
-        The ratio of its second to its first singular value tells how far the record is from a Hammerstein system.
-        """
+        """Theta_c (P_c, nb_c l) of every input, lags inner, outputs outer, of rank one for a Hammerstein system."""
         return _theta_matrices(self.theta, self.layout)
 
     def model(self, split: Literal["whitened", "plain"] = "whitened", gauge: str = "norm") -> HammersteinTF:
-        """Split off the rank-one factors of the present estimate; refused as `theta`.
+        """Return the model of the present estimate by its rank-one factors; errors as `theta`.
 
         Args:
             split: "whitened" (SVD in the Kronecker metric of the Gram matrix, close to the least-squares optimum) or

@@ -1,4 +1,4 @@
-"""What estimators that run on share: their samples as blocks, the forgetting factor, and their state as a file."""
+"""Common parts of recursive estimators: samples as blocks, the forgetting factor, and the state as a file."""
 
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -44,11 +44,11 @@ class SavedState:
 
         Args:
             path: the file.
-            functions: the functions of UserFunctions bases by name, which a file does not hold.
+            functions: the functions of UserFunctions bases by name, which a file does not contain.
 
         Raises:
-            ModelFileError: truncated, of another version, or the state of something else.
-            StructureError: functions that are needed and not given.
+            ModelFileError: a truncated file, or one of another version or kind.
+            StructureError: missing functions.
         """
         head, arrays = read_state(path, cls.kind, VERSION, cls.arrays)
         try:
@@ -60,8 +60,8 @@ class SavedState:
         for name, array in arrays.items():
             wanted = getattr(state, name)
             if array.dtype != wanted.dtype or array.shape != wanted.shape:
-                raise ModelFileError(f"{path}: {name} is {array.dtype} {array.shape}; {wanted.dtype} {wanted.shape} is "
-                                     "needed.")
+                raise ModelFileError(f"{path}: {name} is {array.dtype} {array.shape}, not {wanted.dtype} "
+                                     f"{wanted.shape}.")
             setattr(state, name, np.ascontiguousarray(array))
         return state
 
@@ -69,7 +69,7 @@ class SavedState:
 def as_block(values: Any, names: tuple[str, ...], what: str, seen: int) -> Array:
     """Return samples, a block (N, channels), (N,) of one channel or one sample, as (N, channels), finite or NaN.
 
-    A wrong shape or an infinite sample is a `DataError`, which calls the channels `what` and counts from `seen` on.
+    A wrong shape or an infinite sample of `what` is a `DataError`; samples are counted from `seen` on.
     """
     samples, width = np.asarray(values, dtype=float), len(names)
     if samples.ndim == 0 and width == 1 or samples.ndim == 1 and width > 1 and samples.size == width:
@@ -85,7 +85,7 @@ def as_block(values: Any, names: tuple[str, ...], what: str, seen: int) -> Array
 
 
 def forgetting_factor(value: float) -> float:
-    """Return a forgetting factor, or refuse one outside (0, 1] (`StructureError`)."""
+    """Return a forgetting factor; one outside (0, 1] is a `StructureError`."""
     if not 0 < value <= 1:
-        raise StructureError(f"forgetting={value!r}: a factor above 0 and at most 1, such as 0.995.")
+        raise StructureError(f"forgetting={value!r} must be above 0 and at most 1, such as 0.995.")
     return float(value)

@@ -1,1 +1,1 @@
-"""Subspace identification: statistics of block Hankel matrices that are never formed, and what is read off them."""
+"""Subspace identification from moments of block Hankel matrices, which are never formed."""

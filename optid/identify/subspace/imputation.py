@@ -1,17 +1,15 @@
 """Missing outputs estimated by a model, for projections whose windows must be complete.
 
-With outputs missing here and there, few windows of a block Hankel matrix are complete. A first model, of linearly
-interpolated outputs, predicts the missing outputs one step ahead; the next model is that of the record so completed,
-and so on until the estimates stay (the expectation step of Dempster, Laird and Rubin 1977 with the steady predictor).
-A completed record is a trajectory of the innovation form whose innovations are zero where outputs are missing: the
-true model is a fixed point.
+A first model, of linearly interpolated outputs, predicts the missing outputs one step ahead; the next model is that of
+the record so completed, and so on until the estimates converge (the expectation step of Dempster, Laird and Rubin 1977
+with the steady predictor). The true model is a fixed point: the innovations are zero where outputs are missing.
 """
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, as_list
 from optid.data.record import Data
 from optid.data.stretches import interpolated
 from optid.errors import DataError, RankError
@@ -30,12 +28,11 @@ def clipping_range(outputs: Array) -> tuple[Array, Array]:
 
 
 def _predicted(model: HammersteinSS, data: Data, filled: Sequence[Array]) -> list[Array]:
-    """Return the predictions (N, l); those from the estimates so far where a feedback of predictions runs away."""
+    """Return the predictions (N, l); those from the present estimates where a feedback of predictions diverges."""
     completed = Data([e.u for e in data.experiments], list(filled), data.dt, list(data.inputs), list(data.outputs))
     for record in (data, completed):
         try:
-            found = model.predict(record)
-            return list(found) if isinstance(found, tuple) else [found]
+            return as_list(model.predict(record))
         except DataError as error:
             reason = error
     raise RankError(f"the missing outputs cannot be predicted by a preliminary model: {reason}")
@@ -49,8 +46,7 @@ def impute(data: Data, estimate: Callable[[list[Array]], HammersteinSS]) -> tupl
         estimate: returns the model, with its gain K, of records (N, m + l) whose outputs are complete.
 
     Returns:
-        Arrays [u | y], (N, m + l), one per experiment, in which an output that could not be predicted is NaN; and what
-        was estimated and how, in words.
+        Arrays [u | y], (N, m + l), one per experiment, NaN where no prediction exists; and a description.
 
     Raises:
         RankError: an output with fewer than two samples present, or as `estimate`.

@@ -15,10 +15,10 @@ GRID, CHUNK = 2001, 8192
 
 def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
                      ez: Array, d: Array) -> list[Array]:
-    """Simulate the outputs (N, l) of every experiment from the inputs alone: noise free, clipped as estimates are.
+    """Simulate the outputs (N, l) of every experiment from the inputs alone, clipped to `clipping_range`.
 
     The functions of a missing input count as zero. The records are raw channels [u | y]; A (n, n), C (l, n), Bu (n, p),
-    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, which may lack feedback functions.
+    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, with or without feedback functions.
     """
     m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
     low, high = clipping_range(np.vstack(records)[:, m : m + l])
@@ -49,8 +49,8 @@ def clipped_run(
     x: Array, out: Array) -> None:
     """Simulate x+ = A x + drive + sum_o table_o(y_o) + injection y, y = C x + direct, with y clipped to [low, high].
 
-    The tables (l, G, n) hold the feedback of every output at G points spread evenly over [low, high], read with
-    straight lines. Written are the state x (n,) after the last sample and the clipped outputs (T, l).
+    The tables (l, G, n) hold the feedback of every output at G points spread evenly over [low, high], interpolated
+    linearly. The state x (n,) after the last sample and the clipped outputs (T, l) are written.
     """
     n, l, last = x.size, low.size, tables.shape[1] - 1  # noqa: E741
     following = np.empty(n)

@@ -12,8 +12,7 @@ from optid.errors import DataError, RankError, StructureError
 from optid.identify.subspace.observability import Observability, Windows
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.projection import realise
-from optid.identify.validation import fit_percent
-from optid.identify.validation.predictions import MEASURED, SIMULATION, simulated
+from optid.identify.validation.predictions import MEASURED, SIMULATION, prediction_fit
 from optid.program.program import Program
 from optid.program.solution import Solution
 from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
@@ -36,7 +35,7 @@ class Structured:
     size: float  # largest singular value of the matrix of the measured outputs
 
     def rank(self, sizes: Array) -> int:
-        """Return how many singular values count; with a weight so small that nothing is left of the matrix, none."""
+        """Return the number of significant singular values."""
         return int(np.sum((sizes > RANK * sizes[0]) & (sizes > NOTHING * self.size)))
 
     def order(self, sizes: Array) -> int:
@@ -59,7 +58,7 @@ class Structured:
     def observability(self, values: Values, parts: tuple[Array, Array], nx: int) -> Observability:
         """Return the observability matrix of a decomposed point, in coordinates with states of about unit size.
 
-        What the predictor form leaves is that of (A - K C, C), and the Markov parameters of K stand in T.
+        The predictor form gives that of (A - K C, C); the Markov parameters of K are in T.
         """
         vectors, sizes = parts
         found = vectors[:, :nx] * np.sqrt(sizes[:nx]) / self.problem.shape[1] ** 0.25
@@ -81,10 +80,9 @@ class Structured:
 
 def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program]
                   ) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
-    """Return the weight, and where it is free the order, whose model simulates the parts held out best, and figures.
+    """Return the weight, and where it is free the order, with the best simulation of the parts held out, and figures.
 
-    ``hold_out`` is a fraction of every experiment; ``pose`` returns the programme of a structured problem, with a
-    parameter "weight".
+    ``hold_out`` is a fraction of every experiment; ``pose`` builds the programme, with a parameter "weight".
     """
     part, rest = plan.data.split(1 - hold_out)
     structured, trials = structure(replace(plan, data=part, block_rows=Windows.of(plan).alpha)), []
@@ -103,7 +101,7 @@ def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose:
 
 
 def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int, float]:
-    """Return the simulation fit in %, on another record, of the models of a point, by order: that asked for, or all."""
+    """Return the simulation fit in %, on another record, of the models of a point, by order: as given, or all."""
     order, parts, found = structured.windows.plan.order, structured.decomposed(values), {}
     most = min(structured.rank(parts[1]), structured.problem.rows - 1)
     for nx in range(1, min(most, LARGEST) + 1) if order is None else [order] * (order <= most):
@@ -117,9 +115,8 @@ def order_scores(structured: Structured, values: Values, rest: Data) -> dict[int
 
 
 def held_out_fit(model: Any, data: Data) -> float:
-    """Mean simulation fit in % over the outputs, initial states fitted; with feedback that of measured outputs."""
-    outputs = simulated(model, data, MEASURED if model.feedback else SIMULATION)
-    return float(np.mean(fit_percent(np.vstack([e.y for e in data.experiments]), np.vstack(outputs))))
+    """Return the mean simulation fit in % over the outputs, with measured feedback if there is any; NaN without one."""
+    return float(np.mean(prediction_fit(model, data, MEASURED if model.feedback else SIMULATION)))
 
 
 def structure(plan: Plan) -> Structured:
@@ -169,7 +166,7 @@ def structure(plan: Plan) -> Structured:
 
 
 def _weighted(problem: NuclearProblem, known: Array, instruments: Array | None) -> NuclearProblem:
-    """Put the projection and, with instruments, the weights of the instrumental-variable method in place."""
+    """Return the problem with its projection and, with instruments, the weights of the instrumental-variable method."""
     basis, sizes, _ = np.linalg.svd(known.T, full_matrices=True)
     rank = int(np.sum(sizes > 1e-10 * sizes[0]))
     if instruments is None:

@@ -21,7 +21,7 @@ from optid.models.roots import spectral_radius
 from optid.statistics.expansion import Expansion, check_channels
 from optid.statistics.hankel import complete_runs
 
-WEAK = 0.1  # share of the energy of the feedback functions that the simulated ones explain below which the user is told
+WEAK = 0.1  # share of the energy of the feedback that simulated feedback explains, below which a warning is given
 # missing outputs are estimated where fewer complete windows than this are left per row of the Hankel matrix, and a
 # smaller share than this of all windows
 SCARCE, INTACT = 20, 0.8
@@ -32,30 +32,27 @@ INSIDE = 0.999  # modulus to which the poles of an unstable estimate are brought
 class Windows:
     """The signals of a record in windows of 2 alpha samples."""
 
-    plan: Plan  # what was asked for
+    plan: Plan  # the request
     records: list[Array]  # raw channels, with simulated outputs where the expansion reads them
     expansion: Expansion  # the signals
     alpha: int  # block rows of the past and of the future
 
     @classmethod
     def of(cls, plan: Plan) -> "Windows":
-        """Return the signals of a plan and its number of block rows, after the checks of its channels.
-
-        An order that the block rows cannot carry (`StructureError`) and a constant channel (`DataError`) are refused.
-        """
+        """Return the signals of a plan; too few block rows are a `StructureError`, a constant channel a `DataError`."""
         expansion, nx = plan.expansion(), plan.order
         check_channels(plan.records, plan.data.inputs, plan.data.outputs)
         alpha = (expansion.block_rows(plan.records, nx) if plan.block_rows is None
                  else check_integer(plan.block_rows, "block_rows", 2))
         if nx is not None and alpha <= nx:
-            raise StructureError(f"{alpha} block rows for order {nx}: more block rows than states are needed; use "
+            raise StructureError(f"{alpha} block rows for order {nx}: more block rows than states are required; use "
                                  f"block_rows={nx + 1} or more, or nx={alpha - 1} or less.")
         return cls(plan, plan.records, expansion, alpha)
 
     def are_scarce(self) -> bool:
-        """Whether missing outputs cost many windows, and those left are few for the rows of the Hankel matrix.
+        """Whether missing outputs leave few complete windows for the rows of the Hankel matrix.
 
-        Block rows that were asked for stay: what is missing is then refused.
+        With block rows given by the user, missing outputs are estimated only where the plan says so.
         """
         plan, x, rows = self.plan, self.expansion, 2 * self.alpha
         gaps = any(plan.data.missing[name] for name in plan.data.outputs)
@@ -66,14 +63,14 @@ class Windows:
         return complete < INTACT * candidates and complete < SCARCE * rows * (x.p + x.q + x.l)
 
     def projected(self) -> Projection:
-        """Return the projection with the instruments and the weighting that were asked for."""
+        """Return the projection with the instruments and the weighting of the plan."""
         plan = self.plan
         found = project(self.records, self.expansion, self.alpha, instruments=plan.instruments, offset=plan.offset,
                         form=plan.form, tolerance=plan.tolerance)
         return found if plan.weighting == BEST else replace(found, weighting=plan.weighting)
 
     def ordered(self) -> "Observability":
-        """Return the observability matrix in the weighting that was asked for."""
+        """Return the observability matrix in the weighting of the plan."""
         projection = self.projected()
         return self.observability(projection, self.order(projection)[0])
 
@@ -82,10 +79,9 @@ class Windows:
         return Observability(self, projection.gamma(nx), projection.scale)
 
     def instrumented(self) -> "Windows":
-        """Return the same with simulated outputs where these are instruments.
+        """Return the same with outputs simulated by preliminary models where these are instruments.
 
-        Any preliminary model will do for the simulation, which depends on the inputs alone. The first one has past
-        outputs as instruments; where the regressors are singular then, it has no feedback.
+        The first model has past outputs as instruments; where the regressors are then singular, it has no feedback.
         """
         plan, raw = self.plan, self.records
         if not plan.instruments.startswith("simulated"):
@@ -112,11 +108,7 @@ class Windows:
         return windows
 
     def best_weighting(self, projection: Projection, nx: int) -> Projection:
-        """Return the projection in the weighting whose (A, C) leaves the smallest error on the record.
-
-        None is best on all records: the canonical weighting has the smaller variance where the order suffices, the
-        others keep the outputs with most energy where it does not. A stable estimate comes before one that was moved.
-        """
+        """Return the projection in the weighting whose (A, C) leaves the smallest error, a stable one if there is."""
         tried = []
         for word in WEIGHTINGS:
             weighted = replace(projection, weighting=word)
@@ -126,11 +118,11 @@ class Windows:
         return min(tried, key=lambda one: one[:2])[2]
 
     def order(self, projection: Projection) -> tuple[int, str]:
-        """Return the order, and where it was to be found the reason in words."""
+        """Return the order, and the reason where it was estimated."""
         nx, values, reason = self.plan.order, projection.values, ""
         rank = projection.rank
         if self.plan.nx == "auto" and rank <= min(self.alpha - 1, values.size - 1):  # a record without noise
-            nx, reason = rank, f"{rank}: the singular values after it are rounding"
+            nx, reason = rank, f"{rank}: the following singular values are rounding"
         elif self.plan.nx == "auto":
             try:
                 nx, reason = order_test(self.records, self.expansion, self.alpha, instruments=self.plan.instruments,
@@ -150,16 +142,16 @@ class Windows:
 
 @dataclass(frozen=True, eq=False)
 class Observability:
-    """An estimate of the observability matrix, and the record on which the other matrices follow from it."""
+    """An estimate of the observability matrix, and the record from which the other matrices are estimated."""
 
     windows: Windows  # the record
     gamma: Array  # (rows l, n) observability matrix, in units of the outputs
     scale: Array  # (l,) sizes of the outputs, by which it and the residuals are divided
-    figures: dict[str, Any] = field(default_factory=dict)  # what was measured on the way
+    figures: dict[str, Any] = field(default_factory=dict)  # for the fit
 
     @property
     def scaled(self) -> Array:
-        """Gamma of the outputs divided by their sizes: least squares on it weighs all outputs alike."""
+        """Gamma of the outputs divided by their sizes."""
         return self.gamma / np.tile(self.scale, len(self.gamma) // len(self.scale))[:, None]
 
     def least_squares(self) -> Array:
@@ -167,7 +159,7 @@ class Observability:
         return realise(self.scaled, len(self.scale))[0]
 
     def contracted(self) -> Array:
-        """Return A by least squares, contracted where it is unstable: for simulations and comparisons."""
+        """Return A by least squares, contracted where it is unstable."""
         a = self.least_squares()
         radius = spectral_radius(a)
         return a if radius < 1 else a * (INSIDE / radius)
@@ -175,13 +167,12 @@ class Observability:
     def step(self, a: Array, *, instruments: bool = True) -> Realisation:
         """Compress the least squares for B, D, E, offset and x0 with a given A (n, n).
 
-        Simulated feedback functions are instruments where the noise may be coloured; where past outputs may be
-        instruments, it is white and least squares has the smaller variance.
+        Simulated feedback functions are instruments unless the noise counts as white (past outputs as instruments).
         """
         plan, records, expansion = self.windows.plan, self.windows.records, self.windows.expansion
         c = self.gamma[: len(self.scale)].copy()
         closed = plan.observer == "kalman" or (plan.observer == "auto" and spectral_radius(a) >= 1)
-        # noise of one size at all outputs, which are in units of their own: what states hardly explain counts as noisy
+        # noise of the same size at all outputs, in the units of their residuals
         level = float(np.mean(np.sum(c**2, axis=1))) * np.eye(len(c))
         gain = np.array(kalman_gain(a, c, np.eye(len(a)), level).K) if closed else np.zeros((len(a), len(c)))
         coloured = instruments and expansion.simulated and not plan.instruments.endswith("past")
@@ -189,16 +180,16 @@ class Observability:
         return observer_problem(records, form, [record[:, plan.data.m :] for record in plan.records])
 
     def model(self) -> HammersteinSS:
-        """Return the least-squares model, for comparisons: no constraints, A contracted; errors as of `step`."""
+        """Return the least-squares model without constraints, A contracted; errors as of `step`."""
         step = self.step(self.contracted())
         return step.model(self.windows.plan.data, step.start())
 
 
 def estimate_observability(plan: Plan) -> Observability:
-    """Project, find the order and choose the weighting; where missing outputs leave few windows, estimate them first.
+    """Project, estimate the order and choose the weighting; missing outputs that leave few windows are estimated first.
 
-    What the record does not determine raises a `RankError`. Missing outputs that are estimated, and simulated feedback
-    that explains little of the measured one, are told by a `DataWarning`.
+    What the record does not determine is a `RankError`. Estimated outputs, and simulated feedback that explains little
+    of the measured one, cause a `DataWarning`.
     """
     windows, imputed = Windows.of(plan), {}
     if windows.are_scarce():

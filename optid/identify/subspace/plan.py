@@ -1,4 +1,4 @@
-"""What a subspace method is asked for, on a record in its own units."""
+"""The request to a subspace method, on a record in its own units."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -23,10 +23,7 @@ WORDS = {"observer": ("auto", "none", "kalman"), "split": ("exact", "lumped"), "
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a method is asked for, of a record in its own units; see `planned`.
-
-    Attributes named as arguments of `formulations.hammerstein_ss.sid` mean the same.
-    """
+    """The request to a method; see `planned`. Attributes have the meaning of the arguments of `hammerstein_ss.sid`."""
 
     name: str
     data: Data
@@ -64,7 +61,7 @@ class Plan:
 
     @property
     def order(self) -> int | None:
-        """The order asked for; None where it is to be found."""
+        """The given order; None where it is to be estimated."""
         return None if isinstance(self.nx, str) else int(self.nx)
 
     def expansion(self) -> Expansion:
@@ -88,9 +85,9 @@ class Plan:
 
 def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, offset: bool = True, **settings: Any
             ) -> Plan:
-    """Plan a method on a record in memory, taken to its own units (`optid.program.units`); see `in_record_units`.
+    """Plan a method on a record in memory, in its own units (`optid.program.units`); the settings are further fields.
 
-    Without an offset nothing is centred. The settings are further fields of the plan.
+    Without an offset nothing is centred.
     """
     if not isinstance(data, Data):
         raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")

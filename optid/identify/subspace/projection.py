@@ -15,25 +15,24 @@ from optid.statistics.rq import RQ, rq
 
 WEIGHTINGS = ("moesp", "cva", "plain")
 
-KEPT = 0.5  # share of the windows left by missing samples below which the user is told
+KEPT = 0.5  # share of the windows left by missing samples below which a warning is given
 
 
 @dataclass(frozen=True, eq=False)
 class Projection:
-    """What the projection step leaves."""
+    """The result of the projection step."""
 
     statistics: HankelStatistics  # moments of the windows of 2 block_rows samples
     blocks: RQ  # the RQ decomposition
-    scale: Array  # (l,) standard deviations of the outputs; one output is left as it is
-    # of the projected outputs: "moesp" (outputs divided by their sizes: those in small units are not lost), "cva" (the
-    # inverse root of the covariance of the future outputs with the regressors removed, so that singular values are
-    # canonical correlations: Larimore 1990) or "plain" (outputs in their units: at an order too low the larger ones
-    # come first)
+    scale: Array  # (l,) standard deviations of the outputs; one for a single output
+    # of the projected outputs: "moesp" (outputs divided by their sizes), "cva" (the inverse root of the covariance of
+    # the future outputs with the regressors removed, so that singular values are canonical correlations: Larimore 1990)
+    # or "plain" (outputs in their units)
     weighting: str = WEIGHTINGS[0]
 
     @cached_property
     def decomposition(self) -> tuple[Array, Array]:
-        """Left singular vectors of the weighted outputs, the weights undone, and the singular values, largest first."""
+        """Left singular vectors of the weighted outputs, without the weights, and the singular values, descending."""
         scale = self.scale if self.weighting != "plain" else np.ones(len(self.scale))
         sizes = np.tile(scale, self.statistics.rows // 2)  # the future is the second half of a window
         r22, unweighted = self.blocks.r22 / sizes[:, None], np.diag(sizes)

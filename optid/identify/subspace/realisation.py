@@ -1,4 +1,4 @@
-"""The least-squares step for (B, D, E, offset, x0) with A and C known: compressed, started, read.
+"""The least-squares step for (B, D, E, offset, x0) with A and C known.
 
 The equations are those of the observer form (`optid.identify.subspace.regressors`). Every complete run of samples has
 its own initial state; those of all but the first run of an experiment are eliminated.
@@ -34,7 +34,7 @@ class Realisation:
     factored: bool = False  # whether channels are rank one in the programme itself
 
     def least_squares(self) -> Array:
-        """Return the unrestricted minimiser z; name the first unknown that the record leaves open (`RankError`)."""
+        """Return the unrestricted minimiser z; an unknown that the record does not determine is a `RankError`."""
         root, norms = self.problem.root, np.linalg.norm(self.problem.root, axis=0)
         lost = np.abs(np.diag(root)) <= 1e-10 * np.where(norms > 0, norms, 1.0)
         if lost.any():
@@ -44,7 +44,7 @@ class Realisation:
         return np.asarray(np.linalg.solve(root, self.problem.target), dtype=float)
 
     def ratios(self) -> dict[str, float]:
-        """Second over first singular value of every channel's unrestricted matrix: zero for a channel of rank one."""
+        """Return the second over the first singular value of every channel's unrestricted matrix."""
         found = {}
         for i, (name, theta) in enumerate(zip(self.form.channels, self.form.thetas(self.least_squares()))):
             if min(theta.shape) > 1:
@@ -65,14 +65,14 @@ class Realisation:
 
     @property
     def names(self) -> list[tuple[str, str, str]]:
-        """Names of the two factors and of the matrix of every channel: ``mu[valve]``, ``mu feedback[level]``."""
+        """Names of the two factors and of the matrix of every channel, such as ``mu[valve]``."""
         x = self.form.expansion
         tails = [f"[{name}]" * (x.m > 1) for name in x.input_names]
         tails += [" feedback" + f"[{x.output_names[family.output]}]" * (x.l > 1) for family in x.feedback]
         return [(f"mu{tail}", f"b{tail}", f"Theta{tail}") for tail in tails]
 
     def start(self) -> dict[str, Array]:
-        """Return the unrestricted minimiser, of factored channels promising factors; errors as `least_squares`."""
+        """Return the unrestricted minimiser, or starts of the factors; errors as `least_squares`."""
         form, z, point = self.form, self.least_squares(), None
         if self.factored:
             point = self.problem.core.point(*starts(self.problem.core, count=1)[0])
@@ -107,8 +107,8 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequ
                      ) -> Realisation:
     """Compress the step from raw channels (N, m + l), or (N, m + 2 l) with simulated outputs, one array per experiment.
 
-    Measured outputs (N, l) are given as ``targets`` where those of the records are partly estimated: feedback and
-    observer read the estimates, which are no equations. Fewer equations than unknowns raise a `RankError`.
+    ``targets`` are the measured outputs (N, l) where some in the records are estimated. Fewer equations than unknowns
+    are a `RankError`.
     """
     x, extra, own = form.expansion, form.extra, slice(form.experiments * form.n, None)
     total = form.size + extra
@@ -124,13 +124,13 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequ
                 wide[:, e * form.n : (e + 1) * form.n] = part[:, : form.n]
                 wide[:, own] = part[:, form.n :]
                 root = add_to_root(root, wide)
-            else:  # a state nobody asks for
+            else:  # the initial state of a later run is eliminated
                 root[own, own] = add_to_root(root[own, own], part[form.n :, form.n :])
     if rows < total:
         raise RankError(f"{rows} equations for {total} unknowns of the step for B, D and x0: use a longer record, "
                         "fewer basis functions or a lower order.")
     size = form.size
-    if extra:  # the equations seen through the instruments: what lies outside them is dropped
+    if extra:  # the equations projected on the instruments
         root = add_to_root(np.zeros((size + 1, size + 1)), root[:size, np.r_[: size - extra, size : total + 1]])
     problem = RankOne(root[:size, :size], root[:size, size], float(root[size, size] ** 2), form.blocks, form.linear,
                       energy)
@@ -138,7 +138,7 @@ def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequ
 
 
 def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
-    """A linear channel has mu = 1; every other a b of unit length, its largest entry positive."""
+    """Return mu and b with mu = 1 for a linear channel, otherwise b of unit length, its largest entry positive."""
     if linear:
         return np.ones(1), b * mu[0]
     length = float(np.linalg.norm(b))
@@ -150,11 +150,11 @@ def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
 
 def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
                 e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
-    """Build the model, its feedback functions in their own basis: what is linear in them becomes L and a constant.
+    """Build the model with the meta data of a record; the linear part of the feedback becomes L and a constant.
 
     The matrices are A (n, n), B (n, m), C (l, n) and D (l, m); mus are the coefficients of the nonlinearity of every
     input, nus those of every feedback family in its orthonormal coordinates, with one column of e (n, s) each. K (n, l)
-    and the offset (l,) of the output are zero where None. The record gives names, units and sampling time.
+    and the offset (l,) of the output are zero where None.
     """
     families = expansion.feedback
     parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]

@@ -5,8 +5,8 @@ With an observer gain L and F = A - L C the outputs
     y(k) = C F^k x0 + sum_{i<k} C F^(k-1-i) ((B - L D) eta(i) + E zeta(i) + L (y(i) - d)) + D eta(k) + d
 
 are linear in the unknowns, whatever the poles of A. L = 0 minimises the simulation error with measured feedback;
-a gain that moves the poles inward suits process noise and models near or beyond the stability limit. Products of
-matrices take the place of a loop over samples; time is the last axis, so that every copy is of long stretches.
+a gain that moves the poles inward suits process noise and models near or beyond the stability limit. Time is the last
+axis; matrix products replace loops over samples.
 """
 
 from collections.abc import Iterable, Iterator
@@ -29,10 +29,10 @@ HELD = 1 << 22  # numbers held at once at most: models with many functions and s
 
 @dataclass(frozen=True, eq=False)
 class ObserverForm:
-    """What is known and how the unknowns are laid out.
+    """The known quantities and the layout of the unknowns.
 
-    The vector of unknowns is z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input
-    and zeta x E_o for an output that is fed back, as `RankOne` wants them.
+    The unknowns are z = [x0 of every experiment; d; vec Theta_1; ...], Theta_i = eta x [B_i; D_i] for an input and
+    zeta x E_o for an output that is fed back.
     """
 
     a: Array  # (n, n)
@@ -72,12 +72,12 @@ class ObserverForm:
 
     @property
     def channels(self) -> list[str]:
-        """Names of the channels in words, those of the feedback last."""
+        """Names of the channels, those of the feedback last."""
         x = self.expansion
         return [*x.input_names, *(f"feedback of {x.output_names[f.output]}" for f in x.feedback)]
 
     def names(self) -> list[str]:
-        """Name the unknowns in words for messages."""
+        """Return the names of the unknowns for messages."""
         named = [f"x0 of experiment {e + 1}" for e in range(self.experiments) for _ in range(self.n)]
         named += ["the offset"] * (self.l * self.offset)
         for channel, (p, b) in zip(self.channels, self.blocks):
@@ -160,8 +160,8 @@ def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterabl
                       ) -> Iterator[tuple[Array, Array]]:
     """Yield the signals (d, T) and the regressors (l, d, n, T) of y_o(k) = sum_{i<k} C_o F^(k-1-i) M s(i) by stretches.
 
-    The regressor of output o is the matrix X_o(k) (d, n), like M transposed, with X_o(k + 1) = X_o(k) F + s(k) C_o, and
-    ``state`` (l, d, n) at the first sample; ``inner`` is F (n, n), ``outputs`` C (l, n).
+    The regressor of output o is X_o(k) (d, n) with X_o(k + 1) = X_o(k) F + s(k) C_o, ``state`` (l, d, n) at the first
+    sample; ``inner`` is F (n, n), ``outputs`` C (l, n).
     """
     (l, n), d = outputs.shape, state.shape[1]  # noqa: E741
     powers = np.empty((BLOCK + 1, n, n))
@@ -175,14 +175,14 @@ def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterabl
     free = powers[:BLOCK].transpose(1, 2, 0).reshape(n, -1)
     for part in parts:
         count = part.shape[1]
-        blocks = count // BLOCK + 1  # the state after the last sample stands in the last block, too
+        blocks = count // BLOCK + 1  # the last block also holds the state after the last sample
         signals = np.zeros((d, blocks * BLOCK))
         signals[:, :count] = part
         signals = signals.reshape(d, blocks, BLOCK).transpose(1, 0, 2).reshape(-1, BLOCK)
         within = (signals @ toeplitz).reshape(blocks, d, l, n, BLOCK + 1)
         starts = np.concatenate([state.transpose(1, 0, 2)[None], within[:-1, ..., BLOCK]]).reshape(-1, n)
         step, decay = d * l, powers[BLOCK]
-        while step < len(starts):  # the sum of all that came before, twice as many blocks each time
+        while step < len(starts):  # sums over the preceding blocks, twice as many each time
             starts[step:] += starts[:-step] @ decay
             step, decay = 2 * step, decay @ decay
         starts[np.abs(starts) < TINY] = 0.0

@@ -1,13 +1,12 @@
 """The shift-invariance step under constraints on the poles: its sequence of programmes, and large orders deflated.
 
 ``min_A ‖Gamma_up A - Gamma_dn‖`` has a closed form; with poles restricted to regions it is not convex in A. The fit
-weighted by P, with A = Q P^-1, is a semidefinite programme. The weight is then undone by convex steps that cannot raise
-the unweighted residual: A alone with P fixed, and the P that leaves A the largest margin. The least-squares residual
-bounds what any A can reach, so that every answer carries a certified suboptimality.
+weighted by P, with A = Q P^-1, is a semidefinite programme. Convex steps then reduce the unweighted residual: A alone
+with P fixed, and the P that gives A the largest margin. The least-squares residual is a lower bound for every A, which
+certifies the suboptimality.
 
-The programme in P and Q grows with the fourth power of the order, so that large orders are deflated first: in the
-Schur form of the least-squares solution the residual splits into columns, and with its invariant subspaces kept, the
-poles that obey stay as they are and the others are constrained a few at a time. The bound is the same.
+The programme in P and Q grows with the fourth power of the order: large orders are deflated in the Schur form of the
+least-squares solution, poles that satisfy the constraints kept and the others constrained a few at a time.
 """
 
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -19,6 +18,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
+from optid.identify.arguments import violations
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
 
@@ -32,7 +32,7 @@ AT_ONCE = 8  # poles that are constrained by one programme where there are more 
 
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """The answer of the step."""
+    """The result of the step."""
 
     a: Array | None  # (n, n), or None where no programme had a point
     residual: float  # ‖Gamma_up A - Gamma_dn‖ (Frobenius) at ``a``; nan without a point
@@ -41,7 +41,7 @@ class Shift:
     # OPTIMAL where ``a`` is the least-squares solution, else that of the programmes: LOCAL where the suboptimality is
     # positive, INACCURATE where a back end was or where a pole lies outside its region
     status: Status
-    reason: str  # one sentence for people
+    reason: str  # one sentence
 
     @property
     def suboptimality(self) -> float:
@@ -90,11 +90,10 @@ Shifting = Generator[Program, Solution, Shift]
 
 
 def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: Programmes) -> Shifting:
-    """Solve ``min ‖up A - down‖`` with the poles where the rules want them; use as ``shift = yield from ...``.
+    """Solve ``min ‖up A - down‖`` with the poles in the regions of the rules; use as ``shift = yield from ...``.
 
-    No programme is posed where the least-squares solution obeys every rule already: the weighted fit would contract
-    poles that need no help. A builder that is no rule about poles is always imposed. ``a`` is None where the regions
-    are empty together or the back end failed; the last programme posed is then the one to explain.
+    No programme is solved where the least-squares solution satisfies every rule. A builder that is no rule about poles
+    is always imposed. ``a`` is None where the last programme is infeasible or the back end failed.
 
     Raises:
         StructureError: shapes that do not fit, or a rule that does not apply to a matrix A.
@@ -105,8 +104,8 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
     free = np.linalg.lstsq(up, down, rcond=None)[0]
     bound = float(np.linalg.norm(up @ free - down))
     verified = all(getattr(rule, "verify", None) is not None for rule in rules)
-    if not _disobeyed(free, rules) and verified:
-        return Shift(free, bound, bound, False, Status.OPTIMAL, "the least-squares solution obeys every rule")
+    if not _violated(free, rules) and verified:
+        return Shift(free, bound, bound, False, Status.OPTIMAL, "the least-squares solution satisfies every rule")
     if len(free) > LARGEST and verified:
         shift = yield from _deflated(up, down, free, bound, rules, programmes)
         if shift is not None:
@@ -125,7 +124,7 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
             break
         trial = step.recover(solution.values)
         residual, fall = float(np.linalg.norm(up @ trial - down)), 0.0
-        if residual < best and not set(_disobeyed(trial, rules)) - set(_disobeyed(a, rules)):
+        if residual < best and not set(_violated(trial, rules)) - set(_violated(a, rules)):
             fall, a, best, found = best - residual, trial, residual, solution
         if last or fall <= ENOUGH * (best - bound) or best - bound <= TINY * step.size:
             break
@@ -138,19 +137,19 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
 
 def _deflated(up: Array, down: Array, free: Array, bound: float, rules: Sequence[Any], programmes: Programmes
               ) -> Generator[Program, Solution, Shift | None]:
-    """Solve the step block by block of the real Schur form A = Z T Z': poles that obey, then a few at a time.
+    """Solve the step block by block of the real Schur form A = Z T Z': poles that satisfy the rules, then a few each.
 
-    The columns of ``(up A - down) Z`` that belong to a block are ``up_1 X + up_2 S - down_2``, with X free: without the
-    range of up_1, a small step in S. None where the rules speak of the poles together: none disobeys by itself.
+    The columns of ``(up A - down) Z`` of a block are ``up_1 X + up_2 S - down_2``, with X free: without the range of
+    up_1, a small step in S. None where no pole violates the rules by itself.
     """
     from scipy.linalg import schur
 
-    def obeys(re: float, im: float) -> bool:
-        return not _disobeyed(np.array([[re, im], [-im, re]]), rules)
+    def satisfies(re: float, im: float) -> bool:
+        return not _violated(np.array([[re, im], [-im, re]]), rules)
 
     try:
-        found: Any = schur(free, output="real", sort=obeys)
-    except np.linalg.LinAlgError:  # poles too close to be told from each other: all of them are constrained
+        found: Any = schur(free, output="real", sort=satisfies)
+    except np.linalg.LinAlgError:  # poles too close to be reordered: all of them are constrained
         found = (*schur(free, output="real"), 0)
     triangle, basis, kept = found
     n, ends, status, reason = len(free), [int(kept)], Status.LOCAL, ""
@@ -179,20 +178,18 @@ def _deflated(up: Array, down: Array, free: Array, bound: float, rules: Sequence
 def _judged(a: Array, up: Array, down: Array, bound: float, status: Status, reason: str, rules: Sequence[Any]) -> Shift:
     residual = float(np.linalg.norm(up @ a - down))
     excess = residual - bound
-    said = f"the constrained shift step exceeds the least-squares residual {bound:.3g} by {max(excess, 0.0):.2g}"
-    if outside := _disobeyed(a, rules):
+    reasons = [f"the constrained shift step exceeds the least-squares residual {bound:.3g} by {max(excess, 0.0):.2g}"]
+    if outside := _violated(a, rules):
         status, reason = Status.INACCURATE, "; ".join(outside)
     if status in (Status.OPTIMAL, Status.LOCAL):
-        status, reason = (Status.OPTIMAL if excess <= TINY * np.linalg.norm(down) else Status.LOCAL), said
-    else:
-        reason = f"{said}; {reason}" if reason else said
-    return Shift(a, residual, bound, True, status, reason)
+        status = Status.OPTIMAL if excess <= TINY * np.linalg.norm(down) else Status.LOCAL
+    elif reason:
+        reasons.append(reason)
+    return Shift(a, residual, bound, True, status, "; ".join(reasons))
 
 
-def _disobeyed(a: Array, rules: Sequence[Any]) -> list[str]:
-    model = SimpleNamespace(poles=np.linalg.eigvals(a))
-    checks = [rule.verify for rule in rules if getattr(rule, "verify", None) is not None]
-    return [sentence for check in checks if (sentence := check(model))]
+def _violated(a: Array, rules: Sequence[Any]) -> list[str]:
+    return violations(SimpleNamespace(poles=np.linalg.eigvals(a)), rules)
 
 
 def _definite(p: Array) -> bool:

@@ -1,4 +1,4 @@
-"""Signal subspaces: streaming trackers, the theorems behind them, certificates and reconstruction."""
+"""Signal subspaces: streaming trackers, stationary points of their loss, certificates and reconstruction."""
 
 from optid.identify.tracking.subspaces import (
     FantopeCertificate,

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.identify.recursive.kernel import rotate
 
-WEAK = 1e-8
-"""Pivot of the Gram matrix of the rows of W that are present, relative to its diagonal, below which they do not
-determine the coordinates of a sample."""
+WEAK = 1e-8  # relative pivot of the Gram matrix of the rows of W present below which the coordinates are undetermined
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -29,7 +27,7 @@ def track(
         basis: (n, r) W.
         root: (r, r) upper triangular factor R, diagonal >= 0.
         sums: (2,) weighted count of samples used, and weighted sum of |e|^2 by entries present, scaled to n entries.
-        counts: (3,) samples seen, used, and passed over because their entries do not determine the coordinates.
+        counts: (3,) samples seen, used, and skipped because their entries do not determine the coordinates.
         x: (T, n) samples; NaN = missing.
         forgetting: in (0, 1].
         orthonormal: whether W is kept orthonormal (OPAST).

@@ -34,7 +34,7 @@ def as_covariance(covariance: ArrayLike) -> Array:
     """Return a covariance (n, n); one that is not square, finite, symmetric and semidefinite is a `DataError`."""
     c = np.asarray(covariance, dtype=float)
     if c.ndim != 2 or c.shape[0] != c.shape[1] or not c.size:
-        raise DataError(f"covariance: a square matrix is needed; got shape {c.shape}.")
+        raise DataError(f"covariance: must be a square matrix; got shape {c.shape}.")
     if not np.isfinite(c).all():
         i, j = np.argwhere(~np.isfinite(c))[0]
         raise DataError(f"covariance: entry ({i}, {j}) is {c[i, j]}; estimate it from complete samples.")
@@ -53,19 +53,14 @@ def as_basis(basis: ArrayLike, n: int, what: str = "basis") -> Array:
     w = np.asarray(basis, dtype=float)
     w = w[:, None] if w.ndim == 1 else w
     if w.ndim != 2 or w.shape[0] != n or not 0 < w.shape[1] <= n:
-        raise DataError(f"{what}: an array ({n}, r) with r from 1 to {n} is needed; got shape {w.shape}.")
+        raise DataError(f"{what}: must be an array ({n}, r) with r from 1 to {n}; got shape {w.shape}.")
     if not np.isfinite(w).all():
         raise DataError(f"{what}: every entry must be finite.")
     return w
 
 
 def orthonormal(basis: ArrayLike, what: str = "basis", n: int | None = None) -> Array:
-    """Return an orthonormal basis (n, r) of the columns; any n where none is given.
-
-    Raises:
-        DataError: as `as_basis`.
-        RankError: columns that depend on one another.
-    """
+    """Return an orthonormal basis (n, r) of the columns; dependent columns are a `RankError`, others as `as_basis`."""
     w = as_basis(basis, len(np.asarray(basis)) if n is None else n, what)
     length = np.linalg.norm(w, axis=0)
     if not length.all():
@@ -94,7 +89,7 @@ def principal_angles(first: ArrayLike, second: ArrayLike) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class StationaryPoint:
-    """One matrix W held against the theorems: its rank, J(W), and the norm of the gradient of J there.
+    """A matrix W judged by the theorems: its rank, J(W), and the norm of the gradient of J there.
 
     Attributes:
         indices: eigenvectors of C that span it, 0 for the dominant one; () for a W that was given.
@@ -169,7 +164,7 @@ def stationary_points(covariance: ArrayLike, r: int, among: Sequence[int] | None
 def _eigenvectors(indices: Sequence[int], n: int, what: str) -> list[int]:
     chosen = [int(i) for i in indices]
     if not chosen or len(set(chosen)) != len(chosen) or not all(0 <= i < n for i in chosen):
-        raise StructureError(f"{what}={chosen}: distinct eigenvectors from 0 to {n - 1} are needed.")
+        raise StructureError(f"{what}={chosen}: must be distinct eigenvectors from 0 to {n - 1}.")
     return chosen
 
 
@@ -180,13 +175,13 @@ def _descending(c: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
-    """An orthogonal projector of rank r and what it loses.
+    """An orthogonal projector of rank r and its loss.
 
     Attributes:
         basis: (n, r) orthonormal.
         loss: tr((I - P) C), mean energy of x - P x.
-        optimal_loss: the same for the r dominant eigenvectors, no constraint.
-        worst_loss: bound on the loss that holds before the constraint is looked at, only its dimension is used.
+        optimal_loss: the same for the r dominant eigenvectors, without constraint.
+        worst_loss: bound on the loss from the dimension of the constraint alone.
         kind: "optimal", "sub-optimal" or "constrained".
     """
 
@@ -221,11 +216,7 @@ def optimal_reconstruction(covariance: ArrayLike, r: int) -> Reconstruction:
 
 
 def suboptimal_reconstruction(covariance: ArrayLike, indices: Sequence[int]) -> Reconstruction:
-    """Project on chosen eigenvectors, 0 for the dominant one; the excess is what their eigenvalues lack.
-
-    Raises:
-        StructureError: eigenvectors that do not exist or are named twice.
-    """
+    """Project on chosen eigenvectors, 0 for the dominant one; repeated or unknown ones are a `StructureError`."""
     c = as_covariance(covariance)
     chosen = _eigenvectors(indices, len(c), "indices")
     found = constrained_reconstruction(c, len(chosen), within=_descending(c)[1][:, chosen])
@@ -270,18 +261,17 @@ def constrained_reconstruction(covariance: ArrayLike, r: int, *, within: ArrayLi
 def surviving(n: int, lost: Sequence[int]) -> Array:
     """Return the directions (n, n - lost) that remain when coordinates are lost.
 
-    Raises:
-        StructureError: coordinates that do not exist, or none left.
+    Coordinates that do not exist, or none left, are a `StructureError`.
     """
     gone = sorted({int(i) for i in lost})
     if not all(0 <= i < n for i in gone) or len(gone) >= n:
-        raise StructureError(f"lost={gone}: coordinates from 0 to {n - 1}, not all of them, are needed.")
+        raise StructureError(f"lost={gone}: must be coordinates from 0 to {n - 1}, not all of them.")
     return np.delete(np.eye(n), gone, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class FantopeCertificate:
-    """Energy that a subspace holds and a proven bound on the energy of any subspace of its dimension.
+    """Energy of a subspace, and a proven bound on the energy of any subspace of its dimension.
 
     Attributes:
         energy: tr(P C) of the projector on the subspace.
@@ -299,7 +289,7 @@ class FantopeCertificate:
 
     @property
     def gap(self) -> float:
-        """Energy that a better subspace could hold in addition, at most."""
+        """Bound less energy."""
         return self.bound - self.energy
 
     @property
@@ -336,6 +326,6 @@ def fantope_certificate(covariance: ArrayLike, basis: ArrayLike, t: float | None
     values = _descending(space.T @ c @ space)[0]
     t = float(values[r - 1] + values[min(r, len(values) - 1)]) / 2 if t is None else float(t)
     if not np.isfinite(t):
-        raise StructureError(f"t={t!r}: a finite number is needed.")
+        raise StructureError(f"t={t!r}: must be a finite number.")
     bound = float(r * t + np.sum(np.maximum(values - t, 0)))
     return FantopeCertificate(float(np.trace(w.T @ c @ w)), bound, t, float(np.trace(c)), tuple(gone))

@@ -10,29 +10,27 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, check_integer
+from optid.arrays import Array, check_integer, one_of
 from optid.errors import DataError, StructureError
 from optid.identify.recursive.state import SavedState, as_block, forgetting_factor
 from optid.identify.tracking.subspaces import as_basis, orthonormal, principal_angles
 
 METHODS = ("past", "opast")
 MISSING = ("fill", "skip", "refuse")
-RENEWED = 1024
-"""Samples after which the columns of an orthonormal W are orthonormalised again, against the creep of rounding."""
+RENEWED = 1024  # samples after which an orthonormal W is orthonormalised again, against rounding
 
 
 class SubspaceTracker(SavedState):
     """The dominant r-dimensional subspace of a stream of zero-mean vectors; `update` changes it.
 
-    A sample with missing entries is used through its least-squares coordinates on the rows of W that are present: the
-    missing entries are those the subspace says. Where the entries do not determine the coordinates the sample is passed
-    over and counted.
+    A sample with missing entries is used through its least-squares coordinates on the rows of W that are present; where
+    these do not determine the coordinates, it is skipped and counted.
 
     Attributes:
-        W: (n, r) the basis as the recursion carries it.
+        W: (n, r) the basis of the recursion.
         root: (r, r) triangular factor of the weighted sum of y y^T, y = W^T x.
         sums: (2,) weighted count of samples and weighted sum of residual energy.
-        counts: (3,) samples seen, used, passed over.
+        counts: (3,) samples seen, used, skipped.
     """
 
     kind, arrays = "tracker", ("W", "root", "sums", "counts")
@@ -61,11 +59,10 @@ class SubspaceTracker(SavedState):
         """
         self.n = check_integer(n, "n", 2)
         self.r = check_integer(r, "r", high=self.n - 1)
-        if method not in METHODS or missing not in MISSING:
-            raise StructureError(f"method={method!r}, missing={missing!r}: use one of {', '.join(METHODS)} and one of "
-                                 f"{', '.join(MISSING)}.")
+        one_of("method", method, METHODS)
+        one_of("missing", missing, MISSING)
         if not (np.isfinite(information) and information > 0):
-            raise StructureError(f"information={information!r}: a positive number is needed.")
+            raise StructureError(f"information={information!r}: must be a positive number.")
         self.method, self.forgetting, self.missing = method, forgetting_factor(forgetting), missing
         self.names = tuple(names) if names is not None else tuple(f"x{i + 1}" for i in range(self.n))
         if len(self.names) != self.n:
@@ -78,10 +75,10 @@ class SubspaceTracker(SavedState):
         self.sums, self.counts = np.zeros(2), np.zeros(3, dtype=np.int64)
 
     def update(self, x: ArrayLike) -> Array:
-        """Follow a block (N, n) or one sample (n,); return the distance (N,) of every sample from the subspace before.
+        """Process a block (N, n) or one sample (n,); return the distance (N,) of every sample from the subspace before.
 
-        It is NaN where the sample was not used. Another shape, an infinite entry, or a missing one where
-        missing="refuse", is a `DataError` that names channel and sample.
+        It is NaN where the sample was not used. Another shape, an infinite entry, or a missing one with
+        missing="refuse", is a `DataError`.
         """
         from optid.identify.tracking.kernel import track  # compiled code is loaded with the first sample
 
@@ -128,7 +125,7 @@ class SubspaceTracker(SavedState):
 
     @property
     def rank(self) -> int:
-        """Number of directions that hold signal, at most r, by description length (Wax and Kailath 1985).
+        """Number of signal directions, at most r, by description length (Wax and Kailath 1985).
 
         The n - r eigenvalues that are not tracked count as equal to `floor`, which makes the criterion generous.
         """
@@ -148,7 +145,7 @@ class SubspaceTracker(SavedState):
         seen, used, passed = self.counts.tolist()
         head = f"{self.method.upper()}, {self.r} of {self.n} dimensions, forgetting {self.forgetting:g}"
         named = head.replace(" dimensions", f" dimensions ({', '.join(self.names)})")
-        lost = f", {passed} passed over" if passed else ""
+        lost = f", {passed} skipped" if passed else ""
         energies = " ".join(f"{v:.4g}" for v in self.energies[:8])
         return (f"{named if len(named) <= 80 else head}\n{seen} samples, {used} used{lost}\n"
                 f"energies {energies}; noise {self.floor:.4g}; directions with signal {self.rank}")

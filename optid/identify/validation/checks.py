@@ -1,7 +1,4 @@
-"""How good models are on a record: errors of one-step prediction and simulation, residual tests, structure.
-
-Several models are compared by each predictor over the samples that all of them predict.
-"""
+"""Validation and comparison of models on a record: prediction and simulation errors, residual tests, structure."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,27 +30,26 @@ from optid.models.functions import StaticFunction, has_feedback, static_function
 from optid.registry import Rendered
 
 LAGS = 25
-KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent signal"}
-"""What the argument of a static function is, by the family of the function."""
+KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent signal"}  # arguments of static functions
 ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(Rendered):
-    """What `validate` found on the record named `data`; `print` it.
+    """The result of `validate` on the record named `data`; `print` it.
 
     Attributes:
         horizon: samples ahead of the prediction besides one.
         predictors: errors, by output, of every predictor: "one step", "5 steps", "measured feedback" (the simulation
-            that takes the outputs in the feedback from the record; only of models with nonlinear feedback),
-            "simulation" (its SNR is that of the output noise). `notes` says why a simulation is missing.
+            with measured outputs in the nonlinear feedback, if there is one), "simulation" (its SNR is that of the
+            output noise; `notes` gives the reason where it is missing).
         experiments: {predictor: {output: errors of each experiment}}; empty with one experiment.
         autocorrelations: whiteness test of the residuals by output.
         cross_correlations: independence of residuals and inputs by (output, input).
         between: independence of residuals and the past of those of the other outputs, by (output, other output).
-        structure: structure test of the record, or None when `notes` says why, or the model feeds outputs back.
+        structure: structure test of the record; None where there is nothing to test, or for a reason in `notes`.
         outside: share of samples outside the interval of the basis, by channel.
-        notes: what weakens the result; each was also given as a DataWarning.
+        notes: limitations of the result; each is also a DataWarning.
         predicted: predicted outputs (N, l) per experiment of every predictor, NaN where there is none.
         residuals: one-step residuals (N, l) per experiment, NaN = missing.
     """
@@ -113,8 +109,8 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
         StructureError: an x0 that cannot be read, or a horizon that is not a positive integer.
 
     Warns:
-        DataWarning: the record does not look Hammerstein or does not determine a free model, the model is unstable, no
-            simulation is possible, or inputs lie outside the interval of their basis; also in `Validation.notes`.
+        DataWarning: a failed or impossible structure test, an unstable model, no simulation, or inputs outside the
+            interval of their basis; also in `Validation.notes`.
     """
     horizon, raw = check_integer(horizon, "horizon"), data.raw()
     predicted = {ONE_STEP: tuple(one_step(model, raw))}
@@ -144,7 +140,7 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
              for word, arrays in predicted.items()}
     errors = {word: {name: [Measures.of(y[:, o], p[:, o]) for y, p in several] for o, name in enumerate(raw.outputs)}
               for word, several in pairs.items()}  # over all experiments, then over each
-    # a residual that is nothing but rounding is neither white nor independent of anything
+    # residuals of rounding errors are not tested
     rounding = [errors[ONE_STEP][name][0].rmse <= ROUNDING * float(np.nanmax(np.abs(y[:, o])))
                 for o, name in enumerate(raw.outputs)]
     tested = [np.where(rounding, 0.0, r) for r in residuals]
@@ -184,21 +180,21 @@ def _simulated(model: Any, data: Data, word: str, x0: Any, notes: list[str]) -> 
 def shares_outside(model: Any, data: Data) -> Iterator[tuple[StaticFunction, Array, float]]:
     """Yield the functions of a model, samples of their arguments, and the share outside the intervals of the bases.
 
-    Straight lines are known everywhere; functions of a latent signal that runs away in the record are left out.
+    Linear functions have no samples; functions of a latent signal that diverges are left out.
     """
     for function in static_functions(model):
         try:
             x = np.zeros(0) if function.is_linear else function.samples(data)
-        except OptidError:  # the simulation says so
+        except OptidError:
             continue
         outside = np.count_nonzero(function.nonlinearity.basis.is_outside(x))
         yield function, x, outside / max(int(np.sum(~np.isnan(x))), 1)
 
 
 def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> Structure | None:
-    """Test whether a record has the structure of a model, None where nothing is to be tested; notes say why.
+    """Test whether a record has the structure of a model; None where nothing is tested, for a reason added to notes.
 
-    Hammerstein models answer for their class, models with feedback or latent functions for their own residuals.
+    A Hammerstein model is tested for its class, a model with feedback or latent functions by its own residuals.
     """
     beyond = has_feedback(model) or bool(getattr(model, "latent", ()))
     if not beyond and not static_functions(model):
@@ -216,15 +212,15 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
         return None
     if not found.passed:
         notes.append(
-            f"The record {found.finding}; that saves {100 * found.saving:.2g} % of the "
-            f"residual variance (p = {found.p_value:.1g}). Consider functions of latent signals (lfr.exact), a Wiener "
-            "model, or nonlinear feedback.")
+            f"The record is {found.finding}; modelling this would reduce the residual variance by "
+            f"{100 * found.saving:.2g} % (p = {found.p_value:.1g}). Consider functions of latent signals (lfr.exact), "
+            "a Wiener model, or nonlinear feedback.")
     return found
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Rendered):
-    """What `compare_models` found; `print` it, or write a page with `optid.show.report.write_comparison`.
+    """The result of `compare_models`; `print` it, or write a page with `optid.show.report.write_comparison`.
 
     Attributes:
         names: one per model.
@@ -265,7 +261,7 @@ def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizo
     """Compare several models on one record, preferably one that none of them was estimated from.
 
     Args:
-        models: {name: model}, or models, which are then named by what they are.
+        models: {name: model}, or models, which are then named by title and orders.
         data: the record.
         horizon: samples ahead of one more prediction.
         x0: initial state of the simulations, as the models take it.
@@ -279,7 +275,7 @@ def compare_models(models: Mapping[str, Any] | Sequence[Any], data: Data, horizo
         raise StructureError("there is no model to compare")
     raw = data.raw()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # they stand in the notes of the validations
+        warnings.simplefilter("ignore", DataWarning)  # the notes of the validations contain them
         validations = tuple(validate(model, raw, x0=x0, horizon=horizon) for model in named.values())
         curves = tuple(fit_by_horizon(model, raw) for model in named.values())
     nothing = tuple(np.full(e.y.shape, np.nan) for e in raw.experiments)

@@ -49,10 +49,9 @@ class Correlation:
 
 def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25, *, past: Sequence[Array] | None = None,
                     other: str | None = None) -> Correlation:
-    """Test whether residuals depend on their own past by Ljung and Box's statistic, or on that of another output.
+    """Test whether residuals depend on their own past (Ljung and Box), or on that of another output's residuals.
 
-    Samples of the same instant may be correlated: the noises of two outputs often are. The residuals of another output
-    are taken to be white, too, which their own test decides.
+    The other residuals are taken to be white; samples of the same instant may be correlated.
 
     Args:
         residuals: (N,) per experiment, NaN = missing.

@@ -1,4 +1,4 @@
-"""F tests on Gram matrices of columns beside each other: of further columns, and of rank one."""
+"""F tests on Gram matrices: of further columns, and of rank one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +14,7 @@ from optid.statistics.factors import dependent_column, root_of_gram
 from optid.structures.bilinear import minimise
 from optid.structures.rank_one import RankOne, matrices
 
-DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a direction of its own
+DISTINCT = 1e-4  # smallest eigenvalue of the correlations of alternatives that counts as a further direction
 
 
 @dataclass(frozen=True)
@@ -25,36 +25,39 @@ class FTest:
     saving: float = 0.0
 
     @classmethod
-    def of(cls, more: float, extra: int, rest: float, spare: int, unnoticed: float) -> "FTest":
-        """Compare what `extra` parameters save, `more`, with the rest at `spare` degrees of freedom.
+    def of(cls, more: float, extra: int, rest: float, spare: int, negligible: float) -> "FTest":
+        """Compare the reduction `more` by `extra` parameters with the rest at `spare` degrees of freedom.
 
-        The hypothesis is that they would save no more than a share `unnoticed` of the variance if the record were long
-        enough to know them: the statistic follows a noncentral F distribution at that share. The saving discounts the
-        degrees of freedom.
+        Under the hypothesis the true reduction is at most a share `negligible` of the variance: the statistic follows a
+        noncentral F distribution at that share. The saving discounts the degrees of freedom.
         """
         if extra <= 0 or rest <= 0:
             return cls()
         free, restricted = rest / spare, (rest + max(more, 0.0)) / (spare + extra)
         ratio = max(more, 0.0) / extra / free
-        p = 1 - ncfdtr(extra, spare, unnoticed * (spare + extra), ratio) if unnoticed else fdtrc(extra, spare, ratio)
+        p = 1 - ncfdtr(extra, spare, negligible * (spare + extra), ratio) if negligible else fdtrc(extra, spare, ratio)
         return cls(float(max(p, 0.0)), float(1 - free / restricted))
 
 
-def tested(gram: Array, edges: list[int], rows: int, words: Sequence[str], unnoticed: float) -> dict[str, FTest]:
+def tested(gram: Array, edges: list[int], rows: int, words: Sequence[str], negligible: float) -> dict[str, FTest]:
     """Test every block but the first and the last, the residual, beside the first; those that the rows allow."""
     tests = {}
     for name, first, last in zip(words, edges[1:], edges[2:-1]):
         keep = np.r_[: edges[1], first:last, edges[-1] - 1]
         if rows >= 1.5 * keep.size:
-            tests[name] = _added(gram[np.ix_(keep, keep)], edges[1], rows, unnoticed)
+            tests[name] = _added(gram[np.ix_(keep, keep)], edges[1], rows, negligible)
     return tests
 
 
 def regressed(gram: Array) -> Array:
-    """Return the coefficients of the last column on the others, without directions that hardly differ."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    scaled = gram / np.outer(scale, scale)
+    """Return the coefficients of the last column on the others; nearly dependent directions are left out."""
+    scaled, scale = _scaled(gram)
     return np.linalg.pinv(scaled[:-1, :-1], rcond=1e-10, hermitian=True) @ scaled[:-1, -1] * scale[-1] / scale[:-1]
+
+
+def _scaled(gram: Array) -> tuple[Array, Array]:
+    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    return gram / np.outer(scale, scale), scale
 
 
 def _distinct(gram: Array, least: float) -> Array:
@@ -63,10 +66,9 @@ def _distinct(gram: Array, least: float) -> Array:
     return vectors[:, values > least] / np.sqrt(values[values > least])
 
 
-def _added(gram: Array, n: int, rows: int, unnoticed: float) -> FTest:
-    """Test whether columns n ... of the Gram matrix [additive | alternatives | residual] save anything."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    scaled = gram / np.outer(scale, scale)
+def _added(gram: Array, n: int, rows: int, negligible: float) -> FTest:
+    """Test whether columns n ... of the Gram matrix [additive | alternatives | residual] reduce the residuals."""
+    scaled, _ = _scaled(gram)
     sound = _distinct(scaled[:n, :n], 1e-10)
     half = sound.T @ scaled[:n, n:]
     left = scaled[n:, n:] - half.T @ half
@@ -76,7 +78,7 @@ def _added(gram: Array, n: int, rows: int, unnoticed: float) -> FTest:
     more = float(np.sum((distinct.T @ (left[:-1, -1] / size)[new]) ** 2))
     extra = distinct.shape[1]
     rest = max(float(left[-1, -1]) - more, EXPLAINED)
-    return FTest.of(more, extra, rest, rows - sound.shape[1] - extra, unnoticed)
+    return FTest.of(more, extra, rest, rows - sound.shape[1] - extra, negligible)
 
 
 def rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> RankOne:
@@ -90,11 +92,10 @@ def rank_one(gram: Array, blocks: tuple[tuple[int, int], ...], linear: int) -> R
 
 
 def rank_one_test(gram: Array, theta: Array, bs: Sequence[Array], blocks: tuple[tuple[int, int], ...], rows: int,
-              unnoticed: float) -> tuple[FTest, list[float]]:
+                  negligible: float) -> tuple[FTest, list[float]]:
     """Test rank one of every block of [1 | blocks | fine | missed | residual]; also second over first singular values.
 
-    The fine functions through the leading filter stay free, and so does what the filters miss: what the blocks miss of
-    f must not pass for a second nonlinearity.
+    The fine functions through the leading filter and the missed parts stay free: they are no second nonlinearity.
     """
     size, n = 1 + sum(p * j for p, j in blocks), theta.size
     leading = [np.kron(b[:, None], np.eye(p)) for (p, _), b in zip(blocks, bs)]
@@ -116,11 +117,11 @@ def rank_one_test(gram: Array, theta: Array, bs: Sequence[Array], blocks: tuple[
     ratios = [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in singular]
     extra, rest = sum((p - 1) * (j - 1) for p, j in blocks), max(problem.remainder, EXPLAINED * gram[-1, -1])
     more = minimise(problem, count=3).value - rest if extra else 0.0
-    return FTest.of(more, extra, rest, rows - len(problem.target), unnoticed), ratios
+    return FTest.of(more, extra, rest, rows - len(problem.target), negligible), ratios
 
 
 def _beside(gram: Array, coarse: Array, fine: Array, whole: bool = False) -> Array:
-    """Combinations (columns of `gram`) of fine columns that coarse ones do not give: what they add, or as a whole."""
+    """Combinations of fine columns that coarse ones do not contain: what they add, or as a whole."""
     fine = fine / np.sqrt(np.maximum(np.einsum("ij,ij->j", fine, gram @ fine), 1e-300))
     inner = np.linalg.pinv(coarse.T @ gram @ coarse, rcond=1e-12, hermitian=True)
     added = fine - coarse @ (inner @ (coarse.T @ gram @ fine))

@@ -1,8 +1,7 @@
-"""What a model says about a record, and how far from the record it is.
+"""Predictions of a record by a model, and their errors.
 
-One step ahead uses the outputs up to the sample before; the simulation uses none. Between them stands, for models that
-feed outputs back through static functions, the simulation that takes these outputs from the record (theory of
-subspace identification with nonlinear feedback: P1, P2 and P3).
+The one-step-ahead prediction uses the outputs up to the sample before, the simulation uses none. For models with
+nonlinear feedback the simulation with measured feedback takes the outputs in the feedback from the record.
 """
 
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
 
 
 def predictors(model: Any) -> tuple[str, ...]:
-    """Return the words of the predictors that differ for this model."""
+    """Return the names of the predictors that differ for this model."""
     return (ONE_STEP, MEASURED, SIMULATION) if has_feedback(model) else (ONE_STEP, SIMULATION)
 
 
@@ -44,7 +43,7 @@ def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -
 
 
 def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
-    """Return what `simulated` does; NaN where an input is missing or the model runs away."""
+    """Return what `simulated` does; NaN where an input is missing or the simulation diverges."""
     try:
         return simulated(model, data, word)
     except DataError:
@@ -59,9 +58,9 @@ class Measures:
         fit: 100 (1 - |y - yhat| / |y - mean y|), in %; 100 is perfect, the mean scores 0.
         vaf: variance accounted for, 100 (1 - var(y - yhat) / var y), in %.
         rmse: root of the mean squared error, in output units.
-        e_n: mean squared error (1/N) sum (y - yhat)^2, as the source prints it; perhaps its root was lost: rmse.
-        snr: sum y^2 / sum (y - yhat)^2 as the source prints it, a ratio of energies.
-        snr_amplitude: the root of that, a ratio of amplitudes.
+        e_n: mean squared error (1/N) sum (y - yhat)^2.
+        snr: sum y^2 / sum (y - yhat)^2, a ratio of energies.
+        snr_amplitude: its root, a ratio of amplitudes.
         samples: number of samples N.
     """
 
@@ -118,7 +117,7 @@ def prediction_fit(model: Any, data: Data, word: str = ONE_STEP) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class HorizonCurve(Rendered):
-    """Fits of the predictions so many samples ahead; `print` it.
+    """Fits of the predictions by horizon; `print` it.
 
     Attributes:
         outputs: names of the outputs.

@@ -1,20 +1,17 @@
-"""Does a record look Hammerstein? Then samples at different lags never multiply, and every lag sees the same f.
+"""Test of the Hammerstein structure of a record: no products of samples at different lags, one f at all lags.
 
 A Hammerstein system with additive output noise of any colour obeys
 
     y(k) = c + sum_c sum_i h_c(i) f_c(u_c(k - i)) + v(k).
 
-Two consequences are tested, and neither needs an order or a noise model: (1) functions of single input samples explain
-all of y that the input explains, so that alternatives (`structure_alternatives`) save nothing: products of samples at
-different lags, the mark of a Wiener system, functions of an output, fed back or not, functions behind a part of the
-poles, a gain that changes; (2) the matrix of coefficients, lags times functions, has rank one. What the functions and
-filters miss of a Hammerstein system is completed by finer functions and further lags, and a share of the variance too
-small to notice is allowed for in the distribution of every test.
+Two consequences are tested without an order or a noise model: (1) alternatives (`structure_alternatives`) reduce no
+residuals: products of samples at different lags, as in a Wiener system, functions of an output, fed back or not,
+functions behind some of the poles, a gain that changes; (2) the matrix of coefficients, lags times functions, has rank
+one. Finer functions and further lags complete the model; a negligible share of the variance is allowed in every test.
 
-Lags are compressed by a few filters (`structure_design`). An autoregression fitted to the residuals makes the noise
-white, and since filtering in time leaves (1) and (2) as they are, F tests on the filtered columns hold for noise of
-any colour. What is regressed on them are the residuals of the best Hammerstein model rather than y: the statistics are
-the same, and keep their digits where hardly any noise is left. All columns exist chunk by chunk only.
+Lags are compressed by a few filters (`structure_design`). An autoregression fitted to the residuals whitens the noise;
+filtering in time changes neither (1) nor (2), so that F tests on the filtered columns hold for noise of any colour. The
+residuals of the best Hammerstein model are regressed instead of y, which keeps the digits where there is little noise.
 Sources: Lagrange-multiplier tests of nonlinear regressions (Engle 1984); higher-order correlations as structure tests
 (Billings and Voon 1986); rank one (Bai 1998).
 """
@@ -38,18 +35,15 @@ from optid.structures.rank_one import matrices
 
 WHITE = np.ones(1)
 SIGNIFICANT = 5e-3
-UNNOTICED = 0.003
-"""Share of the residual variance that another structure may save in truth while a record counts as Hammerstein: the
-functions and filters of the test follow a system up to that."""
-PRODUCTS = "inputs at different lags act together, as in a Wiener system"
-RANK = "different lags see different nonlinearities"
+NEGLIGIBLE = 0.003  # share of the residual variance within which functions and filters follow any Hammerstein system
+PRODUCTS = "products of inputs at different lags, as in a Wiener system"
+RANK = "different nonlinearities at different lags"
 FUNCTIONS = "functions of the inputs explain a part of the residuals"
+# largest order of the autoregression, and the share of the rows that it must leave where samples are missing
 NOISE_ORDER, KEPT = 12, 0.4
-"""Largest order of the autoregression, and the share of the rows that it must leave where samples are missing."""
+# regressions on fine functions, one on the filters between them; share of the variance they must leave to be used
 TURNS, SHARPER = 3, 0.99
-"""Regressions on fine functions, one on the filters between them; share of the variance they must leave to be used."""
-SAMPLES = 30_000
-"""The test reads the beginning of every experiment, so many samples in all: what they do not show is not noticeable."""
+SAMPLES = 30_000  # samples read, from the beginning of every experiment
 
 
 @dataclass(frozen=True)
@@ -58,10 +52,10 @@ class Structure:
 
     Attributes:
         ratios: second over first singular value of lags times functions by input, the largest over the outputs.
-        p_value: of the hypothesis that the record is Hammerstein, up to what is not noticeable, all tests together
-            (Bonferroni); 1 when nothing is to be tested.
-        saving: share of the residual variance that the most telling alternative saves.
-        alternative: its words.
+        p_value: of the hypothesis that the record has Hammerstein structure, up to a negligible share of the variance,
+            all tests together (Bonferroni); 1 when nothing is to be tested.
+        saving: share of the residual variance by which the most significant alternative reduces it.
+        alternative: its name.
         p_values: of every alternative by output.
     """
 
@@ -73,35 +67,29 @@ class Structure:
 
     @property
     def passed(self) -> bool:
-        """Whether the record looks Hammerstein."""
+        """Whether the hypothesis is kept."""
         return self.p_value >= SIGNIFICANT
 
     @property
     def finding(self) -> str:
-        """What the tests say, in words."""
-        kind = "look Hammerstein" if RANK in self.alternatives else "look like the model"
-        return kind.replace("look", "looks", 1) if self.passed else f"does not {kind}: {self.alternative}"
-
-    @property
-    def alternatives(self) -> set[str]:
-        """What has been tested."""
-        return {words for each in self.p_values.values() for words in each}
+        """The outcome in words."""
+        kind = "a Hammerstein system" if any(RANK in each for each in self.p_values.values()) else "the model"
+        return f"consistent with {kind}" if self.passed else f"not consistent with {kind}: {self.alternative}"
 
 
 def structure_test(data: Data, simulated: Sequence[Array] | None = None) -> Structure:
     """Test whether a record comes from static nonlinearities of the inputs followed by linear dynamics.
 
-    With the simulated outputs of a model of another kind, such as nonlinear feedback, the test is whether functions of
-    the inputs, of these outputs, or of time explain what it leaves. The inputs must not depend on the noise: in closed
-    loop the test says nothing. Of a long record, the first 30,000 samples are read, spread over the experiments in
-    proportion.
+    The inputs must not depend on the noise: in closed loop the test is not valid. Of a long record, the first 30,000
+    samples are read, spread over the experiments in proportion.
 
     Args:
-        data: the record; NaN = missing, several experiments as they are.
-        simulated: outputs of a model, (N, l) by experiment, which is tested in place of the best Hammerstein model.
+        data: the record; NaN = missing.
+        simulated: outputs of another model, (N, l) by experiment: the test is then whether functions of the inputs, of
+            these outputs, or of time explain its residuals.
 
     Raises:
-        RankError: the record does not determine the free model, because it is short or its inputs have few levels or
+        RankError: the record does not determine the free model: it is short, or its inputs have few levels or
             frequencies.
     """
     if data.n_samples > 1.1 * SAMPLES:
@@ -122,20 +110,14 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None) -> Stru
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A Hammerstein model of an output.
+    """A Hammerstein model of an output."""
 
-    Attributes:
-        bs: (J,) by input, coefficients of the filters.
-        functions: by input, (family, coefficients) of f.
-        theta: coefficients of the columns [1 | additive | fine through the filters `bs`].
-    """
-
-    bs: list[Array]
-    functions: list[tuple[Family, Array]]
-    theta: Array
+    bs: list[Array]  # (J,) by input, coefficients of the filters
+    functions: list[tuple[Family, Array]]  # by input, (family, coefficients) of f
+    theta: Array  # coefficients of the columns
 
     def columns(self, design: Design, u: Array) -> Array:
-        """Return the columns of theta."""
+        """Return [1 | additive | fine through the filters `bs`]."""
         return np.hstack([design.additive(u), design.finer(u, [design.filters @ b for b in self.bs])])
 
 
@@ -166,19 +148,19 @@ def _test_output(design: Design, o: int) -> tuple[dict[str, FTest], list[float]]
 
     def columns(i: int, part: slice, u: Array, output: Array) -> list[Array]:
         carriers = 2 * np.tanh((design.filtered(u, responses) - mean) / spread / 2)
-        posed = hypothesis.columns(design, u)
-        return [np.hstack([posed, missed[i][part]]), _alternatives(carriers),
-                *(group[i][part] for group in groups.values()), (output - posed @ hypothesis.theta)[:, None]]
+        own = hypothesis.columns(design, u)
+        return [np.hstack([own, missed[i][part]]), _products(carriers),
+                *(group[i][part] for group in groups.values()), (output - own @ hypothesis.theta)[:, None]]
 
     gram, edges, rows = _gram(design, o, columns, _autoregression(residuals))
     # what was cut off the responses acts on all of the output, however small the residuals are
     cut = design.cut * float(np.var(np.concatenate(predicted))) / float(np.nanvar(np.concatenate(residuals)))
-    tests = tested(gram, edges, rows, (PRODUCTS, *groups), UNNOTICED + cut)
+    tests = tested(gram, edges, rows, (PRODUCTS, *groups), NEGLIGIBLE + cut)
     if PRODUCTS not in tests:
         _refuse_few(rows, edges[2])
     keep = np.r_[: edges[1], edges[-1] - 1]
     tests[RANK], ratios = rank_one_test(gram[np.ix_(keep, keep)], hypothesis.theta, hypothesis.bs, design.blocks, rows,
-                                        UNNOTICED + cut)
+                                        NEGLIGIBLE + cut)
     return tests, ratios
 
 
@@ -188,7 +170,7 @@ def _refuse_few(rows: int, columns: int) -> None:
 
 
 def _test_residuals(design: Design, o: int, simulated: Sequence[Array]) -> tuple[dict[str, FTest], list[float]]:
-    """Test whether anything explains what a model leaves of an output."""
+    """Return the tests on the residuals of a given model, for one output."""
     reach = len(design.filters) - 1
     predicted = [y[reach:, o] for y in simulated]
     groups = alternatives(design, predicted)
@@ -199,7 +181,7 @@ def _test_residuals(design: Design, o: int, simulated: Sequence[Array]) -> tuple
         return [one, rest, *(group[i][part] for group in groups.values()), (output - predicted[i][part])[:, None]]
 
     gram, edges, rows = _gram(design, o, columns, _autoregression(residuals))
-    return tested(gram, edges, rows, (FUNCTIONS, *groups), UNNOTICED), [0.0] * design.data.m
+    return tested(gram, edges, rows, (FUNCTIONS, *groups), NEGLIGIBLE), [0.0] * design.data.m
 
 
 def _gram(design: Design, o: int, columns: Callable[[int, slice, Array, Array], list[Array]], noise: Array = WHITE
@@ -240,11 +222,10 @@ def _sharpened(design: Design, o: int, hypothesis: _Hypothesis) -> _Hypothesis:
 
 
 def _responses(design: Design, leading: list[Array], additive: Array) -> Array:
-    """Impulse responses (L, q, m) along which alternatives are looked for.
+    """Impulse responses (L, q, m) of the signals whose products are tested.
 
-    The best linear approximation, a regression on the filters of the inputs themselves, their first functions; per
-    input the two leading filters of lags times functions, which also see what is even, and the input itself at its
-    strongest lag and at the next. Of several inputs one of each, since pairs of inputs make products enough.
+    The best linear approximation; per input the two leading filters of lags times functions, which include even
+    functions, and the input itself at its strongest lag and at the next; of several inputs one of each.
     """
     m, size, starts = design.data.m, len(design.filters), 1 + np.cumsum([0, *(p * j for p, j in design.blocks)])
     chosen = [0, *(start + p * k for start, (p, j) in zip(starts, design.blocks) for k in range(j)), -1]
@@ -263,16 +244,16 @@ def _residuals(design: Design, o: int, hypothesis: _Hypothesis, responses: Array
                ) -> tuple[list[Array], list[Array], Array, Array, float]:
     """Residuals of the hypothesis, NaN where a row is incomplete; its outputs; mean and spread of the filtered inputs.
 
-    The last figure is the sum of the moduli of the terms of a row, root mean square over the rows.
+    The last value is the sum of the moduli of the terms of a row, root mean square over the rows.
     """
     residuals: list[Array] = [np.zeros(0)] * len(design.u)
     predicted = list(residuals)
     sums, count, moduli = np.zeros((2, responses.shape[1])), 0, 0.0
     for i, _, u, output, valid in design.stretches(o):
         columns = hypothesis.columns(design, u)
-        said = columns @ hypothesis.theta
-        predicted[i] = np.append(predicted[i], said)
-        residuals[i] = np.append(residuals[i], np.where(valid, output - said, np.nan))
+        y = columns @ hypothesis.theta
+        predicted[i] = np.append(predicted[i], y)
+        residuals[i] = np.append(residuals[i], np.where(valid, output - y, np.nan))
         moduli += float(np.sum((np.abs(columns) @ np.abs(hypothesis.theta)) ** 2))
         carriers = design.filtered(u, responses)
         sums += np.stack([carriers.sum(axis=0), (carriers**2).sum(axis=0)])
@@ -282,7 +263,7 @@ def _residuals(design: Design, o: int, hypothesis: _Hypothesis, responses: Array
     return residuals, predicted, mean, spread, float(np.sqrt(moduli / count))
 
 
-def _alternatives(carriers: Array) -> Array:
+def _products(carriers: Array) -> Array:
     """Products of two of all and of three of the first three carriers, and further functions of the first two."""
     first, second = np.triu_indices(carriers.shape[1])
     cubes = [a * b * c for a, b, c in combinations_with_replacement(carriers.T[:3], 3)]

@@ -1,6 +1,6 @@
-"""What a record that is not Hammerstein may hold instead: groups of columns, each a direction away from the hypothesis.
+"""Alternatives to the Hammerstein structure: groups of columns, functions of the inputs and of time alone.
 
-All are functions of the inputs and of time alone: where the hypothesis holds, they are independent of the noise.
+Where the hypothesis holds, they are independent of the noise.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,17 +12,15 @@ from optid.identify.validation.structure_design import Design, Family, convolved
 from optid.models.recursions import lfilter
 
 COURSES = 4  # degree of the polynomials in time that a gain may follow
+# lags and poles by which the filters are completed; experiments up to which each has decays of its own
 LAGS, SLOW, FEW_RECORDS = 16, (0.8, 0.9, 0.95, 0.98, 0.99), 3
-"""Lags and poles by which the filters are completed; experiments up to which each has decays of its own."""
-MOST = 6  # most groups of poles, over all inputs, that may come before a second nonlinearity
+MOST = 6  # groups of poles, over all inputs, that may come before a second nonlinearity, at most
 
 
 def alternatives(design: Design, predicted: list[Array]) -> dict[str, list[Array]]:
-    """Return groups of columns by what they mean, one array (rows, k) per experiment.
+    """Return groups of columns by their meaning, one array (rows, k) per experiment.
 
-    Args:
-        design: of the record.
-        predicted: what the best Hammerstein model says of an output, from sample L - 1 of every experiment on.
+    The predicted outputs are those of the best Hammerstein model, from sample L - 1 of every experiment on.
     """
     reach = len(design.filters) - 1
     level, spread = _moments(predicted)
@@ -48,9 +46,9 @@ def alternatives(design: Design, predicted: list[Array]) -> dict[str, list[Array
 
 
 def wider(design: Design, functions: Sequence[tuple[Family, Array]]) -> list[Array]:
-    """Return what the filters may miss of a Hammerstein system, one array (rows, k) per experiment.
+    """Return every f, (family, coefficients), at single lags and through slow poles, and decays of initial states.
 
-    Every f, a family with coefficients, at single lags and through slow poles, and what inputs before the record left.
+    The filters may miss these parts of a Hammerstein system. There is one array (rows, k) per experiment.
     """
     reach = len(design.filters) - 1
     room = design.data.n_samples // (20 * design.data.m)
@@ -71,7 +69,7 @@ def wider(design: Design, functions: Sequence[tuple[Family, Array]]) -> list[Arr
 
 
 def _parts(design: Design) -> Iterator[tuple[int, Array, str]]:
-    """Yield input, denominator and words of what may come before a nonlinearity: each pole, and all together."""
+    """Yield input, denominator and name of the dynamics before a nonlinearity: each pole, and all together."""
     poles = design.poles[design.poles.imag >= 0]
     groups = [[p] if p.imag == 0 else [p, p.conjugate()] for p in poles[np.argsort(-np.abs(poles))]]
     several = [list(design.poles)] if len(groups) > 1 else []
@@ -81,7 +79,7 @@ def _parts(design: Design) -> Iterator[tuple[int, Array, str]]:
 
 
 def _curved(x: Array) -> Array:
-    """Square, cube and modulus of a standardised signal, bent where they would be large, (N, 3)."""
+    """Square, cube and modulus of a standardised signal, which saturates, (N, 3)."""
     bent = 2 * np.tanh(x / 2)
     return np.column_stack([bent**2, bent**3, np.abs(bent)])
 

@@ -1,7 +1,4 @@
-"""The columns of the structure test: functions of inputs through a few filters, stretch by stretch of a record.
-
-The functions follow any static nonlinearity, and the filters are found whatever the nonlinearity and the noise are.
-"""
+"""The columns of the structure test: functions of inputs through a few filters, stretch by stretch of a record."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -25,31 +22,23 @@ from optid.statistics.rq import rq
 
 BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
 EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
-LATEST = 30  # longest delay looked for, in samples
+LATEST = 30  # longest delay, in samples
 LEVEL = 0.01
-SPARE = 1  # poles more than the order that noisy data show: what is too weak for that may still matter to a sharp test
-FEW = 3  # functions per input with which the dynamics are looked for
-RADIUS, SLOWEST = 0.98, 20
-"""Poles beyond 0.98 or 1 - 20 / N are drawn in: their responses would not end within a part of the record."""
+SPARE = 1  # poles beyond the order that noisy data show, which may still matter
+FEW = 3  # functions per input with which the dynamics are estimated
+RADIUS, SLOWEST = 0.98, 20  # poles beyond 0.98 or 1 - 20 / N are contracted: their responses must end within the record
 SETTLED = 1e-3  # share of its largest value below which an impulse response has ended
-DEGREE, HATS, SAMPLES = 3, 5, 250
-"""Powers and, at most, hats of an input that every filter sees; samples for each of these hats and each input."""
-FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40
-"""The same for the leading filter: there f is known to a few tenths of a percent."""
+DEGREE, HATS, SAMPLES = 3, 5, 250  # powers and hats (at most) of an input in every filter; samples per hat and input
+FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40  # the same for the leading filter
 EXTRA = 3  # pulses beyond the order of the filters
 LONGEST = 600  # samples after which the filters are cut, at most
 CHUNK = 16384
-PRESENT = 0.9
-"""Missing input samples are interpolated; rows are left out while this share of the energy of the filters passes."""
+PRESENT = 0.9  # share of the energy of the filters that must have passed after an interpolated input before rows count
 
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Functions of one input: powers, which follow its tails, and hats between quantiles, which follow its kinks.
-
-    The powers up to a degree are of the input less its mean over its standard deviation; there is a hat for each inner
-    node of (k + 2,) increasing ones.
-    """
+    """Functions of one input: powers of the standardised input, and a hat for each inner node of (k + 2,) quantiles."""
 
     centre: float
     spread: float
@@ -58,12 +47,12 @@ class Family:
 
     @classmethod
     def of(cls, data: Data, c: int, degree: int, hats: int) -> "Family":
-        """Place the functions for input c, no more than it has levels less one; a constant input is a `RankError`."""
+        """Return the functions for input c, fewer than its levels; a constant input is a `RankError`."""
         samples = np.concatenate([e.u[:, c] for e in data.experiments])
         samples = samples[~np.isnan(samples)]
         levels = np.unique(samples).size
         if levels < 2:
-            raise RankError(f"Input {data.inputs[c]!r} is constant: nothing depends on it.")
+            raise RankError(f"Input {data.inputs[c]!r} is constant.")
         degree = min(degree, levels - 1)
         room = max(0, min(hats, levels - 1 - degree))
         nodes = np.unique(np.quantile(samples, np.linspace(0, 1, room + 2))) if room else np.zeros(0)
@@ -85,11 +74,9 @@ class Family:
 
 
 def delay_of(data: Data) -> int:
-    """Estimate the delay of a record: samples before which no function of any input matters.
+    """Estimate the delay of a record: one less than the first lag with significant coefficients of three functions.
 
-    Least squares of the outputs on three functions of the inputs at all lags; one less than the first lag whose
-    coefficients look significant. A delay too short costs a few filters, one too long is wrong: hence the generous
-    level. Zero where the record is too short to tell.
+    Zero where the record is too short. A delay too short costs a few filters, one too long is wrong: the level is high.
     """
     records, signals = _signals(data, 0)
     p, shortest = signals.p, min(e.n_samples for e in data.experiments)
@@ -117,11 +104,10 @@ def delay_of(data: Data) -> int:
 
 
 def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
-    """Estimate the poles (n,) between inputs, delayed, and outputs by a subspace method with inputs as instruments.
+    """Estimate the poles (n,) between delayed inputs and outputs by a subspace method with inputs as instruments.
 
-    The inputs enter through three functions each, so that a static nonlinearity at the input is no obstacle, and noise
-    of any colour only costs accuracy. The order is that of `rank_test`. The poles are complex, well within the unit
-    circle, in conjugate pairs; there are none for a static record. One that is too short, or does not excite the
+    The inputs enter through three functions each; the noise may have any colour; the order is that of `rank_test`. The
+    poles are well within the unit circle, none for a static record. A record that is too short, or does not excite the
     functions, is a `RankError`.
     """
     records, signals = _signals(data, delay)
@@ -144,8 +130,7 @@ def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, l
     """Return impulse responses (T, J) that span q^-(delay + i) / A(q)^2, i = 0 ... 2n + extra, A with the given poles.
 
     With A^2 in the denominator (A where it is not squared) the span contains B / A' for poles near the given ones, up
-    to the square of their error. All begin after the delay; the extra lags are for pulses and further delays. The
-    responses are cut after `longest` samples at the latest.
+    to the square of their error. The responses are cut after `longest` samples at the latest.
     """
     every = np.concatenate([poles, poles]) if squared else poles
     a = np.asarray(np.real(np.poly(every)), dtype=float) if len(poles) else np.ones(1)
@@ -171,7 +156,7 @@ def convolved(values: Array, filters: Array) -> Array:
 
 def _signals(data: Data, delay: int) -> tuple[Sequence[Array], Expansion]:
     """Raw channels [u | y], the outputs that many samples earlier, and their expansion in a few functions."""
-    # windows without a gap would be few; interpolation adds noise and a zero, but leaves the poles where they are
+    # windows without a gap would be few; interpolation does not move the poles
     records = [interpolated(np.hstack([e.u[: e.n_samples - delay], e.y[delay:]])) for e in data.experiments]
     families: Any = tuple(Family.of(data, c, FEW, 0) for c in range(data.m))
     return records, Expansion(families, (), data.inputs, data.outputs)
@@ -184,25 +169,17 @@ def _statistics(records: Sequence[Array], signals: Expansion, rows: int) -> Hank
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What the columns of all regressions are made of.
-
-    Attributes:
-        u: inputs of the record, missing samples interpolated, one array per experiment.
-        families, fine: functions of each input, and more of them.
-        filters: (L, J) orthonormal impulse responses, of these poles, which begin after the delay.
-        heavy: samples after a missing input until most of its effect has passed.
-        kept: experiments of the record given that are long enough, those of `data`.
-    """
+    """The signals and filters of the columns of all regressions."""
 
     data: Data
-    u: tuple[Array, ...]
-    families: tuple[Family, ...]
-    fine: tuple[Family, ...]
-    filters: Array
-    heavy: int
+    u: tuple[Array, ...]  # inputs of the record, missing samples interpolated, one array per experiment
+    families: tuple[Family, ...]  # functions of each input
+    fine: tuple[Family, ...]  # more of them
+    filters: Array  # (L, J) orthonormal impulse responses, of these poles, which begin after the delay
+    heavy: int  # samples after a missing input until most of its effect has passed
     poles: NDArray[np.complex128]
     delay: int
-    kept: tuple[int, ...]
+    kept: tuple[int, ...]  # experiments of the given record that are long enough, those of `data`
 
     @classmethod
     def of(cls, data: Data) -> "Design":
