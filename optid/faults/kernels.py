@@ -67,10 +67,10 @@ def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def respond(A, C, K, L, present, into_state, into_output, response):
-    """What additions to the state and to the output leave in the innovations of the steady predictor.
+    """Write what additions to the state and to the output leave in the innovations of the steady predictor.
 
     Args:
-        A: (n, n).
+        A: (1, n, n), or (N, n, n) of every sample.
         C: (l, n).
         K: (n, l) gain.
         L: (n, l) output injection of the plant.
@@ -79,9 +79,10 @@ def respond(A, C, K, L, present, into_state, into_output, response):
         into_output: (N, l, d) added to y(k).
         response: (N, l, d) written.
     """
-    n, l, d = A.shape[0], C.shape[0], into_state.shape[2]  # noqa: E741
+    n, l, d = A.shape[1], C.shape[0], into_state.shape[2]  # noqa: E741
     x, later = np.zeros((n, d)), np.zeros((n, d))
     for k in range(present.shape[0]):
+        t = k if A.shape[0] > 1 else 0
         for p in range(d):
             for i in range(n):
                 x[i, p] += into_state[k, i, p]
@@ -93,7 +94,7 @@ def respond(A, C, K, L, present, into_state, into_output, response):
             for i in range(n):
                 later[i, p] = 0.0
                 for j in range(n):
-                    later[i, p] += A[i, j] * x[j, p]
+                    later[i, p] += A[t, i, j] * x[j, p]
                 for o in range(l):
                     later[i, p] += (-K[i, o] if present[k, o] else L[i, o]) * response[k, o, p]
             for i in range(n):

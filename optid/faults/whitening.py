@@ -68,15 +68,18 @@ class Predictor:
         radius = float(np.max(np.abs(np.linalg.eigvals(self.F)), initial=0.0))
         return len(self.F) if radius == 0 else len(self.F) + int(np.ceil(np.log(1e-6) / np.log(min(radius, 1 - 1e-9))))
 
-    def respond(self, into_state: Array, into_output: Array, present: Array | None = None) -> Array:
+    def respond(
+        self, into_state: Array, into_output: Array, present: Array | None = None, A: Array | None = None
+    ) -> Array:
         """Return what additions to x(k) (N, n, d) and to y(k) (N, l, d) leave in the innovations, (N, l, d).
 
         Args:
             into_state: (N, n, d).
             into_output: (N, l, d).
             present: (N, l) whether a reading is there; all by default.
+            A: (N, n, n) of a plant that changes; that of the model by default.
         """
-        if present is None and len(into_output) <= SHORT:
+        if A is None and len(into_output) <= SHORT and (present is None or present.all()):
             drive = into_state.copy()
             drive[1:] -= self.K @ into_output[:-1]
             return into_output + self.C @ propagated(self.F, drive)
@@ -84,7 +87,8 @@ class Predictor:
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
         response = np.empty(into_output.shape)
-        A, C, K, L, state, output = map(compact, (self.A, self.C, self.K, self.L, into_state, into_output))
+        followed = self.A[None] if A is None else A
+        A, C, K, L, state, output = map(compact, (followed, self.C, self.K, self.L, into_state, into_output))
         kernels.respond(A, C, K, L, shown, state, output, response)
         return response
 

@@ -155,33 +155,3 @@ def explained(tables, correlations, roots, statistic):
                     z += roots[k, place + q * d + p] * correlations[k, begin + p]
                 total += z * z
             statistic[c, k] = total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def course(tables, first, order, onset, signature):
-    """Write the whitened signature (N, l, d) of the columns from `first`; order 0: they last, 1: drifts, 2: jumps."""
-    count, l, d = signature.shape  # noqa: E741
-    n = tables.F.shape[1]
-    x, later, now = np.zeros((n, d)), np.zeros((n, d)), np.zeros(l)
-    for k in range(onset, count):
-        t = tables.of[k]
-        age = k - onset
-        share = 1.0 if order == 0 else age + 1.0 if order == 1 else 1.0 if age == 0 else 0.0
-        for j in range(d):
-            for o in range(l):
-                now[o] = share * tables.h[t, o, first + j]
-                for i in range(n):
-                    now[o] += tables.C[o, i] * x[i, j]
-            for o in range(l):
-                total = 0.0
-                for a in range(o + 1):
-                    total += tables.W[t, o, a] * now[a]
-                signature[k, o, j] = total
-            for i in range(n):
-                total = share * tables.e[t, i, first + j]
-                for a in range(n):
-                    total += tables.F[t, i, a] * x[a, j]
-                later[i, j] = total
-        for i in range(n):
-            for j in range(d):
-                x[i, j] = later[i, j]
