@@ -440,7 +440,7 @@ def test_bad_arguments_are_named(found, limits):
 
 def test_collinear_faults_are_answered_as_a_group():
     model = replace(small(), D=np.array([[0.0, 0.0], [0.0, 0.3]]))
-    with pytest.warns(DataWarning, match="same trace"):
+    with pytest.warns(DataWarning, match="same signature"):
         faults = dictionary(model, process={"B1": model.B[:, 0]}, state_jump=False)
     u, y = record(Fault.step("actuator:u1", 60, 0.8), model=model)
     answer = diagnose(model, (u, y), faults)

@@ -113,5 +113,5 @@ def direction_of(model: "HammersteinSS", outputs: Mapping[str, float]) -> Array:
     P = steady + ROUND * max(float(np.trace(steady)), 1e-300) * np.eye(model.nx)
     found = P @ model.C.T @ np.linalg.lstsq(model.C @ P @ model.C.T, d, rcond=1e-10)[0]
     if not np.allclose(model.C @ found, d, rtol=1e-6, atol=1e-9 * np.abs(d).max()):
-        raise StructureError(f"direction by outputs {dict(outputs)}: no disturbance of the state changes them like this.")
+        raise StructureError(f"direction by outputs {dict(outputs)}: no disturbance of the state has this effect.")
     return np.asarray(found)

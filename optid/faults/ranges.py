@@ -108,8 +108,8 @@ def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:
     total = sum(one.samples.size for one in there)
     if total > min(MOST, count // 2):
         raise DataError(
-            f"{' '.join(map(str, there))} This part of the record is too long to be left out: identify the model over the wider "
-            "range, or cut the record."
+            f"{' '.join(map(str, there))} This part is too long to be left out: identify the "
+            "model over the wider range, or cut the record."
         )
     into_state, into_output = np.zeros((count, model.nx, total)), np.zeros((count, model.l, total))
     k = 0

@@ -1,51 +1,26 @@
-"""Other matrices A(k) and B(k) of the state equation as a candidate, (1.8) and (1.10).
+"""Signature of other matrices A(k) and B(k) of the state equation, (1.8) and (1.10).
 
-From the onset on the plant follows other matrices, whose course is known. Two predictors are compared, the healthy one
-and one with these matrices that starts from the same state at the onset: the difference of their predictions is the
-signature. With the state x of the healthy predictor it obeys e+ = (A(k) - K C) e + (A(k) - A) x + (B(k) - B) f(u), so
-that all onsets come from one recursion. Its magnitude is one where the plant changes as described; the recursion is
-that of the whole change, and exact for other magnitudes where B alone changes.
+From the onset on the plant follows other matrices, which are known functions of time. The signature is the difference
+between the predictions of the healthy predictor and of one with these matrices that starts from the same state. With
+the state x of the healthy predictor it obeys e+ = (A(k) - K C) e + (A(k) - A) x + (B(k) - B) f(u), so that one
+recursion gives all onsets. Its magnitude is one where the plant changes as described; the recursion is that of the
+whole change, and exact for other magnitudes where B alone changes.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import StructureError
-from optid.faults.faults import Fault, matrices_of
+from optid.faults.faults import matrices_of
 
 if TYPE_CHECKING:
-    from optid.faults.signatures import Candidate, Dictionary
+    from optid.faults.signatures import Candidate
     from optid.models import HammersteinSS
 
 
-def with_schedules(found: "Dictionary", schedules: Mapping[str, Fault]) -> "Dictionary":
-    """Return the dictionary with known changes of A and B as further candidates, "process:<name> schedule".
-
-    Sample k of their matrices is sample k of the window; the onset of a schedule is not read: all are searched.
-
-    Raises:
-        StructureError: another kind of fault, a name that is there already.
-    """
-    from optid.faults.signatures import Candidate
-
-    n, l, more = found.model.nx, found.model.l, []  # noqa: E741
-    for name, fault in schedules.items():
-        if fault.kind != "schedule":
-            raise StructureError(f"{name}: a fault of kind {fault.kind!r}; Fault.schedule(A=, B=) is needed.")
-        new = Candidate(f"process:{name}", "schedule", np.zeros((n, 1)), np.zeros((l, 1)), schedule=fault)
-        new = replace(new, members=(new.own_label,), places=(new.name,))
-        if new.label in (*found.labels, *(c.label for c in more)):
-            raise StructureError(f"{new.label} is in the dictionary already.")
-        more.append(new)
-    return found.with_candidates(more)
-
-
-def change(model: "HammersteinSS", candidate: "Candidate", states: Array, u: Array) -> tuple[Array, Array]:
-    """Return what a scheduled change adds to the state of a sample (N, n, 1), and its A(k) (N, n, n).
+def change(model: "HammersteinSS", candidate: "Candidate", states: Any, u: Any) -> tuple[Array, Array]:
+    """Return the additions of a scheduled change to the state of a sample (N, n, 1), and its A(k) (N, n, n).
 
     Args:
         model: the healthy model.

@@ -93,7 +93,7 @@ class Predictor:
         return response
 
     def jumps(self, onset: int, present: Array) -> Array:
-        """Return the response (N, l, n) of the innovations of readings (N, l) to unit jumps of the state at a sample."""
+        """Return the response (N, l, n) of the innovations of readings (N, l) to unit jumps of the state at `onset`."""
         (count, l), n = present.shape, len(self.A)  # noqa: E741
         into_state = np.zeros((count, n, n))
         into_state[onset] = np.eye(n)
@@ -345,7 +345,7 @@ def health(whitened: Any, lags: int = LAGS) -> Health:
     rows = np.vstack([part.r[there] for part, there in zip(parts, complete)])
     count, outputs = rows.shape
     if count < 10 * outputs:
-        raise DataError(f"{count} complete samples are too few to judge the noise: at least {10 * outputs} are required.")
+        raise DataError(f"{count} complete samples are too few to judge the noise; {10 * outputs} are required.")
     covariance = rows.T @ rows / count
     lags = max(1, min(lags, count // (4 * outputs)))
     root = _root(covariance + 1e-300 * np.eye(outputs))

@@ -16,6 +16,7 @@ from optid.errors import StructureError
 from optid.faults.search.scanning import Scan
 from optid.faults.signatures import Candidate
 
+
 @dataclass(frozen=True, eq=False)
 class Bounded:
     """The best magnitudes of a candidate within their bounds at every onset; `bounded` makes it.
