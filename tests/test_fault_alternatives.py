@@ -20,7 +20,7 @@ from optid.faults import (
     model_uncertainty,
     whiten,
 )
-from optid.faults.diagnosis.sensor_gains import _likelihood, sensor_gains
+from optid.faults.diagnosis.sensor_gains import likelihoods, sensor_gains
 from optid.models.experiments import in_units_of
 
 COUNT = 160
@@ -64,13 +64,13 @@ def test_the_likelihood_of_a_sensor_gain_is_that_of_a_kalman_filter_with_another
     record = record_of(model, (u, y))
     part = in_units_of(model, record).experiments[0]
     white = whiten(model, record, x0="zero")
-    grid = _likelihood(found, 1, white, part, np.array([0]), np.array([0.0, 0.4]))
+    logs_of = likelihoods(found, 1, white, part, np.array([0]), np.array([0.0, 0.4]))
     factor = np.array([1.0, 0.6])
     other = replace(model, C=factor[:, None] * model.C, D=factor[:, None] * model.D, offset_y=factor * model.offset_y)
     again = whiten(other, record, x0="zero")
     logs = [-0.5 * np.sum(w.r**2) + COUNT * np.linalg.slogdet(w.predictor.root)[1] for w in (white, again)]
-    assert grid.logs[0, 0] == pytest.approx(0, abs=1e-6)
-    assert grid.logs[0, 1] == pytest.approx(logs[1] - logs[0], rel=1e-6)
+    assert logs_of[0, 0] == pytest.approx(0, abs=1e-6)
+    assert logs_of[0, 1] == pytest.approx(logs[1] - logs[0], rel=1e-6)
 
 
 @pytest.mark.slow

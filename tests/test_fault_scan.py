@@ -335,7 +335,7 @@ def test_bad_input():
         (StructureError, "at least 8 samples", lambda: thresholds(found, 7)),
         (StructureError, "false_alarm=", lambda: thresholds(found, 60, 1.0)),
         (DataError, "at least 50000000 draws", lambda: thresholds(found, 60, 1e-6)),
-        (DataError, "as many are needed", lambda: thresholds(found, 60, u=u[:30])),
+        (DataError, "at least those of the window", lambda: thresholds(found, 60, u=u[:30])),
         (StructureError, "other candidates",
          lambda: scan(found, white).gains(thresholds(dictionary(small()), 60, draws=5000))),
         (LookupFailed, "actuator:u9", lambda: scan(found, white).peak("actuator:u9")),

@@ -1,4 +1,4 @@
-"""Refit of a damaged plant with a healthy prior: what broke alone, or all parameters.
+"""Refit of a damaged plant with a healthy prior: the damaged nonlinearities alone, or all parameters.
 
 ``actuator``: the values of the damaged nonlinearities at their nodes are the unknowns, and the columns of B and D that
 carry them stay, so that the innovations are linear in them and the programme is a QP:
@@ -39,7 +39,7 @@ HALVINGS = 12
 
 
 def actuator(problem: Refitting, *, constraints: Sequence[Any] | str = "default") -> Program:
-    """Pose the refit of what broke alone.
+    """Build the refit of the damaged nonlinearities alone.
 
     Args:
         problem: from `optid.faults.repair.refitting.refitting`.
@@ -83,7 +83,7 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
 
 
 class Refitted:
-    """What a refit ends with.
+    """Result of a refit.
 
     Attributes:
         theta: the vector of unknowns.
@@ -99,12 +99,14 @@ class Refitted:
 
 def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
           ) -> Program:
-    """Pose the programme linearised at theta: one sum of squares, of the record and of what is believed beforehand."""
+    """Build the programme linearised at theta: one sum of squares, of the record and of the prior."""
     if isinstance(constraints, str) and constraints != "default":
         raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
     believed, wanted = problem.believed()
     rows = np.vstack([np.pad(s, ((0, 0), (0, len(problem.curves)))), believed])
-    triangle, target, rest = _compressed(rows, np.concatenate([s @ theta - r, wanted]))
+    q = rows.shape[1]
+    factor: Any = np.linalg.qr(np.column_stack([rows, np.concatenate([s @ theta - r, wanted])]), mode="r")
+    triangle, target, rest = factor[:q, :q], factor[:q, q], float(np.sum(factor[q:, q] ** 2))
     variables = {key: cp.Variable(value.shape, name=key) for key, value in problem.unknowns.items()}
     variables |= {f"lost[{curve.name}]": cp.Variable(1, name=f"lost[{curve.name}]") for curve in problem.curves}
     point = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="C") for v in variables.values()])
@@ -149,14 +151,6 @@ def _not_stronger(curve: Any, mu: Any) -> list[Any]:
     ]
 
 
-def _compressed(s: Array, target: Array) -> tuple[Array, Array, float]:
-    """Triangular factor of [s target]: ‖s z - target‖² = ‖R z - t‖² + rest."""
-    q = s.shape[1]
-    factor: Any = np.linalg.qr(np.column_stack([s, target]), mode="r")
-    rest = float(factor[q, q] ** 2) if len(factor) > q else 0.0
-    return factor[:q, :q], factor[:q, q], rest
-
-
 def _vector(problem: Refitting, values: Values) -> Array:
     """Return [unknowns; shares lost]; what stays zero is zero exactly."""
     theta = np.where(problem.held, 0.0, problem.pack(values))
@@ -164,6 +158,6 @@ def _vector(problem: Refitting, values: Values) -> Array:
 
 
 def _cost(problem: Refitting, z: Array, r: Array) -> float:
-    """Value of the objective with the innovations r at z, linearised in nothing."""
+    """Value of the objective with the innovations r at z, without linearisation."""
     rows, wanted = problem.believed()
     return float(np.sum(r**2) + np.sum((rows @ z - wanted) ** 2))
