@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_plants import levels, noisy, standard
+from fault_plants import LOAD, levels, noisy, refused, standard
 from state_systems import with_feedback
 from test_fault_injection import small
 
@@ -14,7 +14,6 @@ from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, whiten
 
 N, ONSET = 90, 30
-LOAD = np.array([0.3, -0.2, 0.5])
 
 
 def difference(model, u, fault, gaps=0.0):
@@ -115,20 +114,15 @@ def test_choices_and_bad_input():
     chosen = dictionary(model, actuators=["u1"], sensors="sensor:y2", kinds="drift", state_jump=False)
     assert chosen.labels == ("actuator:u1 drift", "sensor:y2 drift")
     assert chosen["actuator:u1"].label == "actuator:u1 drift"
-    whole = dictionary(model, kinds=["bias", "frozen", "noise"])
-    with pytest.raises(StructureError, match="arbitrary waveform"):
-        whole.signature("sensor:y1 frozen", N)
-    with pytest.raises(LookupFailed, match="sensor:y2"):
-        whole["sensor:y9"]
-    lossy = dictionary(model, kinds="loss")
-    with pytest.raises(StructureError, match="pass u"):
-        lossy.signature("actuator:u1 loss", N)
-    with pytest.raises(DataError, match="channels"):
-        lossy.signature("actuator:u1 loss", N, u=np.zeros((N, 3)))
-    for how in ({"kinds": "bend"}, {"actuators": ["u7"]}, {"sensors": "z"}):
-        with pytest.raises(LookupFailed):
-            dictionary(model, **how)
-    with pytest.raises(StructureError, match="direction"):
-        dictionary(model, process={"load": [1.0]})
-    with pytest.raises(StructureError, match="noise covariances"):
-        dictionary(replace(model, noise=None))
+    whole, lossy = dictionary(model, kinds=["bias", "frozen", "noise"]), dictionary(model, kinds="loss")
+    refused(
+        (StructureError, "arbitrary waveform", lambda: whole.signature("sensor:y1 frozen", N)),
+        (LookupFailed, "sensor:y2", lambda: whole["sensor:y9"]),
+        (StructureError, "pass u", lambda: lossy.signature("actuator:u1 loss", N)),
+        (DataError, "channels", lambda: lossy.signature("actuator:u1 loss", N, u=np.zeros((N, 3)))),
+        (LookupFailed, "bend", lambda: dictionary(model, kinds="bend")),
+        (LookupFailed, "u7", lambda: dictionary(model, actuators=["u7"])),
+        (LookupFailed, "z", lambda: dictionary(model, sensors="z")),
+        (StructureError, "direction", lambda: dictionary(model, process={"load": [1.0]})),
+        (StructureError, "noise covariances", lambda: dictionary(replace(model, noise=None))),
+    )

@@ -37,19 +37,6 @@ def test_whitened_innovations_of_a_predictor_run_by_hand():
         x = model.A @ x + model.B @ u[k] + model.offset_x + steady.K @ np.where(there, error, 0.0)
 
 
-@pytest.mark.parametrize("gaps", [0.0, 0.15])
-def test_signatures_are_the_difference_a_fault_makes(gaps):
-    model, u, onset = small(), levels(120, 0), 40
-    healthy = with_gaps(inject(model, u, seed=1), share=gaps)
-    faulty = healthy + inject(model, u, [Fault.step("actuator:u1", onset, 1.0)], seed=1) - inject(model, u, seed=1)
-    a, b = (whiten(model, Data(u, y), x0="zero") for y in (healthy, faulty))
-    into_state, into_output = np.zeros((120, 3, 1)), np.zeros((120, 2, 1))
-    into_state[onset:, :, 0], into_output[onset:, :, 0] = model.B[:, 0], model.D[:, 0]
-    signature = a.seen(a.predictor.respond(into_state, into_output, a.present))
-    np.testing.assert_allclose(signature[..., 0], b.r - a.r, atol=1e-10)
-    assert not signature[:onset].any() and np.abs(signature).max() > 1
-
-
 def test_a_missing_reading_is_fed_back_as_predicted():
     model = with_feedback(feedback=(), E=None, output_of=())
     u = levels(60, 0)

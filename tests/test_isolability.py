@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fault_plants import levels, noisy, refused, standard
+from fault_plants import LOAD, levels, noisy, refused, standard
 from scipy.stats import chi2, ncx2
 from test_fault_injection import small
 from typer.testing import CliRunner
@@ -18,8 +18,6 @@ from optid.faults import Fault, dictionary, inject, whiten
 from optid.faults.isolability import GRID, MIDDLE
 from optid.faults.search.calibration import family_thresholds
 from optid.faults.search.sweeps import sweep
-
-LOAD = np.array([0.3, -0.2, 0.5])
 
 
 @pytest.fixture(scope="module")
@@ -153,14 +151,15 @@ def test_bad_input(found):
         (StructureError, "prob=", lambda: found.isolability(40, prob=1.0)),
         (StructureError, "false_alarm=", lambda: found.isolability(40, false_alarm=0.0)),
         (DataError, "at least 50000000 draws", lambda: found.isolability(40, false_alarm=1e-6)),
+        *((StructureError, "onset=", lambda k=k: found.isolability(40, onset=k)) for k in ("middle", 40, -1)),
+        (StructureError, "draws must be a positive integer; got 0", lambda: found.isolability(draws=0)),
+        (StructureError, "calibration must be a positive", lambda: found.isolability(calibration=0.5)),
+        (StructureError, "fit in memory", lambda: found.isolability(10**8)),
+        (StructureError, "No candidate has a signature",
+         lambda: dictionary(small(), kinds="loss", state_jump=False).isolability(40)),
+        (LookupFailed, "sensor:y2",
+         lambda: found.isolability(20, calibration=5000, draws=50).forecast("sensor:y", 1.0)),
     )
-    for onset in ("middle", 40, -1):
-        with pytest.raises(StructureError, match="onset="):
-            found.isolability(40, onset=onset)
-    with pytest.raises(StructureError, match="No candidate has a signature"):
-        dictionary(small(), kinds="loss", state_jump=False).isolability(40)
-    with pytest.raises(LookupFailed, match="sensor:y2"):
-        found.isolability(20, calibration=5000, draws=50).forecast("sensor:y", 1.0)
 
 
 # -- faults whose signature depends on the input -----------------------------------------------------------------------

@@ -50,7 +50,13 @@ def decoupled(
     """
     steady = predictor(model)
     kinds = {"actuator": model.inputs, "sensor": model.outputs, "process": tuple(process or {})}
-    parts = [place_of(model, _full_name(name, kinds), None, process) for name in disturbances]
+    parts = []
+    for name in disturbances:
+        here = [kind for kind, names in kinds.items() if name in names]
+        if ":" not in name and len(here) != 1:
+            known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
+            raise LookupFailed(f"disturbance {name!r}: {'several' if here else 'none'} of {known} has this name.")
+        parts.append(place_of(model, name if ":" in name else f"{here[0]}:{name}", None, process))
     E, F = np.hstack([part[0] for part in parts]), np.hstack([part[1] for part in parts])
     A, into = model.A + model.L @ model.C, E + model.L @ F
     transfer = model.C @ np.linalg.solve(GENERIC * np.eye(model.nx) - A, into) + F
@@ -73,17 +79,6 @@ def decoupled(
     white = np.linalg.solve(np.linalg.cholesky(kept @ loud.covariance @ kept.T), kept)
     r: Any = np.linalg.qr(np.vstack([white, np.zeros((silent, model.l))])[:, ::-1], mode="r")  # triangular again
     return louder, replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
-
-
-def _full_name(name: str, kinds: Mapping[str, Sequence[str]]) -> str:
-    """Return the name of a place with the part before the colon."""
-    if ":" in name:
-        return name
-    here = [kind for kind, names in kinds.items() if name in names]
-    if len(here) == 1:
-        return f"{here[0]}:{name}"
-    known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
-    raise LookupFailed(f"disturbance {name!r}: {'none' if not here else 'several'} of {known} has this name.")
 
 
 def direction_of(model: "HammersteinSS", outputs: Mapping[str, float]) -> Array:

@@ -139,7 +139,12 @@ def _planned(
         if fault.kind in ADDITIVE:
             _add(model, plan, fault, now, before, process)
         elif fault.kind == "schedule":
-            plan = _scheduled(plan, fault, before, count)
+            for word, given in (("A", fault.A), ("B", fault.B)):
+                if given is not None:
+                    changed = np.array(getattr(plan, word))
+                    changed[before] = matrices_of(
+                        "schedule", word, given, range(before.start, before.stop), getattr(model, word), count)
+                    plan = plan._replace(**{word: changed})
         elif fault.kind in ("process_noise", "sensor_noise"):
             state, output = place_of(model, fault.name, fault.direction, process)
             where, target, samples, word = (output, plan.v, now, "R") if fault.kind == "sensor_noise" else (
@@ -175,16 +180,6 @@ def _add(
         plan.shift[:] += np.outer(course, into_output @ size)
         plan.jolt[:-1] += np.outer(course[1:], into_state @ size)
     plan.start[:] += course[0] * (into_state @ size)
-
-
-def _scheduled(plan: _Plan, fault: Fault, before: slice, count: int) -> _Plan:
-    changed = {}
-    for word, given, whole in (("A", fault.A, plan.A), ("B", fault.B, plan.B)):
-        if given is not None:
-            changed[word] = np.array(whole)
-            changed[word][before] = matrices_of("schedule", word, given, range(before.start, before.stop), whole[0],
-                                                count)
-    return plan._replace(**changed)
 
 
 def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, u: Array) -> None:

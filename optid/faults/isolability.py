@@ -215,11 +215,16 @@ def study(
     whole = np.array([1.0 if c.kind == "loss" else np.inf for c in candidates])  # largest possible size
     sizes = [np.where(d / unit > whole, np.inf, d / unit) for d in (detectable, isolable)]
     labels = tuple(c.label for c in candidates)
+    rivals = []
+    for c, at in zip(curves, isolable):  # at the isolable deflection or the one before it
+        wrong = c.accused[:, max(int(np.searchsorted(GRID, at)) - 1, 0)].copy()
+        wrong[int(np.argmax(c.accused[:, -1]))] = 0.0
+        rivals.append(labels[int(np.argmax(wrong))] if wrong.max() > 0 else "")
     return Isolability(
         labels=labels, window=window, onset=onset, prob=prob, false_alarm=false_alarm, detectable=sizes[0],
         isolable=sizes[1], matrix=np.where(matrix > whole[:, None], np.inf, matrix),
         sines=np.array([_sines(space, int(c), known) for c in named]), unit=unit,
-        rivals=tuple(_rival(labels, c, at) for c, at in zip(curves, isolable)),
+        rivals=tuple(rivals),
         bounded=np.array([c.bounded_deflection for c in candidates]), excluded=dict(found.excluded),
         skipped=tuple(c.label for c in found.candidates if c not in candidates), thresholds=thresholds,
         detected=detected, isolated=isolated, draws=draws,
@@ -313,14 +318,6 @@ def _crossing(probabilities: Array, prob: float, draws: int) -> float:
     first, second = _probits(probabilities[last : last + 2], draws)
     rise = (float(ndtri(prob)) - first) / (second - first)
     return float(GRID[last] + min(max(rise, 0.0), 1.0) * (GRID[last + 1] - GRID[last]))
-
-
-def _rival(labels: tuple[str, ...], curves: _Curves, at: float) -> str:
-    """The candidate most often accused instead, at the isolable deflection or the one before it."""
-    g = GRID.size - 1 if not np.isfinite(at) else max(int(np.searchsorted(GRID, at)) - 1, 0)
-    wrong = curves.accused[:, g].copy()
-    wrong[int(np.argmax(curves.accused[:, -1]))] = 0.0
-    return labels[int(np.argmax(wrong))] if wrong.max() > 0 else ""
 
 
 def _sines(space: Sweep, c: int, known: int | None) -> Array:

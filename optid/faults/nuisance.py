@@ -143,7 +143,11 @@ def model_uncertainty(
         StructureError: no noise covariances.
     """
     count = sum(len(part.y) for part in data.experiments)
-    steady = _forgetting(model, count) if decoupled is None else decoupled
+    steady = decoupled
+    if steady is None:
+        noise = model.noise
+        steady = predictor(model if noise is None else replace(
+            model, noise=replace(noise, R=noise.R + model.nx / count * noise.innovation)))
     gained = replace(model, K=steady.K)
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
@@ -201,24 +205,10 @@ def largest_factor(s2: Array, z2: Array) -> float:
     return float(allowed[-1]) if allowed.size else 1.0
 
 
-def _forgetting(model: "HammersteinSS", samples: int) -> Predictor:
-    """Return the predictor of the noise with additional measurement noise."""
-    if model.noise is None:
-        return predictor(model)  # refused there
-    more = model.noise.R + model.nx / samples * model.noise.innovation
-    return predictor(replace(model, noise=replace(model.noise, R=more)))
-
-
 def _whitened_parts(model: "HammersteinSS", steady: Predictor, data: Data) -> "Iterator[tuple[Experiment, Whitened]]":
     """Return every experiment with its whitened innovations, the initial state estimated."""
     raw = in_units_of(model, data)
     return zip(raw.experiments, as_list(whiten(model, raw, scale=steady)))  # type: ignore[arg-type]
-
-
-def _whitened(model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: np.ndarray) -> Array:
-    job = simulation.prepared(model, "predict", part.u, part.y, None, "")
-    errors = np.where(present, part.y - simulation.run(job, x0), 0.0)
-    return steady.whitened(errors, present).ravel()
 
 
 def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:
@@ -264,6 +254,10 @@ def sensitivities(
     """Derivatives (N l, q) and (N l, n) of the whitened innovations along the columns of root and by the start."""
     columns = np.empty((present.size, root.shape[1]))
     for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
-        sides = [_whitened(moved, steady, part, x0, present) for moved in (plus, minus)]
-        columns[:, j] = (sides[0] - sides[1]) * factor
+        first, second = (
+            simulation.run(simulation.prepared(moved, "predict", part.u, part.y, None, ""), x0)
+            for moved in (plus, minus)
+        )
+        change = np.where(present, (second - first) * factor, 0.0)  # of the innovations
+        columns[:, j] = steady.whitened(change, present).ravel()
     return columns, steady.whitened(steady.jumps(0, present), present).reshape(present.size, model.nx)

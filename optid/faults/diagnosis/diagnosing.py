@@ -130,10 +130,13 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     remaining = None
     if alarm:
         remaining = ranking.fits[0].remaining if ranking.fits else seen.healthy
+    verdict = "untestable" if seen.lost and not seen.tested else "unknown" if alarm else "healthy"
+    if alarm and model.l == 1 and any(c.kind == "frozen" for c in seen.dictionary.candidates):
+        verdict = "not isolable"
     white, search = seen.whitened, seen.search
     fitted = fits[0].fitted if fits else np.zeros_like(white.r)
     return Diagnosis(
-        verdict="faulty" if stuck or fits else _without_answer(seen, alarm),
+        verdict="faulty" if stuck or fits else verdict,
         detected=bool(alarm or stuck),
         best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
         p_value=0.0 if stuck else first.p_value, certificate=certificate,
@@ -142,14 +145,6 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         model=model.title, outputs=model.outputs, dt=model.dt, remaining=remaining,
         evidence=Evidence(white.r, white.present, fitted, seen.gains, () if search is None else search.labels, search),
     )
-
-
-def _without_answer(seen: RecordSearch, alarm: bool) -> str:
-    """Return the verdict without an answer."""
-    found, nothing = seen.dictionary, bool(seen.lost) and not seen.tested
-    if alarm and found.model.l == 1 and any(c.kind == "frozen" for c in found.candidates):
-        return "not isolable"
-    return "untestable" if nothing else "unknown" if alarm else "healthy"
 
 
 def _not_searched(seen: RecordSearch) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""A diagnosis as one HTML page that carries its figure with it."""
+"""Self-contained HTML page of a diagnosis."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from optid.faults.page import write_page
 from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "faulty": "bad"}
-"""How a verdict looks; the others are neither good nor bad."""
+"""Colour of a verdict; the others are neutral."""
 
 
 def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str = "") -> Path:
@@ -18,15 +18,15 @@ def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str 
         StructureError: a diagnosis read from a file: the record is not in it.
         OSError: the file cannot be written.
     """
-    best = ", what the best answer leaves in them, and its onset with the interval" if found.best is not None else ""
+    best = ", the fit of the best answer, and its onset with the interval" if found.best is not None else ""
     several = "; the probability of every answer in the set" if len(found.candidates) > 1 else ""
     caption = (
-        f"Whitened innovations of every output{best}; the energy that every candidate explains by its onset, beyond "
-        f"the threshold at which a healthy plant alarms{several}."
+        f"Whitened innovations of every output{best}; the energy that every candidate explains, by its onset, beyond "
+        f"its threshold{several}."
     )
     return write_page(
         path, f"Diagnosis: {found.verdict}", (record, found.model, f"{found.window} samples"),
-        headings=("Answers", "What the record shows", "What the answer rests on"), draw=found.plot, caption=caption,
+        headings=("Answers", "Innovations and statistics", "Evidence"), draw=found.plot, caption=caption,
         cards=_cards(found), tables=[_answers(found)] * bool(found.candidates), facts=_evidence(found),
         tone=TONES.get(found.verdict, "fair"), word=words.headline(found),
         sentences=words.explained(found, notes=False),
@@ -45,7 +45,7 @@ def _cards(found: Diagnosis) -> list[tuple[str, str]]:
             ("deflection", number(fault.deflection, 3)),
         ]
     if found.remaining is not None:
-        cards.append(("p-value of what is left", words.probability_words(found.remaining.p_value)))
+        cards.append(("p-value of the residual", words.probability_words(found.remaining.p_value)))
     return cards
 
 
@@ -61,8 +61,8 @@ def _answers(found: Diagnosis) -> Table:
             ))
             rows += [("", "", "", "", magnitude) for magnitude in more]
     note = (
-        f"The smallest set that holds {100 * found.coverage:g} % of the probability. Intervals in brackets hold "
-        f"{100 * found.coverage:g} %, the search for the onset included."
+        f"The smallest set with {100 * found.coverage:g} % of the probability. Intervals in brackets have a "
+        f"coverage of {100 * found.coverage:g} %, the search for the onset included."
     )
     return Table("Answers", ("fault", "probability", "onset", "deflection", "magnitude"), rows, note)
 
