@@ -1,4 +1,4 @@
-"""Re-allocation of a plant to the actuators that are left: where it can rest, and how to get there.
+"""Re-allocation of a plant to its remaining actuators: resting points, and control to reach them.
 
 A monotone nonlinearity maps the range of its input onto a range of v = f(u) exactly, so that the problem is linear in
 v: the bounds of the inputs are those of v, and u = f^-1(v) keeps them. A stuck actuator is one whose range is a point.
@@ -34,12 +34,13 @@ Equations = Callable[[AllocationProblem, Any, Any, Any], dict[str, tuple[Any, ..
 
 def target(problem: AllocationProblem, *, reference: Any, equations: Equations | None = None,
            constraints: Sequence[Any] = ()) -> Program:
-    """Pose the resting point nearest to a reference.
+    """Build the programme of the resting point nearest to a reference.
 
     Args:
-        problem: what is left of the plant.
-        reference: (l,) outputs wanted.
-        equations: what ties v to the inputs u, which are then variables, too; without them v is free in its bounds.
+        problem: the damaged plant.
+        reference: (l,) of the outputs.
+        equations: constraints between v and the inputs u, which are then variables, too; by default v is free in its
+            bounds.
         constraints: builders of further constraints in v, x and y.
     """
     r = np.asarray(reference, dtype=float)
@@ -59,11 +60,11 @@ def target(problem: AllocationProblem, *, reference: Any, equations: Equations |
 def track(problem: AllocationProblem, *, reference: Any, states: Sequence[Any], goal: Any, rests: Any = None,
           horizon: int = 40, effort: float = 1e-3, rates: Any = None, previous: Any = None,
           equations: Equations | None = None, constraints: Sequence[Any] = ()) -> Program:
-    """Pose the control of a horizon; reference, states, goal, rests and previous are parameters of the programme.
+    """Build the control of a horizon; reference, states, goal, rests and previous are parameters of the programme.
 
     Args:
-        problem: what is left of the plant.
-        reference: (l,) outputs wanted.
+        problem: the damaged plant.
+        reference: (l,) of the outputs.
         states: (n,) of every member.
         goal: v (r,) of the resting point, or its u (m,) with equations.
         rests: (n,) state of every member there; that of v by default.

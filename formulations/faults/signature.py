@@ -5,7 +5,7 @@
 Q has orthonormal columns, q is the threshold of the exact search for one fault. At lambda = 1 something is active
 exactly when that search raises an alarm: zero is optimal if and only if ‖Q' r‖² <= q for every candidate and onset.
 The sum-of-norms form is that of Ohlsson, Gustafsson, Ljung and Boyd (Automatica 48, 2012). Its magnitudes are biased
-and onsets next to one another share the work, so that the result says where to look, not what the answer is.
+and onsets next to one another share the work, so that the result selects onsets for an exact search.
 
 Named variables: ``a[label]`` (onsets, d); named expressions: ``size[label]`` (onsets, d), in the units of the fault.
 """
@@ -55,11 +55,11 @@ def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constrai
 
 
 def _programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float) -> Program:
-    """Pose the programme of a window r (N l,)."""
+    """Build the programme of a window r (N l,)."""
     if not (np.isfinite(penalty) and penalty > 0):
         raise StructureError(f"penalty={penalty!r}; a positive number is needed.")
     if not atoms:
-        raise StructureError("No candidate is tested at any onset: there is nothing to look for.")
+        raise StructureError("No candidate is tested at any onset: the programme has no groups.")
     level = cp.Parameter(nonneg=True, name="lambda", value=penalty)
     variables: dict[str, cp.Variable] = {}
     start, sizes, designs, norms = {}, {}, [], []

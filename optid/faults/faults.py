@@ -125,19 +125,19 @@ class Fault:
             end: first sample that it no longer changes.
             direction: (n,) of a "process" fault.
         """
-        return cls(name, "step", onset, end, _size(name, size), _direction(name, direction))
+        return cls(name, "step", onset, end, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
     def jump(cls, name: str, onset: int, size: ArrayLike, *, direction: ArrayLike | None = None) -> "Fault":
         """Return an offset in one sample only: a jump of the state, a spike of a sensor. Arguments as `step`."""
-        return cls(name, "jump", onset, None, _size(name, size), _direction(name, direction))
+        return cls(name, "jump", onset, None, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
     def ramp(
         cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
     ) -> "Fault":
         """Return a drift: slope at the onset, twice the slope one sample later, .... Arguments as `step`."""
-        return cls(name, "ramp", onset, end, _size(name, slope), _direction(name, direction))
+        return cls(name, "ramp", onset, end, _finite(name, slope, "size"), _finite(name, direction, "direction"))
 
     drift = ramp
 
@@ -190,7 +190,7 @@ class Fault:
         the standard deviation along the direction (of every state), scale, the factor of the standard deviation of the
         present noise, and covariance (n, n); onset, end and direction as `step`.
         """
-        return cls(name, "process_noise", onset, end, None, _direction(name, direction), 0.0,
+        return cls(name, "process_noise", onset, end, None, _finite(name, direction, "direction"), 0.0,
                    *_noise(name, std, scale, covariance))
 
     @classmethod
@@ -314,17 +314,12 @@ def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Arra
 
 
 def _finite(name: str, value: Any, word: str) -> Any:
-    if not np.all(np.isfinite(value)):
+    if value is None:
+        return None
+    array = np.asarray(value, dtype=float)
+    if not np.isfinite(array).all():
         raise StructureError(f"{name}: {word} = {value!r} is not finite.")
-    return value
-
-
-def _size(name: str, size: ArrayLike) -> Array:
-    return _finite(name, np.atleast_1d(np.asarray(size, dtype=float)), "size")
-
-
-def _direction(name: str, direction: ArrayLike | None) -> Array | None:
-    return None if direction is None else _finite(name, np.asarray(direction, dtype=float), "direction")
+    return np.atleast_1d(array) if word == "size" else array
 
 
 def _noise(name: str, std: Any, scale: Any, covariance: Any) -> tuple[float | None, float | None, Array | None]:

@@ -15,9 +15,9 @@ from scipy.special import ndtr, ndtri
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.search.calibration import check_draws, family_thresholds
-from optid.faults.search.scanning import shorten
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
+from optid.show.wording import short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -126,8 +126,8 @@ class Isolability:
             rival = self.rivals[i]
             sine = f"{self.sines[i, self.labels.index(rival)]:6.3f}" if rival else ""
             lines.append(
-                f"{i + 1:>3}  {shorten(label, 22):<23}{_size(self.detectable[i]):>10}{_size(self.isolable[i]):>9}"
-                f"  {shorten(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
+                f"{i + 1:>3}  {short(label, 22):<23}{_size(self.detectable[i]):>10}{_size(self.isolable[i]):>9}"
+                f"  {short(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
             )
         lines += ["", "smallest size at which the fault of a row is isolated from that of a column"]
         wide = 7

@@ -198,9 +198,6 @@ class Dictionary:
                 f"{c.label} has no signature, because its course is not known: test it as an arbitrary waveform or by "
                 "its covariance."
             )
-        return self._multiplicative(c, since, u)
-
-    def _multiplicative(self, c: Candidate, since: np.ndarray, u: ArrayLike | None) -> tuple[Array, Array]:
         if u is None:
             raise StructureError(f"{c.label}: its signature depends on the input: pass u (N, m).")
         inputs = np.asarray(u, dtype=float).reshape(since.size, -1)
@@ -258,7 +255,7 @@ def dictionary(
         kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise", "spike"; each at its possible places.
         process: directions (n,) of disturbances in the state equation, by name.
         state_jump: whether the state may jump, in any direction.
-        schedules: known changes of A and B by name, see `optid.faults.scheduled`.
+        schedules: known changes of A and B by name.
         unknown: whether "none of these" is a possible answer; a constant disturbance of unknown direction is then, too.
         zeros: {input: the value at which its actuator has no effect}. A loss reduces the effect beyond that value to
             the share (1 - gamma); without it any constant may be added.

@@ -12,6 +12,7 @@ from optid.errors import LookupFailed, StructureError, nearest
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
+from optid.show.wording import short
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
@@ -137,13 +138,13 @@ class Scan:
         lines = [f"window of {len(self.whitened.r)} samples, energy {self.energy:.1f}",
                  f"  {'candidate':<40}{'energy':>9}{'onset':>7}  magnitude"]
         for candidate, row in zip(self.dictionary.candidates, self.statistic):
-            label = shorten(candidate.label, 39)
+            label = short(candidate.label, 39)
             if np.isnan(row).all():
                 lines.append(f"  {label:<40}{'not tested':>16}")
                 continue
             onset = self.peak(candidate)
             sizes = " ".join(f"{v:.3g}" for v in self.estimate(candidate, onset).nu)
-            lines.append(f"  {label:<40}{row[onset]:>9.1f}{onset:>7}  {shorten(sizes, 20)}")
+            lines.append(f"  {label:<40}{row[onset]:>9.1f}{onset:>7}  {short(sizes, 20)}")
         return "\n".join(lines)
 
 
@@ -175,8 +176,3 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         statistic[:, np.setdiff1d(np.arange(count), chosen)] = np.nan
     inputs = None if u is None else np.asarray(u, dtype=float).reshape(len(whitened.r), -1)
     return Scan(found, whitened, inputs, statistic, prepared, correlations)
-
-
-def shorten(text: str, most: int) -> str:
-    """Cut a long text for a table."""
-    return text if len(text) <= most else text[: most - 1] + "…"

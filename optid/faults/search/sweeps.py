@@ -19,8 +19,8 @@ import numpy as np
 
 from optid.arrays import Array, compact
 from optid.errors import DataError, StructureError
-from optid.faults.scheduled import change
-from optid.faults.signatures import Dictionary
+from optid.faults.faults import matrices_of
+from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
 
@@ -114,7 +114,7 @@ class Sweep:
         if candidate.schedule is None:
             into_state, into_output = self.found.additions(candidate, self.window, onset, self.u)
         else:
-            into_state, A = change(self.found.model, candidate, white.states, self.u)
+            into_state, A = _change(self.found, candidate, white.states, self.u)
             into_state[:onset] = 0.0
             into_output = np.zeros((*white.r.shape, 1))
         return white.seen(white.predictor.respond(into_state, into_output, white.present, A))
@@ -319,8 +319,23 @@ def _with_schedules(found: Dictionary, white: Whitened, tables: Tables, u: Array
     F[:, :n, :n], e[:, :n] = tables.F, tables.e
     for place, (i, candidate) in enumerate(chosen, 1):
         own, column = slice(n * place, n * (place + 1)), tables.first[i]
-        added, A = change(found.model, candidate, white.states, u)
+        added, A = _change(found, candidate, white.states, u)
         F[:, own, own] = tables.F + A - steady.A
         h[:, :, column] = added[:, :, 0] @ steady.C.T
         e[:, own, column] = np.einsum("kij,kj->ki", F[:, own, own], added[:, :, 0])
     return tables._replace(F=F, C=np.tile(tables.C, 1 + len(chosen)), h=h, e=e)
+
+
+def _change(found: Dictionary, candidate: Candidate, states: Any, u: Any) -> tuple[Array, Array]:
+    """Return the additions (N, n, 1) of a scheduled change, (1.8) and (1.10), to the states, and its A(k) (N, n, n).
+
+    Its signature is the difference between the predictions of the healthy predictor, with states x, and of one with
+    the changed matrices: e+ = (A(k) - K C) e + (A(k) - A) x + (B(k) - B) f(u), for all onsets. Its magnitude is one
+    where the plant changes as described, and linear where B alone changes.
+    """
+    fault, count, model = candidate.schedule, len(u), found.model
+    assert fault is not None
+    A, B = (matrices_of(candidate.label, word, given, range(count), healthy, count)
+            for word, given, healthy in (("A", fault.A, model.A), ("B", fault.B, model.B)))
+    step = np.einsum("kij,kj->ki", A - model.A, states) + np.einsum("kij,kj->ki", B - model.B, model.expanded(u))
+    return np.vstack([np.zeros((1, model.nx)), step[:-1]])[:, :, None], A
