@@ -79,7 +79,7 @@ def test_several_records_count_together_and_a_short_one_gives_the_factor_of_more
     parts = [whiten(found.model, record(3000, seed, 1.0)) for seed in range(5, 9)]
     whole = empirical_thresholds(found, parts, WINDOW, 0.02)
     assert whole.independent == 480 and not whole.extrapolated
-    with pytest.raises(DataError, match="samples are needed"):
+    with pytest.raises(DataError, match="samples are required"):
         empirical_thresholds(found, parts[0], WINDOW, 1e-3)
     rare = empirical_thresholds(found, parts, WINDOW, 1e-3, extrapolate=True)
     assert rare.extrapolated and rare.factor == pytest.approx(whole.factor, rel=0.35)

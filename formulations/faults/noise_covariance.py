@@ -30,7 +30,7 @@ from optid.solving.solve import Evidence, Procedure
 FORMS = ("places", "full")
 
 NOTHING = 1e-4
-"""Covariances of this many standard deviations are what interior-point methods leave of a zero."""
+"""Covariances, in standard deviations, below which the result of an interior-point method is zero."""
 
 
 def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", lags: int | None = None, onset: int = 0,

@@ -8,7 +8,7 @@ the course changes. Changes that the Bayesian information criterion rejects are 
 explain most, and the course is fitted again by least squares under the same constraints. BIC chooses the
 penalty and, if asked, the prior.
 
-Named expressions: ``f`` (N,), the course; ``changes``, what the penalty counts.
+Named expressions: ``f`` (N,), the course; ``changes``, the penalised quantities.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from optid.solving.solve import Evidence, Procedure
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 
 PENALTIES = tuple(float(share) for share in np.geomspace(0.5, 0.003, 10))
-"""Penalties tried, as shares of the one at which nothing is left."""
+"""Penalties tried, as shares of the one at which the course is zero."""
 
 ROUGHNESS = tuple(float(share) for share in np.geomspace(1e-4, 1e2, 9))
 """Weights of the random walk tried, over the mean square of the columns of T."""
@@ -97,7 +97,7 @@ def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = 
         penalties = ROUGHNESS if prior == "smooth" else PENALTIES
     shares = [float(share) for share in penalties]
     if not shares or not all(np.isfinite(share) and share > 0 for share in shares):
-        raise StructureError(f"penalties={penalties!r}; positive numbers are needed.")
+        raise StructureError(f"penalties={penalties!r}; they must be positive numbers.")
     rules = [*_rules(sign, limit, slew), *constraints]
     for word in ("tv", "trend") if prior == "auto" else (prior,):
         yield from (_smoothed(shares, rules, fits) if word == "smooth" else _changing(word, shares, rules, fits))
@@ -222,7 +222,7 @@ def _rules(sign: str | None, limit: float | None, slew: float | None) -> list[An
         rules.append(lambda v: {f"{sign} course": SIGNS[sign] * v["f"] >= 0})
     for word, value in (("limit", limit), ("slew", slew)):
         if value is not None and not (np.isfinite(value) and value > 0):
-            raise StructureError(f"{word}={value!r}; a positive number is needed.")
+            raise StructureError(f"{word}={value!r}; it must be a positive number.")
     if limit is not None:
         rules.append(lambda v: {"limit": [sign * v["f"] <= limit for sign in (1, -1)]})
     if slew is not None:

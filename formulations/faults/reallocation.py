@@ -7,7 +7,7 @@ v: the bounds of the inputs are those of v, and u = f^-1(v) keeps them. A stuck 
   the bounds of v. Where the reference cannot be reached, the distance is positive, and the multipliers of the bounds
   say which actuator limits it.
 * ``track``: model predictive control over a horizon, ‖W (y_k - r)‖² + ‖(v_k - v_s) / q‖² and a terminal cost.
-* both with several members that stand for what may be broken: the same v for all, the worst of them made least
+* both with several members, the possible damages: the same v for all, with the least cost of the worst of them
   (min-max), each a plant with its own gains and constants in the v of the healthy nonlinearities.
 * with ``norm``: ‖S v_k‖ <= limit, a limit that actuators share (a pump, a power supply); a second-order cone.
 * with ``equations``: in the inputs u themselves, as `formulations.faults.reallocation_nlp` does it.
@@ -107,7 +107,7 @@ def track(problem: AllocationProblem, *, reference: Any, states: Sequence[Any], 
 
 
 def _labelled(problem: AllocationProblem) -> Iterator[tuple[str, Member]]:
-    """Yield the members, each with what is added to the names of its variables."""
+    """Yield the members with the suffixes of the names of their variables."""
     for number, member in enumerate(problem.members):
         yield f"[{number + 1}]" if len(problem.members) > 1 else "", member
 

@@ -6,8 +6,8 @@ carry them stay, so that the innovations are linear in them and the programme is
     minimise ‖s - R z‖² + sum ((c - c_healthy) / p)² + sum (D2 (c - (1 - g) c_healthy) / q)²
 
 with c = values at the nodes, D2 second differences, and g the share of the gain that is lost, in [0, 1]: a plain loss
-of gain bends nothing. Unless others are asked for, c is monotone like the healthy nonlinearity and nowhere steeper:
-nothing gains strength by breaking. ``parameters``: A, B, C, D and the other nonlinearities are open, too, each with a
+of gain changes no curvature. By default c is monotone like the healthy nonlinearity and nowhere steeper: a fault does
+not increase the gain. ``parameters``: A, B, C, D and the other nonlinearities are open, too, each with a
 healthy prior; a Gauss-Newton procedure whose steps are the same QP. Named variables: ``mu[input]``,
 ``constant[input]``, ``lost[input]``, and A, B, C, D.
 """
@@ -152,7 +152,7 @@ def _not_stronger(curve: Any, mu: Any) -> list[Any]:
 
 
 def _vector(problem: Refitting, values: Values) -> Array:
-    """Return [unknowns; shares lost]; what stays zero is zero exactly."""
+    """Return [unknowns; shares lost], fixed zeros exact."""
     theta = np.where(problem.held, 0.0, problem.pack(values))
     return np.append(theta, [float(np.ravel(values[f"lost[{curve.name}]"])[0]) for curve in problem.curves])
 

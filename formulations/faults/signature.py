@@ -57,7 +57,7 @@ def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constrai
 def _programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float) -> Program:
     """Build the programme of a window r (N l,)."""
     if not (np.isfinite(penalty) and penalty > 0):
-        raise StructureError(f"penalty={penalty!r}; a positive number is needed.")
+        raise StructureError(f"penalty={penalty!r}; it must be a positive number.")
     if not atoms:
         raise StructureError("No candidate is tested at any onset: the programme has no groups.")
     level = cp.Parameter(nonneg=True, name="lambda", value=penalty)

@@ -1,8 +1,8 @@
 """Fault models (1.8)-(1.13) of the dissertation, and others of practice.
 
-Timing, for every kind: the onset theta is the first sample of the record that the fault can change. What enters through
-the state equation changes x(theta) first, so it is present in the step from theta - 1 to theta; what enters through the
-output equation, a direct feedthrough included, changes y(theta) first.
+Timing, for every kind: the onset theta is the first sample of the record that the fault can change. A fault in
+the state equation changes x(theta) first, so it is present in the step from theta - 1 to theta; one in the output
+equation, a direct feedthrough included, changes y(theta) first.
 """
 
 from collections.abc import Mapping
@@ -207,8 +207,8 @@ class Fault:
 
         Args:
             onset: first sample that they can change: the step from onset - 1 to onset uses A(onset - 1).
-            A: (n, n), (N, n, n) for every sample k of the record, or a function of k; None leaves A as it is.
-            B: (n, r), (N, n, r) or a function of k; None leaves B as it is.
+            A: (n, n), (N, n, n) for every sample k of the record, or a function of k; None for an unchanged A.
+            B: (n, r), (N, n, r) or a function of k; None for an unchanged B.
             end: first sample that they no longer change.
 
         Raises:

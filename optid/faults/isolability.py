@@ -207,18 +207,17 @@ def study(
     healthy = np.concatenate(list(space.simulated(draws, np.random.default_rng(int(second) + 1))))
     noise = _scores(space, healthy)
     curves = [_curves(space, place, noise, thresholds, known, rng) for place in range(named.size)]
-    detected, isolated = np.array([c.detected for c in curves]), np.array([c.isolated for c in curves])
-    unit = np.array([c.unit for c in curves])
-    matrix = np.array([[_crossing(p, prob, draws) for p in c.preferred] for c in curves]) / unit[:, None]
+    detected, isolated, preferred, accused, unit = map(np.array, zip(*curves))
+    matrix = np.array([[_crossing(p, prob, draws) for p in row] for row in preferred]) / unit[:, None]
     isolable = np.array([_crossing(p, prob, draws) for p in isolated])
     detectable = np.array([_crossing(p, prob, draws) for p in detected])
     whole = np.array([1.0 if c.kind == "loss" else np.inf for c in candidates])  # largest possible size
     sizes = [np.where(d / unit > whole, np.inf, d / unit) for d in (detectable, isolable)]
     labels = tuple(c.label for c in candidates)
     rivals = []
-    for c, at in zip(curves, isolable):  # at the isolable deflection or the one before it
-        wrong = c.accused[:, max(int(np.searchsorted(GRID, at)) - 1, 0)].copy()
-        wrong[int(np.argmax(c.accused[:, -1]))] = 0.0
+    for shares, at in zip(accused, isolable):  # at the isolable deflection or the one before it
+        wrong = shares[:, max(int(np.searchsorted(GRID, at)) - 1, 0)].copy()
+        wrong[int(np.argmax(shares[:, -1]))] = 0.0
         rivals.append(labels[int(np.argmax(wrong))] if wrong.max() > 0 else "")
     return Isolability(
         labels=labels, window=window, onset=onset, prob=prob, false_alarm=false_alarm, detectable=sizes[0],
@@ -237,27 +236,14 @@ def _scores(space: Sweep, windows: Array) -> list[Array]:
     return [space.coordinates(found, int(c))[:, space.tested[c]] for c in np.flatnonzero(space.tables.sizes)]
 
 
-class _Curves(NamedTuple):
-    """Probabilities of one fault over the grid of deflections.
-
-    Attributes:
-        detected: (G,).
-        isolated: (G,).
-        preferred: (C, G) detected and preferred to each other candidate; detected in its own row.
-        accused: (C, G) share of the answers.
-        unit: deflection of a size of one.
-    """
-
-    detected: Array
-    isolated: Array
-    preferred: Array
-    accused: Array
-    unit: float
-
-
 def _curves(
     space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
-) -> _Curves:
+) -> tuple[Array, Array, Array, Array, float]:
+    """Probabilities of one fault over the grid of deflections, and the deflection of a size of one.
+
+    They are those of detection (G,), of isolation (G,), of detection and preference to each other candidate (C, G), in
+    its own row of detection, and of an alarm for each candidate (C, G).
+    """
     c, draws, window = int(np.flatnonzero(space.tables.sizes)[place]), len(noise[0]), space.window
     low, high = (int(share * window) for share in MIDDLE)
     onsets = np.full(draws, known) if known is not None else rng.integers(low, max(high, low + 1), draws)
@@ -279,7 +265,7 @@ def _curves(
         preferred[:, g] = np.mean((own > 0) & (own >= excess), axis=0)
         preferred[place, g] = detected[g]
         accused[:, g] = [np.mean(alarm & (answer == j)) for j in range(count)]
-    return _Curves(detected, isolated, preferred, accused, unit)
+    return detected, isolated, preferred, accused, unit
 
 
 def _directions(

@@ -179,8 +179,8 @@ def empirical_thresholds(
     rare = false_alarm * independent < LEAST
     if rare and not extrapolate:
         raise DataError(
-            f"{independent:.0f} windows of a healthy record cannot support a false alarm in {1 / false_alarm:.3g}: "
-            f"{int(np.ceil(LEAST / false_alarm * window))} samples are needed. Take a longer record, a shorter window "
+            f"{independent:.0f} windows of a healthy record are too few for a false alarm in {1 / false_alarm:.3g}: "
+            f"{int(np.ceil(LEAST / false_alarm * window))} samples are required. Take a longer record, shorter windows "
             "or a higher probability, or let the factor be that of a more frequent alarm (extrapolate=True)."
         )
     longest = None if u is None else max((np.asarray(one) for one in inputs), key=len)

@@ -21,7 +21,7 @@ def joint_energy(first, second, cosines, floor, work):
     energy = 0.0
     for i in range(a):
         energy += first[i] * first[i]
-    for j in range(b):  # what is left of the smaller one beside the larger one, and of the window along it
+    for j in range(b):  # the smaller one, and the window along it, orthogonal to the larger one
         left = second[j]
         for i in range(a):
             left -= cosines[i, j] * first[i]
@@ -63,7 +63,7 @@ def search(tables, products, states, along, roots, tested, z, q, same, floor, be
         tables: `optid.faults.search.sweeps.Tables`.
         products: (N, D, D) of columns with the same onset.
         states: (N, n, D) of a unit state with the columns.
-        along: (N, Q, D) what an uncertain model takes off the products.
+        along: (N, Q, D) the reduction of the products by an uncertain model.
         roots: (N, R) inverse roots of the products.
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.

@@ -38,15 +38,15 @@ ORDERS = {"drift": 1, "jump": 2, "spike": 2}
 
 
 class Tables(NamedTuple):
-    """What the kernels of `optid.faults.search.sweep_kernels` read.
+    """Input of the kernels of `optid.faults.search.sweep_kernels`.
 
     Attributes:
         of: (N,) which of the T tables governs a sample.
         F: (T, n, n) transition of the error of the predictor.
         C: (l, n).
         W: (T, l, l) whitening, lower triangular; zero rows and columns where a reading is missing.
-        h: (T, l, D) what the columns add to the innovation.
-        e: (T, n, D) what they add to the state of the next sample.
+        h: (T, l, D) additions of the columns to the innovation.
+        e: (T, n, D) their additions to the state of the next sample.
         lasting: number of columns that last, which come first.
         drifts: number of drifts, which follow; the others are jumps.
         helpers: index of the helper of the first drift.
@@ -142,7 +142,7 @@ class Sweep:
         return result
 
     def largest(self, windows: Array) -> Array:
-        """Return the largest energy over the onsets for windows (M, N, l), (M, C); NaN for what is not tested."""
+        """Return the largest energy over the onsets for windows (M, N, l), (M, C); NaN where not tested."""
         from optid.faults.search.sweep_kernels import correlate, explained
 
         shown = np.where(self.white.present, windows, 0.0)
@@ -171,7 +171,7 @@ _MOST = 4
 def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
     """Prepare the search for one fault.
 
-    What depends on the model alone is kept with the dictionary for the next window of the same length.
+    Tables that depend on the model alone are cached with the dictionary for the next window of the same length.
 
     Args:
         found: the dictionary.
