@@ -61,7 +61,7 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
     """
     z = np.append(problem.start, np.zeros(len(problem.curves)))
     r, s = problem.linearised(problem.start)
-    objective = np.inf
+    (believed, wanted), objective = problem.believed(), np.inf
     for _ in range(STEPS):
         solution = yield _step("refit.parameters", problem, z[: problem.start.size], r, s, constraints)
         if not solution.has_point:
@@ -70,7 +70,7 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
         for _ in range(HALVINGS):
             trial = z + length * step
             r, s = problem.linearised(trial[: problem.start.size])
-            objective = _cost(problem, trial, r)
+            objective = float(np.sum(r**2) + np.sum((believed @ trial - wanted) ** 2))
             if np.isfinite(objective) and objective <= before:
                 break
             length /= 2
@@ -155,9 +155,3 @@ def _vector(problem: Refitting, values: Values) -> Array:
     """Return [unknowns; shares lost], fixed zeros exact."""
     theta = np.where(problem.held, 0.0, problem.pack(values))
     return np.append(theta, [float(np.ravel(values[f"lost[{curve.name}]"])[0]) for curve in problem.curves])
-
-
-def _cost(problem: Refitting, z: Array, r: Array) -> float:
-    """Value of the objective with the innovations r at z, without linearisation."""
-    rows, wanted = problem.believed()
-    return float(np.sum(r**2) + np.sum((rows @ z - wanted) ** 2))

@@ -26,7 +26,7 @@ from optid.arrays import Array, as_list
 from optid.data.record import Data, Experiment
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
-from optid.faults.whitening import Predictor, Whitened, predictor, whiten
+from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 
@@ -151,9 +151,8 @@ def model_uncertainty(
     gained = replace(model, K=steady.K)
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
-    for part, seen in _whitened_parts(gained, steady, data):
-        present, white = seen.present, seen.r.ravel()
-        by_parameter, by_start = sensitivities(gained, steady, part, seen.states[0], present, np.eye(size))
+    for part, x0, present, white in _whitened_parts(gained, steady, data):
+        by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
         rest = by_parameter - basis @ (basis.T @ by_parameter)
@@ -179,11 +178,11 @@ def model_uncertainty(
 def _inflated(found: ModelUncertainty, healthy: Data) -> ModelUncertainty:
     """Multiply the covariance by the largest factor that a healthy record allows."""
     spreads, squares = [], []
-    for part, seen in _whitened_parts(found.model, found.predictor, healthy):
-        nuisance = found.nuisance(part, seen.states[0], seen.present)
+    for part, x0, present, white in _whitened_parts(found.model, found.predictor, healthy):
+        nuisance = found.nuisance(part, x0, present)
         axes = nuisance.s < np.sqrt(DIFFUSE)  # the others are those of the initial state
         spreads.append(nuisance.s[axes] ** 2)
-        squares.append((nuisance.U[:, axes].T @ seen.r.ravel()) ** 2)
+        squares.append((nuisance.U[:, axes].T @ white) ** 2)
     factor = largest_factor(np.concatenate(spreads), np.concatenate(squares))
     return replace(found, root=np.sqrt(factor) * found.root, inflation=factor)
 
@@ -205,10 +204,14 @@ def largest_factor(s2: Array, z2: Array) -> float:
     return float(allowed[-1]) if allowed.size else 1.0
 
 
-def _whitened_parts(model: "HammersteinSS", steady: Predictor, data: Data) -> "Iterator[tuple[Experiment, Whitened]]":
-    """Return every experiment with its whitened innovations, the initial state estimated."""
+def _whitened_parts(
+    model: "HammersteinSS", steady: Predictor, data: Data
+) -> "Iterator[tuple[Experiment, Array, np.ndarray, Array]]":
+    """Yield every experiment with its estimated initial state, its readings present, and its whitened innovations."""
     raw = in_units_of(model, data)
-    return zip(raw.experiments, as_list(whiten(model, raw, scale=steady)))  # type: ignore[arg-type]
+    found: list[Any] = as_list(whiten(model, raw, scale=steady))
+    for part, white in zip(raw.experiments, found):
+        yield part, white.states[0], white.present, white.r.ravel()
 
 
 def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:

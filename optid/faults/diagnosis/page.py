@@ -20,7 +20,9 @@ def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str 
     """
     percent, best = f"{100 * found.coverage:g} %", found.best
     p_value = "p-value of health", words.probability_words(found.p_value)
-    cards, rows, caption = [p_value], [], "Whitened innovations of every output"
+    cards: list[tuple[str, str]] = [p_value]
+    rows: list[tuple[str, ...]] = []
+    caption = "Whitened innovations of every output"
     facts = [("Method", found.method), ("False alarms", f"{found.false_alarm:g} of healthy records"), p_value]
     if best is not None:
         caption += ", the fit of the best answer, and its onset with the interval"

@@ -57,7 +57,7 @@ class Thresholds:
 
     def for_scan(self, found: "Scan") -> Array:
         """Return the thresholds (C,) of a search; StructureError where one is missing for a tested candidate."""
-        q, tested = self.of(found.labels), ~np.isnan(found.statistic).all(axis=1)
+        q, tested = self.of(found.labels), [bool(np.isfinite(row).any()) for row in found.statistic]
         missing = [label for label, value, used in zip(self.labels, q, tested) if used and not value > 0]
         if missing:
             raise StructureError(

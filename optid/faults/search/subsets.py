@@ -15,7 +15,7 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.errors import StructureError
-from optid.faults.search.atoms import atoms_of, exchanged
+from optid.faults.search.atoms import Atoms, atoms_of, exchanged
 from optid.faults.search.scanning import ALIKE, Magnitude, Scan
 from optid.faults.search.sparse import REACH, SparseResult
 from optid.faults.search.sweeps import inverse_roots
@@ -206,7 +206,7 @@ def polish(
     check_integer(max_faults, "max_faults")
     count = found.statistic.shape[1]
     mask = np.ones(count, dtype=bool) if sparse is None else sparse.near(reach)
-    atoms = atoms_of(found, limits, mask) if mask.any() else ()
+    atoms = atoms_of(found, limits, mask) if mask.any() else tuple[Atoms, ...]()
     number = sum(a.onsets.size for a in atoms)
     subsets = sum(comb(number, k) for k in range(1, max_faults + 1))
     if subsets > MOST or sum(a.onsets.size * a.dimension for a in atoms) > COLUMNS:

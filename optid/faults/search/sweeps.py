@@ -183,8 +183,9 @@ def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
         DataError: inputs of another length, or missing.
         StructureError: a window that is too short, or no candidate with a signature.
     """
-    white = window
-    if not isinstance(window, Whitened):
+    if isinstance(window, Whitened):
+        white = window
+    else:
         empty = np.zeros((int(window), found.model.l))
         white = Whitened(empty, empty, np.ones(empty.shape, dtype=bool), found.predictor, found.model.outputs)
     count, least = len(white.r), 2 * found.model.nx + 2
