@@ -1,6 +1,7 @@
 """Independent routes for rank-one least squares: the exact one-dimensional search for n_b = 2, and small problems."""
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from optid.structures.rank_one import RankOne
 
@@ -31,14 +32,18 @@ def search_circle(problem: RankOne, points: int = 720) -> float:
     values = np.array([value(angle) for angle in angles])
     best = np.inf
     for k in np.flatnonzero((values <= np.roll(values, 1)) & (values <= np.roll(values, -1))):
-        low, high = angles[k] - np.pi / points, angles[k] + np.pi / points
-        ratio = (np.sqrt(5) - 1) / 2
-        while high - low > 1e-9:
-            left, right = high - ratio * (high - low), low + ratio * (high - low)
-            low, high = (low, right) if value(left) < value(right) else (left, high)
-        angle = (low + high) / 2
+        around = angles[k] - np.pi / points, angles[k] + np.pi / points
+        angle = minimize_scalar(value, bounds=around, method="bounded", options={"xatol": 1e-9}).x
         best = min(best, direction_value(problem, np.array([np.cos(angle), np.sin(angle)])))
     return best
+
+
+def coloured(rng: np.random.Generator, rows: int, nb: int, correlation: float) -> np.ndarray:
+    """A bounded input of some correlation from sample to sample."""
+    u = rng.standard_normal(rows + 100 + nb)
+    for k in range(1, len(u)):
+        u[k] = correlation * u[k - 1] + np.sqrt(1 - correlation**2) * u[k]
+    return np.tanh(u[100:] / 1.5)
 
 
 def regress(design: np.ndarray, y: np.ndarray, blocks, linear: int) -> RankOne:
@@ -54,11 +59,7 @@ def hammerstein(seed: int, nb: int, p: int, rows: int, snr: float = 3.0, correla
     rng = np.random.default_rng(seed)
     design, y = [rng.standard_normal((rows, linear))], 0.0
     for channel in range(channels):
-        u = rng.standard_normal(rows + 100 + nb)
-        for k in range(1, len(u)):
-            u[k] = correlation * u[k - 1] + np.sqrt(1 - correlation**2) * u[k]
-        u = np.tanh(u[100:] / 1.5)
-        values = np.polynomial.legendre.legvander(u, p)[:, 1:]
+        values = np.polynomial.legendre.legvander(coloured(rng, rows, nb, correlation), p)[:, 1:]
         lagged = np.hstack([values[nb - j:nb - j + rows] for j in range(nb)])
         truth = sum(np.kron(rng.standard_normal(nb), rng.standard_normal(p)) for _ in range(rank))
         y = y + (0.0 if channel in silent else 1.0) * lagged @ truth
@@ -72,10 +73,7 @@ def monotone(seed: int, nb: int, p: int, rows: int, snr: float = 1.0,
              correlation: float = 0.5) -> tuple[RankOne, np.ndarray]:
     """Regression on triangular functions with a monotone truth that has flat pieces; (problem, increments (P, P))."""
     rng = np.random.default_rng(seed)
-    u = rng.standard_normal(rows + 100 + nb)
-    for k in range(1, len(u)):
-        u[k] = correlation * u[k - 1] + np.sqrt(1 - correlation**2) * u[k]
-    u = np.tanh(u[100:] / 1.5)
+    u = coloured(rng, rows, nb, correlation)
     nodes = np.linspace(u.min(), u.max(), p + 1)
     values = np.delete(np.maximum(0, 1 - np.abs(u[:, None] - nodes) / (nodes[1] - nodes[0])), p // 2, axis=1)
     increments = np.delete(np.diff(np.eye(p + 1), axis=0), p // 2, axis=1)

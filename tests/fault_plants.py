@@ -43,10 +43,10 @@ LOAD = np.array([0.3, -0.2, 0.5])
 
 def record(model, seed, faults=(), missing=0.0, count=50):
     """Inputs and readings of a plant with faults, some readings missing."""
-    u = levels(count, seed)
+    u = levels(count, seed, model.m)
     y = inject(model, u, faults, seed=seed, process={"load": LOAD})
     y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
-    return Data(u, y)
+    return Data(u, y, dt=model.dt, outputs=model.outputs)
 
 
 def refused(*cases):

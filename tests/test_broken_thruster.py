@@ -23,21 +23,24 @@ def model(tmp_path_factory):
     return path
 
 
-def test_the_broken_propeller_is_named_with_the_share_that_is_lost(model, tmp_path):
-    result = run("diagnose", model, "--example", "broken_thruster", "--identified", "thruster", "--out",
-                 tmp_path / "d.json")
-    assert result.exit_code == 0, result.output
-    found, truth = load_diagnosis(tmp_path / "d.json"), example("broken_thruster").truth
+@pytest.fixture(scope="module")
+def answer(model):
+    path = model.with_name("d.json")
+    result = run("diagnose", model, "--example", "broken_thruster", "--identified", "thruster", "--out", path)
+    assert result.exit_code == 0 and "--identified" not in result.output, result.output
+    return path
+
+
+def test_the_broken_propeller_is_named_with_the_share_that_is_lost(answer):
+    found, truth = load_diagnosis(answer), example("broken_thruster").truth
     assert found.verdict == "faulty" and found.best.faults[0].kind == "loss"
     low, high = found.size_interval[0]
     assert low < truth["lost"] < high
     assert found.onset_interval[0] <= truth["onset"] <= found.onset_interval[1]
-    assert "--identified" not in result.output
 
 
-def test_the_broken_rig_is_refitted(model, tmp_path):
-    answer, page = tmp_path / "d.json", tmp_path / "r.html"
-    run("diagnose", model, "--example", "broken_thruster", "--identified", "thruster", "--out", answer)
+def test_the_broken_rig_is_refitted(model, answer, tmp_path):
+    page = tmp_path / "r.html"
     result = run("reformulate", model, answer, "--example", "broken_thruster", "--model", tmp_path / "damaged.json",
                  "--report", page)
     assert result.exit_code == 0, result.output

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_plants import levels, noisy, refused
+from fault_plants import LOAD, levels, noisy, refused
 from matplotlib.figure import Figure
 from test_fault_injection import small
 
@@ -12,7 +12,6 @@ from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import Fault, diagnose, dictionary, inject, load_diagnosis, model_uncertainty, thresholds
 
-LOAD = np.array([0.3, -0.2, 0.5])
 COUNT = 120
 
 
@@ -163,20 +162,13 @@ def test_a_sensor_that_repeats_its_reading_is_a_finding_and_the_rest_is_judged(f
     answer = diagnose(small(), (u, y), found)
     assert answer.verdict == "faulty" and answer.best.labels == ("sensor:y1 frozen",) and answer.onset == 70
     assert answer.size[0] == y[70, 0] and answer.certificate.kind == "flat line"
-    assert "identical to the bit" in str(answer)
+    assert "are identical" in str(answer)
     u, y = record(Fault.frozen("sensor:y1", 70), Fault.step("sensor:y2", 40, 0.8))
     both = diagnose(small(), (u, y), found)
     assert both.best.labels == ("sensor:y2", "sensor:y1 frozen")
-
-
-@pytest.mark.slow
-def test_a_constant_channel_is_a_finding_too(found):
-    u, y = record()
-    y = y.copy()
-    y[:, 1] = 0.25
-    answer = diagnose(small(), (u, y), found)
-    assert answer.best.labels == ("sensor:y2 frozen",) and answer.best.faults[0].onset_censored
-    assert "at or before" in str(answer)
+    constant = diagnose(small(), (u, np.where([False, True], 0.25, record()[1])), found)
+    assert constant.best.labels == ("sensor:y2 frozen",) and constant.best.faults[0].onset_censored
+    assert "at or before" in str(constant)
 
 
 @pytest.mark.slow
@@ -355,32 +347,25 @@ def test_a_healthy_record_with_other_noise_is_refused(found, limits):
     other = replace(small(), A=small().A * 0.6)
     with pytest.raises(DataError, match="not white"):
         diagnose(other, faulty, healthy=sound)
-    with pytest.raises(StructureError, match="healthy="):
-        diagnose(small(), faulty, found, rescale=True)
 
 
 @pytest.mark.slow
 def test_swapped_outputs_and_units_that_jump_are_named(found):
     long = inputs(300, 7)
     y = inject(small(), long, seed=8)
-    with pytest.raises(DataError, match="y1, y2 look swapped"):
-        diagnose(small(), record(), found, healthy=(long, y[:, ::-1]))
-    with pytest.raises(DataError, match="look swapped"):
-        diagnose(small(), (long, y[:, ::-1]), found)
     jump = y.copy()
     jump[150:, 1] *= 1000
-    with pytest.raises(DataError, match="unit of output 'y2' seems to change at sample 150"):
-        diagnose(small(), (long, jump), found)
+    refused(
+        (DataError, "y1, y2 look swapped", lambda: diagnose(small(), record(), found, healthy=(long, y[:, ::-1]))),
+        (DataError, "look swapped", lambda: diagnose(small(), (long, y[:, ::-1]), found)),
+        (DataError, "output 'y2' seems to change at sample 150", lambda: diagnose(small(), (long, jump), found)),
+    )
 
 
 def test_the_uncertainty_of_an_identified_model_counts_or_is_refused(found, limits):
     long = inputs(300, 7)
     origin = Data(long, inject(small(), long, seed=8))
     faulty = record(Fault.step("sensor:y2", 60, 0.8))
-    with pytest.raises(StructureError, match="covariance of the model"):
-        diagnose(small(), faulty, found, model_uncertainty="use")
-    with pytest.raises(StructureError, match="'ignore'"):
-        diagnose(small(), faulty, found, model_uncertainty="perhaps")
     exact = diagnose(small(), faulty, found, thresholds=limits, model_uncertainty="ignore")
     unsure = diagnose(small(), faulty, found, model_uncertainty=model_uncertainty(small(), origin))
     assert unsure.best.label == "sensor:y2"
@@ -402,17 +387,12 @@ def test_the_uncertainty_of_an_identified_model_counts_or_is_refused(found, limi
 
 def test_bad_records_are_named(found):
     u, y = record()
-    holes = u.copy()
-    holes[17, 1] = np.nan
-    with pytest.raises(DataError, match="input 'u2' is missing at sample 17"):
-        diagnose(small(), (holes, y), found)
-    infinite = y.copy()
-    infinite[5, 0] = np.inf
-    with pytest.raises(DataError, match="y1.*5|5.*y1"):
-        diagnose(small(), (u, infinite), found)
-    with pytest.raises(DataError):
-        diagnose(small(), (u[:, :1], y), found)
+    holes, infinite = u.copy(), y.copy()
+    holes[17, 1], infinite[5, 0] = np.nan, np.inf
     refused(
+        (DataError, "input 'u2' is missing at sample 17", lambda: diagnose(small(), (holes, y), found)),
+        (DataError, "y1.*5|5.*y1", lambda: diagnose(small(), (u, infinite), found)),
+        (DataError, "channel|column|input", lambda: diagnose(small(), (u[:, :1], y), found)),
         (DataError, "samples", lambda: diagnose(small(), (u[:7], y[:7]), found)),
         (DataError, "sampled every", lambda: diagnose(small(), Data(u, y, dt=0.5), found)),
         (DataError, "outputs", lambda: diagnose(small(), Data(u, y, outputs=["y2", "y1"]), found)),
@@ -422,13 +402,13 @@ def test_bad_records_are_named(found):
 
 def test_bad_arguments_are_named(found, limits):
     data = record()
-    for arguments, words in (
-        ({"false_alarm": 0.0}, "false_alarm"), ({"coverage": 1.0}, "coverage"), ({"method": "exakt"}, "exact"),
-        ({"max_faults": 0}, "max_faults"), ({"max_faults": 3}, "sparse\\+polish"), ({"faults": "bias"}, "dictionary"),
-    ):
-        with pytest.raises(StructureError, match=words):
-            diagnose(small(), data, **({"faults": found} | arguments))
     refused(
+        *((StructureError, words, lambda how=how: diagnose(small(), data, **({"faults": found} | how)))
+          for how, words in (
+            ({"false_alarm": 0.0}, "false_alarm"), ({"coverage": 1.0}, "coverage"), ({"method": "exakt"}, "exact"),
+            ({"max_faults": 0}, "max_faults"), ({"max_faults": 3}, "sparse\\+polish"), ({"faults": "b"}, "dictionary"),
+            ({"rescale": True}, "healthy="), ({"model_uncertainty": "use"}, "covariance of the model"),
+            ({"model_uncertainty": "perhaps"}, "'ignore'"))),
         (StructureError, "another model", lambda: diagnose(replace(small(), A=small().A * 0.9), data, found)),
         (StructureError, "windows of 120 samples; the record has 100",
          lambda: diagnose(small(), (data[0][:100], data[1][:100]), found, thresholds=limits)),
@@ -440,7 +420,7 @@ def test_bad_arguments_are_named(found, limits):
 
 def test_collinear_faults_are_answered_as_a_group():
     model = replace(small(), D=np.array([[0.0, 0.0], [0.0, 0.3]]))
-    with pytest.warns(DataWarning, match="same trace"):
+    with pytest.warns(DataWarning, match="same signature"):
         faults = dictionary(model, process={"B1": model.B[:, 0]}, state_jump=False)
     u, y = record(Fault.step("actuator:u1", 60, 0.8), model=model)
     answer = diagnose(model, (u, y), faults)
@@ -456,10 +436,8 @@ def test_the_course_of_the_fault_is_estimated_on_request(found, limits, tmp_path
     course = answer.profile("trend").course
     truth = 0.03 * np.maximum(np.arange(len(course)) - 59, 0)
     assert np.linalg.norm(course - truth) < 0.15 * np.linalg.norm(truth)
-    with pytest.raises(StructureError, match="names none"):
-        diagnose(small(), record(), found, thresholds=limits).profile()
-    with pytest.raises(StructureError, match="read from a file"):
-        load_diagnosis(answer.save(tmp_path / "d.json")).profile()
+    healthy, stored = diagnose(small(), record(), found, thresholds=limits), load_diagnosis(answer.save(tmp_path / "d"))
+    refused((StructureError, "names none", healthy.profile), (StructureError, "read from a file", stored.profile))
 
 
 def test_every_verdict_has_words_and_a_picture(found, limits):

@@ -79,7 +79,7 @@ def test_several_records_count_together_and_a_short_one_gives_the_factor_of_more
     parts = [whiten(found.model, record(3000, seed, 1.0)) for seed in range(5, 9)]
     whole = empirical_thresholds(found, parts, WINDOW, 0.02)
     assert whole.independent == 480 and not whole.extrapolated
-    with pytest.raises(DataError, match="samples are needed"):
+    with pytest.raises(DataError, match="samples are required"):
         empirical_thresholds(found, parts[0], WINDOW, 1e-3)
     rare = empirical_thresholds(found, parts, WINDOW, 1e-3, extrapolate=True)
     assert rare.extrapolated and rare.factor == pytest.approx(whole.factor, rel=0.35)
@@ -133,7 +133,12 @@ def test_diagnosis_takes_the_thresholds_of_a_healthy_record(found):
 def test_refusals(found):
     data = record(200, 21)
     white = whiten(found.model, data)
+    course, limits = sliding_scan(found, white, WINDOW), thresholds(found, 30, 0.05, draws=2000)
+    uncertain = whiten(found.model, data, uncertainty=model_uncertainty(found.model, record(400, 22)))
     refused(
+        (StructureError, "windows of 30 samples, not 25", lambda: course.alarms(limits)),
+        (StructureError, "without uncertainty", lambda: sliding_scan(found, uncertain, WINDOW)),
+        (DataError, "20 are needed", lambda: watching(found, arl0=3000, healthy=record(300, 40))),
         (DataError, "does not fit", lambda: sliding_scan(found, white, 201)),
         (StructureError, "hop must be a positive integer; got 0", lambda: sliding_scan(found, white, WINDOW, hop=0)),
         (DataError, "u has 150 samples; the record has 200",
@@ -141,12 +146,6 @@ def test_refusals(found):
         (DataError, "u is of 1 experiments, the record of 2",
          lambda: empirical_thresholds(found, [white, white], WINDOW, 0.2, u=[data.u])),
     )
-    course, limits = sliding_scan(found, white, WINDOW), thresholds(found, 30, 0.05, draws=2000)
-    with pytest.raises(StructureError, match="windows of 30 samples, not 25"):
-        course.alarms(limits)
-    uncertain = whiten(found.model, data, uncertainty=model_uncertainty(found.model, record(400, 22)))
-    with pytest.raises(StructureError, match="without uncertainty"):
-        sliding_scan(found, uncertain, WINDOW)
 
 
 # -- monitors --------------------------------------------------------------------------------------------------------
@@ -194,8 +193,3 @@ def test_a_monitor_of_losses_is_calibrated_along_the_inputs():
     other = record(6000, 41, 1.5)
     counts = [sum(e.kind == "alarm" for e in monitor.run(other.u, other.y)) for monitor in (plain, taught)]
     assert counts[1] <= 24 < counts[0], counts  # 12 are asked for
-
-
-def test_a_monitor_needs_a_healthy_record_of_some_length(found):
-    with pytest.raises(DataError, match="20 are needed"):
-        watching(found, arl0=3000, healthy=record(300, 40))

@@ -5,13 +5,12 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from fault_plants import levels, refused
+from fault_plants import record, refused
 from scipy.stats import chi2
 from test_fault_injection import small
 
-from optid import Data
 from optid.errors import DataError, StructureError
-from optid.faults import Fault, dictionary, inject, scan, state_jumps, thresholds, whiten
+from optid.faults import Fault, dictionary, scan, state_jumps, thresholds, whiten
 
 
 @pytest.fixture(scope="module")
@@ -20,10 +19,7 @@ def found():
 
 
 def window(found, count, seed, faults=(), missing=0.0):
-    u = levels(count, seed)
-    y = inject(found.model, u, faults, seed=seed)
-    y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
-    return whiten(found.model, Data(u, y), x0="zero")
+    return whiten(found.model, record(found.model, seed, faults, missing, count), x0="zero")
 
 
 def brute(found, white, onsets):
@@ -80,21 +76,14 @@ def test_a_healthy_window_has_none(found):
 
 def test_bad_input(found):
     white = window(found, 30, 0)
-    for most in (-1, 1.5):
-        with pytest.raises(StructureError, match="most must be a nonnegative integer"):
-            state_jumps(found, white, most)
-    with pytest.raises(StructureError, match="penalty="):
-        state_jumps(found, white, penalty=float("nan"))
     untested = replace(thresholds(found, 30, draws=5000), q=np.full(len(found.labels), np.nan))
+    bad = replace(white, r=np.where((np.arange(30)[:, None] == 4) & [False, True], np.inf, white.r))
     refused(
+        *((StructureError, "most must be a nonnegative", lambda k=k: state_jumps(found, white, k)) for k in (-1, 1.5)),
+        (StructureError, "penalty=", lambda: state_jumps(found, white, penalty=float("nan"))),
         (StructureError, "none for a jump", lambda: state_jumps(found, white, penalty=untested)),
         (StructureError, "one experiment", lambda: state_jumps(found, (white, white))),
         (StructureError, "ties all segments", lambda: state_jumps(found, replace(white, nuisance=lambda r: r))),
+        (DataError, "'y2' at sample 4", lambda: state_jumps(found, bad)),
+        (StructureError, "too many", lambda: state_jumps(found, replace(white, r=np.zeros((3001, 2))))),
     )
-    bad = white.r.copy()
-    bad[4, 1] = np.inf
-    with pytest.raises(DataError, match="'y2' at sample 4"):
-        state_jumps(found, replace(white, r=bad))
-    long = replace(white, r=np.zeros((3001, 2)))
-    with pytest.raises(StructureError, match="too many"):
-        state_jumps(found, long)

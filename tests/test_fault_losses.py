@@ -11,23 +11,6 @@ from test_fault_scan import record
 from optid import Data
 from optid.errors import StructureError
 from optid.faults import Fault, bounded, dictionary, inject, scan, severity, whiten
-from optid.faults.search.losses import boxed
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("d", [1, 2, 3])
-def test_all_faces_find_the_optimum_of_the_box(d):
-    rng = np.random.default_rng(d)
-    G = rng.normal(size=(200, 8, d))
-    y = 2 * rng.normal(size=(200, 8))
-    low, high = -rng.uniform(0, 1, d), rng.uniform(0, 1, d)
-    high[-1] = np.inf
-    sizes, values = boxed(np.einsum("tki,tkj->tij", G, G), np.einsum("tki,tk->ti", G, y), low, high)
-    for one, target, nu, value in zip(G, y, sizes, values):
-        expected = lsq_linear(one, target, (low, high), tol=1e-14)
-        np.testing.assert_allclose(nu, expected.x, atol=1e-6)
-        assert abs(value - (target @ target - 2 * expected.cost)) < 1e-7
-    assert np.mean(np.any((sizes == low) | (sizes == high), axis=1)) > 0.3
 
 
 def broken(model, fault, seed=0, count=160):

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from fault_plants import levels, standard
+from fault_plants import levels, refused, standard
 from test_fault_injection import small
 from test_fault_scan import KINDS, LOAD, random_model, record
 
@@ -127,17 +127,17 @@ def test_faults_that_look_the_same_near_the_end_are_reported():
         found = dictionary(model, state_jump=False)
     two = pairs(scan(found, whiten(model, record(model, 30, 0))), penalties(found))
     assert (("actuator:u", "sensor:y"), (29, 29)) in [(a.labels, a.onsets) for a in two.indistinguishable]
-    assert two.alike == len(two.indistinguishable) and "cannot be told apart" in str(two)
+    assert two.alike == len(two.indistinguishable) and "indistinguishable" in str(two)
 
 
 def test_bad_input():
     model, data = small(), record(small(), 40, 0)
     found = dictionary(model, kinds=["bias", "loss"])
     result = scan(found, whiten(model, data), data.experiments[0].u)
-    with pytest.raises(StructureError, match="no threshold for actuator:u1 loss.*u=u"):
-        pairs(result, thresholds(found, 40, draws=5000))
-    with pytest.raises(StructureError, match="other candidates"):
-        pairs(result, penalties(dictionary(model)))
     long = scan(found, whiten(model, record(model, 12_000, 0)))
-    with pytest.raises(StructureError, match="too many for all pairs"):
-        pairs(long, penalties(found))
+    refused(
+        (StructureError, "no threshold for actuator:u1 loss.*u=u",
+         lambda: pairs(result, thresholds(found, 40, draws=5000))),
+        (StructureError, "other candidates", lambda: pairs(result, penalties(dictionary(model)))),
+        (StructureError, "too many for all pairs", lambda: pairs(long, penalties(found))),
+    )

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_plants import levels, noisy, refused, standard
+from fault_plants import LOAD, levels, noisy, refused
+from fault_plants import record as plants_record
 from state_systems import with_feedback
 from test_fault_injection import small
 
@@ -14,7 +15,6 @@ from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.faults import Fault, dictionary, inject, model_uncertainty, scan, thresholds, whiten
 from optid.faults.search.sweeps import sweep
 
-LOAD = np.array([0.3, -0.2, 0.5])
 KINDS = ["bias", "drift", "loss", "stuck"]
 
 
@@ -28,10 +28,7 @@ def random_model(seed, n=3, m=2, l=2):  # noqa: E741
 
 
 def record(model, count, seed, gaps=0.0, fault=()):
-    rng = np.random.default_rng(seed)
-    u = levels(count, seed, model.m)
-    y = inject(model, u, fault, seed=seed)
-    return Data(u, np.where(rng.random(y.shape) < gaps, np.nan, y), dt=model.dt, outputs=model.outputs)
+    return plants_record(model, seed, fault, gaps, count)
 
 
 def dense(found, white, u, label):
@@ -54,6 +51,7 @@ def sensor_gain(candidate):
 
 def compare(found, white, u):
     result = scan(found, white, u)
+    assert max(map(len, str(result).splitlines())) <= 80
     for c, candidate in enumerate(found.candidates):
         if sensor_gain(candidate):  # it multiplies what the sensor reads: no least squares
             assert np.isnan(result.statistic[c]).all()
@@ -201,21 +199,6 @@ def test_states_of_the_predictor_with_feedback_and_gaps():
     np.testing.assert_allclose((y - predicted)[white.present], white.innovations[white.present], atol=1e-9)
 
 
-def test_a_fault_is_found_where_it_is(real_data):
-    model, load = standard(real_data)
-    found = dictionary(model, kinds=["bias", "loss", "stuck"], process={"load": load})
-    u = levels(300, 2)
-    y = inject(model, u, Fault.loss("actuator:u1", 200, 0.5), seed=3)
-    result = scan(found, whiten(model, Data(u, y), x0="zero"), u)
-    limits = thresholds(found, 300, u=u, draws=5000)
-    gains = result.gains(limits)
-    c, onset = np.unravel_index(np.nanargmax(gains), gains.shape)
-    assert found.labels[c] == "actuator:u1 loss" and abs(onset - 200) <= 2
-    nu, covariance = result.estimate("actuator:u1 loss", int(onset))
-    assert abs(nu[0] - 0.5) < 4 * np.sqrt(covariance[0, 0]) < 0.3
-    assert max(map(len, str(result).splitlines())) <= 80
-
-
 def test_only_the_onsets_asked_for():
     found, data = dictionary(small()), record(small(), 60, 0)
     white = whiten(small(), data)
@@ -335,7 +318,7 @@ def test_bad_input():
         (StructureError, "at least 8 samples", lambda: thresholds(found, 7)),
         (StructureError, "false_alarm=", lambda: thresholds(found, 60, 1.0)),
         (DataError, "at least 50000000 draws", lambda: thresholds(found, 60, 1e-6)),
-        (DataError, "as many are needed", lambda: thresholds(found, 60, u=u[:30])),
+        (DataError, "at least those of the window", lambda: thresholds(found, 60, u=u[:30])),
         (StructureError, "other candidates",
          lambda: scan(found, white).gains(thresholds(dictionary(small()), 60, draws=5000))),
         (LookupFailed, "actuator:u9", lambda: scan(found, white).peak("actuator:u9")),

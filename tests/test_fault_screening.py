@@ -39,11 +39,15 @@ def test_a_coarse_sensor_is_not_a_flat_line(record):
     assert flat_lines(Data(u, np.round(y))) == ()
 
 
-def test_swapped_outputs_are_named(record):
+@pytest.mark.parametrize(("spoil", "named"), [
+    (lambda u, y: (u, y[:, ::-1]), "outputs y1, y2 look swapped"),
+    (lambda u, y: (u[:, ::-1], y), "inputs u1, u2 look swapped"),
+    (lambda u, y: (u * [1.0, 25.4], y), "'u2' .* divided by 25.4")])
+def test_swapped_channels_and_inputs_in_another_unit_are_named(record, spoil, named):
     model, u, y = record
     check_channels(model, Data(u, y))
-    with pytest.raises(DataError, match="y1, y2 look swapped"):
-        check_channels(model, Data(u, y[:, ::-1]))
+    with pytest.raises(DataError, match=named):
+        check_channels(model, Data(*spoil(u, y)))
 
 
 def test_a_change_of_the_unit_is_named_with_its_sample(record):

@@ -6,18 +6,15 @@ from itertools import combinations
 import cvxpy as cp
 import numpy as np
 import pytest
-from fault_plants import levels, refused
+from fault_plants import LOAD, levels, record, refused
 from test_fault_injection import small
 
-from optid import Data
 from optid.backends import Answer, BackEnd, find
 from optid.errors import LookupFailed, StructureError
 from optid.faults import (
     Fault,
     dictionary,
-    inject,
     model_uncertainty,
-    pairs,
     polish,
     scan,
     signature_estimate,
@@ -30,7 +27,6 @@ from optid.registry import fault_formulation
 from optid.solving.solve import solve
 from optid.structures.group_sparse import GroupSparseStructure
 
-LOAD = np.array([0.3, -0.2, 0.5])
 N = 40
 
 
@@ -44,40 +40,31 @@ def limits(found):
     return thresholds(found, N, draws=5000)
 
 
-def window(found, seed, faults=(), missing=0.0, **how):
-    u = levels(N, seed)
-    y = inject(found.model, u, faults, seed=seed, process={"load": LOAD})
-    y[np.random.default_rng(seed).random(y.shape) < missing] = np.nan
-    return whiten(found.model, Data(u, y), x0="zero", **how), u
+def window(found, seed, faults=(), missing=0.0):
+    return whiten(found.model, record(found.model, seed, faults, missing, N), x0="zero")
 
 
 def two(found, seed=1, **how):
     faults = [Fault.step("sensor:y1", 10, 0.9), Fault.step("actuator:u2", 25, 1.5)]
-    return scan(found, window(found, seed, faults, **how)[0])
+    return scan(found, window(found, seed, faults, **how))
 
 
 # -- atoms ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("missing", [0.0, 0.2])
+@pytest.mark.parametrize("missing", [0.0, 0.2, "uncertain"])
 def test_atoms_explain_what_the_scan_says(found, limits, missing):
-    s = two(found, missing=missing)
+    if missing == "uncertain":  # and losses
+        u, model = levels(N, 4), found.model
+        found = dictionary(model, kinds=["bias", "loss"])
+        data = record(model, 4, Fault.loss("actuator:u1", 15, 0.5), 0.0, N)
+        uncertain = model_uncertainty(model, record(model, 9, count=400))
+        s = scan(found, whiten(model, data, uncertainty=uncertain), u)
+        limits = thresholds(found, N, u=u, draws=5000)
+    else:
+        s = two(found, missing=missing)
     for atom in atoms_of(s, limits):
-        row = s.statistic[s.index(atom.label)][atom.onsets]
-        energy = np.sum(np.einsum("tkd,k->td", atom.axes, s.whitened.r.ravel()) ** 2, axis=1)
-        np.testing.assert_allclose(energy, row, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_atoms_of_losses_and_of_an_uncertain_model(found):
-    u, u2 = levels(400, 9), levels(N, 4)
-    model = found.model
-    uncertain = model_uncertainty(model, Data(u, inject(model, u, seed=9)))
-    y = inject(model, u2, Fault.loss("actuator:u1", 15, 0.5), seed=4)
-    lossy = dictionary(model, kinds=["bias", "loss"])
-    s = scan(lossy, whiten(model, Data(u2, y), uncertainty=uncertain), u2)
-    for atom in atoms_of(s, thresholds(lossy, N, u=u2, draws=5000)):
         row = s.statistic[s.index(atom.label)][atom.onsets]
         energy = np.sum(np.einsum("tkd,k->td", atom.axes, s.whitened.r.ravel()) ** 2, axis=1)
         np.testing.assert_allclose(energy, row, rtol=1e-5, atol=1e-8)
@@ -90,7 +77,7 @@ def test_atoms_of_losses_and_of_an_uncertain_model(found):
 @pytest.mark.parametrize("seed", range(6))
 def test_something_is_active_exactly_when_the_search_alarms(found, limits, seed):
     size = 0.1 * seed
-    s = scan(found, window(found, seed, [Fault.step("sensor:y2", 15, size)] if seed else [])[0])
+    s = scan(found, window(found, seed, [Fault.step("sensor:y2", 15, size)] if seed else []))
     result = signature_estimate(s, limits)
     q = limits.of(found.labels)[:, None]
     assert result.certified and result.alarm == bool(np.nanmax(s.gains(limits)) > 0)
@@ -244,15 +231,6 @@ def test_a_solver_without_a_point_gives_no_certificate(found, limits, answer):
     assert "not certified" in str(result) and max(map(len, str(result).splitlines())) <= 80
 
 
-def test_a_solver_that_raises_is_an_outcome(found, limits):
-    def run(program, settings):
-        raise ZeroDivisionError("boom")
-
-    bad = BackEnd("bad", frozenset(), run, structures=(GroupSparseStructure,))
-    result = signature_estimate(two(found), limits, solver=bad)
-    assert not result.certified and "boom" in result.status
-
-
 # -- the exact search near the onsets ------------------------------------------------------------------------------
 
 
@@ -260,36 +238,17 @@ def dense_gain(s, limits, members):
     r = s.whitened.r.ravel()
     G = np.concatenate([s.signature(label, onset).reshape(r.size, -1) for label, onset in members], axis=1)
     fitted = G @ np.linalg.lstsq(G, r, rcond=1e-9)[0]
-    return fitted @ fitted - sum(limits.q[found_index(s, label)] for label, _ in members)
+    return fitted @ fitted - sum(limits.q[s.labels.index(label)] for label, _ in members)
 
 
-def found_index(s, label):
-    return s.labels.index(label)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("missing", [0.0, 0.2])
-def test_all_onsets_give_what_all_pairs_give(found, limits, missing):
-    s = two(found, missing=missing)
-    search, exact = polish(s, limits), pairs(s, limits)
-    assert exact.best is not None and search.gain == pytest.approx(max(exact.gain, exact.single), rel=1e-8)
-    assert sorted(zip(search.best.labels, search.best.onsets)) == sorted(zip(exact.best.labels, exact.best.onsets))
-    gains = {pair.labels: pair.gain for pair in exact.ranked}
-    for subset in search.ranked:
-        if len(subset.labels) == 2:
-            assert subset.gain == pytest.approx(gains[subset.labels], rel=1e-7, abs=1e-7)
-
-
-@pytest.mark.parametrize("size", [1, 2, 3])
-def test_equal_to_brute_force_over_all_subsets(found, limits, size):
-    u = levels(N, 2)
+@pytest.mark.parametrize("size, missing", [(1, 0.0), (2, 0.2), (3, 0.0)])
+def test_equal_to_brute_force_over_all_subsets(found, limits, size, missing):
     faults = [Fault.step("sensor:y1", 12, 0.5), Fault.jump("state", 20, [0.8, -0.8, 0.4]),
               Fault.step("actuator:u1", 28, 0.8)]
-    s = scan(found, whiten(found.model, Data(u, inject(found.model, u, faults, seed=2)), x0="zero"),
-             onsets=[11, 12, 20, 28])
+    s = scan(found, window(found, 2, faults, missing), onsets=[11, 12, 20, 28])
     search = polish(s, limits, max_faults=size)
     atoms = [(label, k) for label in found.labels for k in (11, 12, 20, 28)
-             if not np.isnan(s.statistic[found_index(s, label), k])]
+             if not np.isnan(s.statistic[s.labels.index(label), k])]
     values = {members: dense_gain(s, limits, members) for k in range(1, size + 1) for members in combinations(atoms, k)}
     best = max(values, key=lambda members: values[members])
     assert search.gain == pytest.approx(values[best], rel=1e-7)
@@ -331,27 +290,9 @@ def test_exchanges_never_lose_and_end_where_no_single_one_gains(found, limits):
         for i in range(len(members)):
             for label in found.labels:
                 for k in range(0, N, 3):
-                    if not np.isnan(s.statistic[found_index(s, label), k]):
+                    if not np.isnan(s.statistic[s.labels.index(label), k]):
                         trial = [*members[:i], (label, k), *members[i + 1 :]]
                         assert dense_gain(s, limits, trial) <= better.gain + 1e-6 or len(set(trial)) < len(trial)
-
-
-@pytest.mark.slow
-def test_a_mixed_integer_programme_agrees_on_a_tiny_grid(found, limits):
-    """The same optimum by branch and bound with binaries, on a grid small enough for it."""
-    if "SCIP" not in cp.installed_solvers():
-        pytest.skip("SCIP is not installed")
-    s = scan(found, two(found).whitened, onsets=[9, 10, 11, 24, 25, 26])
-    search = polish(s, limits)
-    atoms, r = [a for a in atoms_of(s, limits) if a.dimension == 1], s.whitened.r.ravel()
-    Q = np.hstack([a.axes[:, :, 0].T for a in atoms])
-    q = np.concatenate([np.full(a.onsets.size, a.threshold) for a in atoms])
-    a, z = cp.Variable(q.size), cp.Variable(q.size, boolean=True)
-    big = 2 * np.linalg.norm(r)
-    problem = cp.Problem(cp.Minimize(cp.sum_squares(r - Q @ a) + q @ z), [cp.abs(a) <= big * z, cp.sum(z) <= 2])
-    problem.solve(solver="SCIP", scip_params={"limits/time": 60.0, "limits/gap": 1e-7})
-    scalar = [x for x in search.ranked if "state" not in x.labels]
-    assert float(r @ r) - problem.value == pytest.approx(scalar[0].gain, rel=1e-5)
 
 
 # -- bad input -----------------------------------------------------------------------------------------------------
@@ -359,17 +300,14 @@ def test_a_mixed_integer_programme_agrees_on_a_tiny_grid(found, limits):
 
 def test_bad_input(found, limits):
     s = two(found)
-    for penalty in (0.0, -1.0, np.nan):
-        with pytest.raises(StructureError, match="penalty="):
-            signature_estimate(s, limits, penalty=penalty)
-    with pytest.raises(StructureError, match="other candidates"):
-        signature_estimate(s, replace(limits, labels=limits.labels[::-1]))
-    with pytest.raises(StructureError, match="has no threshold"):
-        signature_estimate(s, replace(limits, q=np.full(len(limits.q), np.nan)))
-    for most in (0, 1.5, -1):
-        with pytest.raises(StructureError, match="max_faults must be"):
-            polish(s, limits, max_faults=most)
+    wide = replace(s, statistic=np.zeros((len(found.labels), 100_000)))
+    backwards, none = replace(limits, labels=limits.labels[::-1]), replace(limits, q=np.full(len(limits.q), np.nan))
     refused(
+        *((StructureError, "penalty=", lambda p=p: signature_estimate(s, limits, penalty=p)) for p in (0, -1, np.nan)),
+        *((StructureError, "max_faults must be", lambda k=k: polish(s, limits, max_faults=k)) for k in (0, 1.5, -1)),
+        (StructureError, "other candidates", lambda: signature_estimate(s, backwards)),
+        (StructureError, "no threshold", lambda: signature_estimate(s, none)),
+        (StructureError, "shorter window", lambda: atoms_of(wide, limits)),
         (StructureError, "too many for an exact search", lambda: polish(s, limits, max_faults=6)),
         (LookupFailed, "fault.signature", lambda: fault_formulation("fault.signatur")),
         (StructureError, "not convex",
@@ -377,13 +315,10 @@ def test_bad_input(found, limits):
         (StructureError, "no fault|none|does not have|asks for",
          lambda: signature_estimate(s, limits, constraints=[lambda v: v["size[sensor:y9]"] >= 1])),
     )
-    wide = replace(s, statistic=np.zeros((len(found.labels), 100_000)))
-    with pytest.raises(StructureError, match="shorter window"):
-        atoms_of(wide, limits)
 
 
 def test_a_healthy_window_gives_nothing(found, limits):
-    s = scan(found, window(found, 3)[0])
+    s = scan(found, window(found, 3))
     result = signature_estimate(s, limits)
     assert not result.alarm and result.clusters == () and not result.near().any()
     search = polish(s, limits, result)

@@ -1,8 +1,8 @@
 """The proof of a group-sparse programme: a lower bound recomputed from a feasible dual point.
 
 For ``min 1/2 ‖r - M a‖² + lambda sum w_g ‖a_g‖`` under affine constraints whose multipliers make the part ``c' a + k``
-of the Lagrangian, every v with ``‖M_g' v - c_g‖ <= lambda w_g`` gives the bound ``r' v - 1/2 ‖v‖² + k``. What a solver
-returns is scaled into that set, v and multipliers together, so that the bound holds whatever it was.
+of the Lagrangian, every v with ``‖M_g' v - c_g‖ <= lambda w_g`` gives the bound ``r' v - 1/2 ‖v‖² + k``. The
+point of a solver is scaled into that set, v and multipliers together, so that the bound always holds.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from optid.program.solution import Bound, relative_gap
 from optid.structures.group_sparse import GroupSparseStructure
 
 PROVED = 1e-6
-"""Relative gap below which a point counts as optimal."""
+"""Relative gap below which a point is optimal."""
 
 
 def certify(program: Program, values: Values, duals: Values) -> tuple[Bound, None]:

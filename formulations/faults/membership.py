@@ -3,11 +3,10 @@
     min t   subject to   x(k + 1) - A x(k) = w(k),  |w| <= t w̄,   e(k) - C x(k) = v(k),  |v| <= t v̄
 
 with x the deviation of the states from a simulation from zero, and e the readings less that simulation. t > 1 proves
-that no healthy plant has made the window; the multipliers of the measurements are near the parity vector that shows it
-(`optid.faults.consistency.bounded_noise`). With a fault of unknown size the same programme tells whether a candidate is
-possible.
-Its onset is searched by branch and bound: what a step with any onset between two samples can do, a free course between
-them followed by a step can do, too. Bounds of t are recomputed from parity vectors, never copied from a solver.
+that the window is not that of a healthy plant; the multipliers of the measurements approximate the parity vector of the
+proof (`optid.faults.consistency.bounded_noise`). With a fault of unknown size the same programme tests a candidate. Its
+onset is searched by branch and bound: a free course between two samples followed by a step includes every step with an
+onset between them. Bounds of t are recomputed from parity vectors, not taken from a solver.
 
 Named variables: ``t``; named expressions: ``x`` (N, n) and, with a candidate, ``size``.
 """
@@ -39,11 +38,10 @@ from optid.solving.solve import Evidence, Procedure
 Array = np.ndarray
 
 PROVED = 1e-6
-"""Relative gap below which a factor counts as least."""
-
+"""Relative gap below which a factor is proved to be the least."""
 
 Signature = tuple[Array, Array]
-"""What a fault of unknown sizes adds: (N, n, c) to x(k), (N, l, c) to y(k)."""
+"""Additions of a fault of unknown sizes: (N, n, c) to x(k), (N, l, c) to y(k)."""
 
 
 def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictionary | None = None,
@@ -56,9 +54,9 @@ def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictiona
         data: the window; one experiment, some ten to a hundred samples.
         bounds: of the noise: a number of standard deviations, or {"process": (n,), "output": (l,)}.
         faults: the candidates; none by default.
-        onsets: "all", the onsets that are tried, or "course": a fault of any course, which takes one programme for
-            every candidate and excludes fewer.
-        candidates: whether candidates are tried although a healthy plant is possible.
+        onsets: "all", the onsets that are tried, or "course": a fault of arbitrary course, with one programme for every
+            candidate, which excludes fewer.
+        candidates: whether candidates are tested although a healthy plant is possible.
         constraints: further constraints on ``x`` and ``t`` of the healthy programme.
 
     Returns:
@@ -99,7 +97,7 @@ def _possible(window: BoundedWindow, candidate: Candidate, unit: Signature, trie
               ) -> Generator[Program, Solution, tuple[float, int | None, dict[tuple[int, int], ParityProof]]]:
     """Return a factor and onset at which a candidate is possible; or the least factor proved, with all proofs.
 
-    The factor is NaN where the solver gave neither; `unit` is what a unit of the course in each sample adds.
+    The factor is NaN where the solver gave neither; `unit` is the addition of a unit course in each sample.
     """
     if tried is None:
         solution = yield _programme(window, _between(candidate, unit, 0, window.count))
@@ -108,7 +106,7 @@ def _possible(window: BoundedWindow, candidate: Candidate, unit: Signature, trie
     proofs: dict[tuple[int, int], ParityProof] = {}
     waiting: list[tuple[float, int, int]] = [(0.0, 0, len(tried) - 1)]
     while waiting:
-        waiting.sort()  # the smallest factor first: there the candidate may be possible
+        waiting.sort()  # the smallest factor first
         _, first, last = waiting.pop(0)
         solution = yield _programme(window, _between(candidate, unit, tried[first], tried[last]))
         proof, middle = _proof_of(solution), (first + last) // 2
@@ -147,7 +145,7 @@ def _between(candidate: Candidate, unit: Signature, first: int, last: int) -> Si
 
 
 def _programme(window: BoundedWindow, signature: Signature | None = None) -> Program:
-    """Pose the linear programme of the healthy plant, or with additions of unknown sizes."""
+    """Build the linear programme of the healthy plant, or with additions of unknown sizes."""
     n, count = window.A.shape[0], window.count
     later, earlier = (sp.diags_array(np.ones(count - 1), offsets=k, shape=(count - 1, count)) for k in (1, 0))
     steps = sp.kron(later, np.eye(n)) - sp.kron(earlier, window.A)
@@ -166,7 +164,7 @@ def _programme(window: BoundedWindow, signature: Signature | None = None) -> Pro
     bounded, exact = np.flatnonzero(known & (bounds > 0)), np.flatnonzero(known & (bounds == 0))
 
     def noise(rows: Array, units: Array) -> Any:
-        """The noise in some rows, in units, as an expression of as few parts as possible: it is judged often."""
+        """Return the noise in some rows, in units, as an expression of few parts, because it is evaluated often."""
         found = level[rows] / units - (sp.diags_array(1 / units) @ matrix[rows]) @ x
         return found - (added[rows] / units[:, None]) @ variables["size"] if "size" in variables else found
 
@@ -204,9 +202,9 @@ def _certified(window: BoundedWindow, signature: Signature | None, bounded: Arra
 def _onsets(onsets: Sequence[int] | str, count: int) -> list[int] | None:
     if isinstance(onsets, str):
         if onsets not in ("all", "course"):
-            raise StructureError(f"onsets={onsets!r}: use 'all', 'course' or whole numbers.")
+            raise StructureError(f"onsets={onsets!r}: use 'all', 'course' or integers.")
         return list(range(count)) if onsets == "all" else None
     chosen = sorted({int(k) for k in onsets})
     if not chosen or chosen[0] < 0 or chosen[-1] >= count:
-        raise StructureError(f"onsets: whole numbers from 0 to {count - 1} are needed, one at least.")
+        raise StructureError(f"onsets: they must be integers from 0 to {count - 1}, at least one.")
     return chosen

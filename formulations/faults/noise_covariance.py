@@ -1,4 +1,4 @@
-"""Where has the noise grown? Covariance matching as a convex programme: several places at once (F8).
+"""Places of increased noise by covariance matching, a convex programme for several places at once (F8).
 
 White noise of variance rho at a place adds rho Lambda(l) to the covariance at lag l of the whitened innovations, which
 is I at lag 0 and zero beyond for a healthy plant. With S(l) the sample covariances of the window,
@@ -7,7 +7,7 @@ is I at lag 0 and zero beyond for a healthy plant. With S(l) the sample covarian
 
 is a non-negative least-squares problem; weights W are the inverse standard deviations of S when healthy. With full
 covariances of the added process and sensor noise, positive semidefinite, in place of rho it is a semidefinite
-programme ("full"), which asks for no candidates but cannot tell directions apart that leave the same covariances.
+programme ("full"), which needs no candidates but does not distinguish directions with the same covariances.
 
 Named variables: ``rho`` (C,), variances in units of the places; or ``Q`` (n, n) and ``R`` (l, l).
 """
@@ -30,7 +30,7 @@ from optid.solving.solve import Evidence, Procedure
 FORMS = ("places", "full")
 
 NOTHING = 1e-4
-"""Covariances of this many standard deviations are what interior-point methods leave of a zero."""
+"""Covariances, in standard deviations, below which the result of an interior-point method is zero."""
 
 
 def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", lags: int | None = None, onset: int = 0,
@@ -55,15 +55,14 @@ def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", l
     if form not in FORMS:
         raise StructureError(f"form={form!r}. {nearest(str(form), FORMS)}")
     problem = covariance_problem(found, whitened, lags=lags, onset=onset)
-    pose = places_programme if form == "places" else full_programme
-    solution = yield pose(problem).subject_to(*constraints)
+    solution = yield (_places if form == "places" else _full)(problem).subject_to(*constraints)
     bound = solution.bound or Bound.none(solution.reason)
     return Evidence(_matched(problem, solution), solution.objective, bound, solution.status, solution.reason,
                     {"lags": problem.lags})
 
 
-def places_programme(problem: CovarianceProblem) -> Program:
-    """Pose the non-negative least-squares problem of the candidates."""
+def _places(problem: CovarianceProblem) -> Program:
+    """The non-negative least-squares problem of the candidates."""
     sizes = np.linalg.norm(problem.signatures, axis=0)
     scaled, units = cp.Variable(sizes.size, name="scaled"), problem.signatures / sizes
     return least_squares(
@@ -72,8 +71,8 @@ def places_programme(problem: CovarianceProblem) -> Program:
         constraints={"variances": (scaled >= 0,)})
 
 
-def full_programme(problem: CovarianceProblem) -> Program:
-    """Pose the semidefinite programme of full covariances of the added process and sensor noise."""
+def _full(problem: CovarianceProblem) -> Program:
+    """The semidefinite programme of full covariances of the added process and sensor noise."""
     n, l = problem.nx, problem.l  # noqa: E741
     Q, R = cp.Variable((n, n), symmetric=True, name="Q"), cp.Variable((l, l), symmetric=True, name="R")
     process, sensor = (cp.multiply(units, one) for units, one in zip(_units(problem), (Q, R)))
@@ -83,10 +82,9 @@ def full_programme(problem: CovarianceProblem) -> Program:
         {"Q": process, "R": sensor}, constraints={"process covariance": (Q >> 0,), "sensor covariance": (R >> 0,)})
 
 
-def _units(problem: CovarianceProblem) -> tuple[np.ndarray, np.ndarray]:
+def _units(problem: CovarianceProblem) -> list[np.ndarray]:
     """Units of the entries of Q and of R."""
-    return (np.sqrt(np.outer(problem.state_units, problem.state_units)),
-            np.sqrt(np.outer(problem.output_units, problem.output_units)))
+    return [np.sqrt(np.outer(units, units)) for units in (problem.state_units, problem.output_units)]
 
 
 def _matched(problem: CovarianceProblem, solution: Solution) -> CovarianceMatch:

@@ -4,11 +4,11 @@
 
 with f = 0 before the window, so that a change in the first sample counts, and optional constraints on f: its sign, its
 size, its slew rate. The penalties shrink the course and share one change among neighbours; so they only propose where
-the course changes. Changes that the Bayesian information criterion does not pay for are dropped, the others move to
-where they explain most, and the course is fitted again by least squares under the same constraints. BIC chooses the
+the course changes. Changes that the Bayesian information criterion rejects are dropped, the others move to where they
+explain most, and the course is fitted again by least squares under the same constraints. BIC chooses the
 penalty and, if asked, the prior.
 
-Named expressions: ``f`` (N,), the course; ``changes``, what the penalty counts.
+Named expressions: ``f`` (N,), the course; ``changes``, the penalised quantities.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from optid.solving.solve import Evidence, Procedure
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 
 PENALTIES = tuple(float(share) for share in np.geomspace(0.5, 0.003, 10))
-"""Penalties tried, as shares of the one at which nothing is left."""
+"""Penalties tried, as shares of the one at which the course is zero."""
 
 ROUGHNESS = tuple(float(share) for share in np.geomspace(1e-4, 1e2, 9))
 """Weights of the random walk tried, over the mean square of the columns of T."""
@@ -41,25 +41,29 @@ SIGNS = {"positive": 1.0, "negative": -1.0}
 
 
 class _Fits:
-    """What the programmes have given so far: (criterion, course, solution), gaps, and what failed."""
+    """Results of the programmes: courses with their criterion and solution, gaps, and the first failure."""
 
-    def __init__(self) -> None:
+    def __init__(self, problem: CourseProblem) -> None:
+        self.problem = problem
         self.found: list[tuple[float, Profile, Solution]] = []
         self.gaps: list[float] = []
         self.failed = ""
 
     def usable(self, word: str, solution: Solution, *, proved: bool = True) -> bool:
-        """Note the gap of a solution, or why there is none to go on with."""
+        """Record the gap of a solution, or its failure."""
         if solution.has_point and (not proved or solution.status in (Status.OPTIMAL, Status.LOCAL)):
             self.gaps.append(solution.gap)
             return True
         self.failed = self.failed or f"{word}: {solution.status}, {solution.reason}"
         return False
 
-    def add(self, problem: CourseProblem, fit: Profile, solution: Solution) -> None:
+    def add(self, program: Program, solution: Solution, prior: str, course: np.ndarray, std: np.ndarray,
+            changes: dict[int, float], freedom: float) -> None:
         """Add a course with the value of its criterion."""
-        rest = problem.r - problem.matrix @ fit.course
-        self.found.append((problem.criterion(float(rest @ rest), fit.freedom), fit, solution))
+        rest = self.problem.r - self.problem.matrix @ course
+        fit = Profile(self.problem.label, course, std, prior, changes, {}, freedom, 0.0, False,
+                      tuple(program.user_constraints))
+        self.found.append((self.problem.criterion(float(rest @ rest), freedom), fit, solution))
 
 
 def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = None, limit: float | None = None,
@@ -85,17 +89,18 @@ def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = 
         DataError: the window sees nothing of the fault.
         StructureError: words or numbers that do not fit, a candidate without a course.
     """
-    problem, fits = course_problem(found, label), _Fits()
+    problem = course_problem(found, label)
+    fits = _Fits(problem)
     if prior != "auto" and prior not in PRIORS:
         raise StructureError(f"prior={prior!r}. {nearest(str(prior), ['auto', *PRIORS])}")
     if penalties is None:
         penalties = ROUGHNESS if prior == "smooth" else PENALTIES
     shares = [float(share) for share in penalties]
     if not shares or not all(np.isfinite(share) and share > 0 for share in shares):
-        raise StructureError(f"penalties={penalties!r}; positive numbers are needed.")
+        raise StructureError(f"penalties={penalties!r}; they must be positive numbers.")
     rules = [*_rules(sign, limit, slew), *constraints]
     for word in ("tv", "trend") if prior == "auto" else (prior,):
-        yield from (_smoothed if word == "smooth" else _changing)(problem, word, shares, rules, fits)
+        yield from (_smoothed(shares, rules, fits) if word == "smooth" else _changing(word, shares, rules, fits))
     if not fits.found:
         return Evidence.pointless(Status.FAILED, fits.failed)
     bic: dict[str, float] = {}
@@ -112,14 +117,14 @@ def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = 
                     {"prior": best.prior, "degrees of freedom": best.freedom, "largest relative gap": gap})
 
 
-def _changing(problem: CourseProblem, prior: str, shares: Sequence[float], rules: Sequence[Any], fits: _Fits
-              ) -> Procedure:
-    """Propose changes by the penalties, drop what does not pay, and fit again."""
+def _changing(prior: str, shares: Sequence[float], rules: Sequence[Any], fits: _Fits) -> Procedure:
+    """Propose changes by the penalties, drop those that the criterion rejects, and fit again."""
+    problem = fits.problem
     shapes = problem.shapes(prior)
-    columns = problem.matrix @ shapes
-    lengths = np.linalg.norm(columns, axis=0)
+    design = problem.matrix @ shapes
+    lengths = np.linalg.norm(design, axis=0)
     program = profile_programme(problem, prior).subject_to(*rules)
-    largest = float(np.abs(columns.T @ problem.r).max())
+    largest = float(np.abs(design.T @ problem.r).max())
     seen: set[tuple[int, ...]] = set()
     for share in sorted(shares, reverse=True):
         program.parameters["lambda"].value = share * largest
@@ -129,30 +134,32 @@ def _changing(problem: CourseProblem, prior: str, shares: Sequence[float], rules
         sizes = np.abs(np.ravel(solution.values["changes"])) * lengths
         kept = np.flatnonzero(sizes > 1e-5 * max(float(sizes.max()), 1e-3 * float(np.linalg.norm(problem.r))))
         if kept.size:
-            kept = problem.pruned(columns, problem.moved(columns, problem.pruned(columns, kept)))
+            kept = problem.pruned(design, problem.moved(design, problem.pruned(design, kept)))
         if tuple(kept.tolist()) in seen:
             continue
         seen.add(tuple(kept.tolist()))
         unit = 1 / np.where(lengths[kept] > 0, lengths[kept], 1.0)
-        scaled, course, std = columns[:, kept] * unit, np.zeros(problem.count), np.zeros(problem.count)
+        columns, course, std = design[:, kept] * unit, np.zeros(problem.count), np.zeros(problem.count)
         changes: dict[int, float] = {}
         if kept.size:
-            solution = yield _refit(problem, scaled, shapes[:, kept] * unit, unit, prior).subject_to(*rules)
+            scaled, courses = cp.Variable(kept.size, name="scaled"), shapes[:, kept] * unit
+            solution = yield least_squares(
+                f"fault.profile {prior} refit", problem.r, columns @ scaled, {"scaled": scaled},
+                {"scaled": problem.refitted(columns)[0]}, {"f": courses @ scaled, "changes": cp.multiply(unit, scaled)},
+            ).subject_to(*rules)
             if not fits.usable(f"refit of {prior}", solution):
                 continue
             heights = np.asarray(solution.values["scaled"]) * unit
             course = shapes[:, kept] @ heights
-            covariance = np.linalg.pinv(scaled.T @ scaled, rcond=1e-10, hermitian=True)
-            squares = np.einsum("kp,pq,kq->k", shapes[:, kept] * unit, covariance, shapes[:, kept] * unit)
-            std = np.sqrt(np.maximum(squares, 0.0))
+            covariance = np.linalg.pinv(columns.T @ columns, rcond=1e-10, hermitian=True)
+            std = np.sqrt(np.maximum(np.einsum("kp,pq,kq->k", courses, covariance, courses), 0.0))
             scale = 1.0 if prior == "tv" else 1.0 / problem.count
             changes = {int(k): float(height * scale) for k, height in zip(kept, heights)}
-        fits.add(problem, Profile(problem.label, course, std, prior, changes, {}, float(EACH * kept.size), 0.0, False,
-                                  tuple(program.user_constraints)), solution)
+        fits.add(program, solution, prior, course, std, changes, float(EACH * kept.size))
 
 
 def profile_programme(problem: CourseProblem, prior: str) -> Program:
-    """Pose the programme with a penalty on the changes of the course ("tv") or of its slope ("trend").
+    """Build the programme with a penalty on the changes of the course ("tv") or of its slope ("trend").
 
     Args:
         problem: from `optid.faults.consistency.profiles.course_problem`.
@@ -170,17 +177,9 @@ def profile_programme(problem: CourseProblem, prior: str) -> Program:
         penalty=level * cp.norm1(changes), parameters={"lambda": level}, structure=form, certify=certify)
 
 
-def _refit(problem: CourseProblem, columns: np.ndarray, shapes: np.ndarray, unit: np.ndarray, prior: str) -> Program:
-    """Pose least squares with changes at given samples: columns of unit length, and the courses that they stand for."""
-    scaled = cp.Variable(unit.size, name="scaled")
-    return least_squares(
-        f"fault.profile {prior} refit", problem.r, columns @ scaled, {"scaled": scaled},
-        {"scaled": problem.refitted(columns)[0]}, {"f": shapes @ scaled, "changes": cp.multiply(unit, scaled)})
-
-
-def _smoothed(problem: CourseProblem, prior: str, shares: Sequence[float], rules: Sequence[Any], fits: _Fits
-              ) -> Procedure:
+def _smoothed(shares: Sequence[float], rules: Sequence[Any], fits: _Fits) -> Procedure:
     """Fit random walks of several variances; the trace of the smoother counts as degrees of freedom."""
+    problem = fits.problem
     program = smooth_programme(problem).subject_to(*rules)
     differences = np.eye(problem.count) - np.eye(problem.count, k=-1)
     products = problem.matrix.T @ problem.matrix
@@ -190,13 +189,12 @@ def _smoothed(problem: CourseProblem, prior: str, shares: Sequence[float], rules
         solution = yield program
         if fits.usable(f"smooth at {share:.2g}", solution):
             covariance = np.linalg.inv(products + share * scale * differences.T @ differences)
-            fits.add(problem, Profile(
-                problem.label, np.asarray(solution.values["f"]), np.sqrt(np.diag(covariance)), prior, {}, {},
-                float(np.sum(covariance * products)), 0.0, False, tuple(program.user_constraints)), solution)
+            fits.add(program, solution, "smooth", np.asarray(solution.values["f"]), np.sqrt(np.diag(covariance)), {},
+                     float(np.sum(covariance * products)))
 
 
 def smooth_programme(problem: CourseProblem) -> Program:
-    """Pose the programme of the random walk: what the Kalman smoother solves, open to constraints."""
+    """Build the programme of the random walk: that of the Kalman smoother, with constraints."""
     f, rough = cp.Variable(problem.count, name="f"), cp.Variable(problem.count, name="rough")
     root = cp.Parameter(nonneg=True, name="root of rho", value=1.0)
     shapes = problem.shapes("tv")
@@ -210,7 +208,7 @@ def smooth_programme(problem: CourseProblem) -> Program:
 
 
 def _one(columns: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """The one change that explains most: a start, and the size that is usual."""
+    """The change that explains most, as a start."""
     sizes = np.linalg.norm(columns, axis=0)
     heights = np.divide(columns.T @ r, sizes**2, out=np.zeros(sizes.size), where=sizes > 0)
     return np.where(np.arange(sizes.size) == int(np.argmax(np.abs(heights * sizes))), heights, 0.0)
@@ -224,7 +222,7 @@ def _rules(sign: str | None, limit: float | None, slew: float | None) -> list[An
         rules.append(lambda v: {f"{sign} course": SIGNS[sign] * v["f"] >= 0})
     for word, value in (("limit", limit), ("slew", slew)):
         if value is not None and not (np.isfinite(value) and value > 0):
-            raise StructureError(f"{word}={value!r}; a positive number is needed.")
+            raise StructureError(f"{word}={value!r}; it must be a positive number.")
     if limit is not None:
         rules.append(lambda v: {"limit": [sign * v["f"] <= limit for sign in (1, -1)]})
     if slew is not None:

@@ -1,4 +1,4 @@
-"""Re-allocation of a plant to the actuators that are left: where it can rest, and how to get there.
+"""Re-allocation of a plant to its remaining actuators: resting points, and control to reach them.
 
 A monotone nonlinearity maps the range of its input onto a range of v = f(u) exactly, so that the problem is linear in
 v: the bounds of the inputs are those of v, and u = f^-1(v) keeps them. A stuck actuator is one whose range is a point.
@@ -7,7 +7,7 @@ v: the bounds of the inputs are those of v, and u = f^-1(v) keeps them. A stuck 
   the bounds of v. Where the reference cannot be reached, the distance is positive, and the multipliers of the bounds
   say which actuator limits it.
 * ``track``: model predictive control over a horizon, ‖W (y_k - r)‖² + ‖(v_k - v_s) / q‖² and a terminal cost.
-* both with several members that stand for what may be broken: the same v for all, the worst of them made least
+* both with several members, the possible damages: the same v for all, with the least cost of the worst of them
   (min-max), each a plant with its own gains and constants in the v of the healthy nonlinearities.
 * with ``norm``: ‖S v_k‖ <= limit, a limit that actuators share (a pump, a power supply); a second-order cone.
 * with ``equations``: in the inputs u themselves, as `formulations.faults.reallocation_nlp` does it.
@@ -34,12 +34,13 @@ Equations = Callable[[AllocationProblem, Any, Any, Any], dict[str, tuple[Any, ..
 
 def target(problem: AllocationProblem, *, reference: Any, equations: Equations | None = None,
            constraints: Sequence[Any] = ()) -> Program:
-    """Pose the resting point nearest to a reference.
+    """Build the programme of the resting point nearest to a reference.
 
     Args:
-        problem: what is left of the plant.
-        reference: (l,) outputs wanted.
-        equations: what ties v to the inputs u, which are then variables, too; without them v is free in its bounds.
+        problem: the damaged plant.
+        reference: (l,) of the outputs.
+        equations: constraints between v and the inputs u, which are then variables, too; by default v is free in its
+            bounds.
         constraints: builders of further constraints in v, x and y.
     """
     r = np.asarray(reference, dtype=float)
@@ -59,11 +60,11 @@ def target(problem: AllocationProblem, *, reference: Any, equations: Equations |
 def track(problem: AllocationProblem, *, reference: Any, states: Sequence[Any], goal: Any, rests: Any = None,
           horizon: int = 40, effort: float = 1e-3, rates: Any = None, previous: Any = None,
           equations: Equations | None = None, constraints: Sequence[Any] = ()) -> Program:
-    """Pose the control of a horizon; reference, states, goal, rests and previous are parameters of the programme.
+    """Build the control of a horizon; reference, states, goal, rests and previous are parameters of the programme.
 
     Args:
-        problem: what is left of the plant.
-        reference: (l,) outputs wanted.
+        problem: the damaged plant.
+        reference: (l,) of the outputs.
         states: (n,) of every member.
         goal: v (r,) of the resting point, or its u (m,) with equations.
         rests: (n,) state of every member there; that of v by default.
@@ -106,7 +107,7 @@ def track(problem: AllocationProblem, *, reference: Any, states: Sequence[Any], 
 
 
 def _labelled(problem: AllocationProblem) -> Iterator[tuple[str, Member]]:
-    """Yield the members, each with what is added to the names of its variables."""
+    """Yield the members with the suffixes of the names of their variables."""
     for number, member in enumerate(problem.members):
         yield f"[{number + 1}]" if len(problem.members) > 1 else "", member
 

@@ -1,4 +1,4 @@
-"""Re-allocation in the inputs themselves: for nonlinearities that have no inverse, for feedback, and for rates of u.
+"""Re-allocation in the inputs: for nonlinearities without an inverse, for feedback, and for rates of u.
 
     minimise sum ‖W (y_k - r)‖² + effort ‖(u_k - u_s) / half the range‖² + terminal cost
     subject to x_k+1 = A x_k + B f(u_k) + E g(y_k) + L y_k + d, y_k = C x_k + D f(u_k) + c, bounds and rates of u
@@ -30,12 +30,12 @@ SHARP = 1e-5
 
 
 def resting(problem: AllocationProblem, *, reference: Any, constraints: Sequence[Any] = ()) -> Program:
-    """Pose the resting point nearest to a reference; see `formulations.faults.reallocation.target`."""
+    """Build the resting point nearest to a reference; see `formulations.faults.reallocation.target`."""
     return target(problem, reference=reference, equations=function_equations, constraints=constraints)
 
 
 def tracker(problem: AllocationProblem, **how: Any) -> Program:
-    """Pose the control of a horizon, with rates of u or without; see `formulations.faults.reallocation.track`."""
+    """Build the control of a horizon, with or without rates of u; see `formulations.faults.reallocation.track`."""
     return track(problem, **how, equations=function_equations)
 
 

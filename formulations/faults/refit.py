@@ -1,4 +1,4 @@
-"""Refit of a damaged plant with a healthy prior: what broke alone, or all parameters.
+"""Refit of a damaged plant with a healthy prior: the damaged nonlinearities alone, or all parameters.
 
 ``actuator``: the values of the damaged nonlinearities at their nodes are the unknowns, and the columns of B and D that
 carry them stay, so that the innovations are linear in them and the programme is a QP:
@@ -6,8 +6,8 @@ carry them stay, so that the innovations are linear in them and the programme is
     minimise ‖s - R z‖² + sum ((c - c_healthy) / p)² + sum (D2 (c - (1 - g) c_healthy) / q)²
 
 with c = values at the nodes, D2 second differences, and g the share of the gain that is lost, in [0, 1]: a plain loss
-of gain bends nothing. Unless others are asked for, c is monotone like the healthy nonlinearity and nowhere steeper:
-nothing gains strength by breaking. ``parameters``: A, B, C, D and the other nonlinearities are open, too, each with a
+of gain changes no curvature. By default c is monotone like the healthy nonlinearity and nowhere steeper: a fault does
+not increase the gain. ``parameters``: A, B, C, D and the other nonlinearities are open, too, each with a
 healthy prior; a Gauss-Newton procedure whose steps are the same QP. Named variables: ``mu[input]``,
 ``constant[input]``, ``lost[input]``, and A, B, C, D.
 """
@@ -39,7 +39,7 @@ HALVINGS = 12
 
 
 def actuator(problem: Refitting, *, constraints: Sequence[Any] | str = "default") -> Program:
-    """Pose the refit of what broke alone.
+    """Build the refit of the damaged nonlinearities alone.
 
     Args:
         problem: from `optid.faults.repair.refitting.refitting`.
@@ -61,7 +61,7 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
     """
     z = np.append(problem.start, np.zeros(len(problem.curves)))
     r, s = problem.linearised(problem.start)
-    objective = np.inf
+    (believed, wanted), objective = problem.believed(), np.inf
     for _ in range(STEPS):
         solution = yield _step("refit.parameters", problem, z[: problem.start.size], r, s, constraints)
         if not solution.has_point:
@@ -70,7 +70,7 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
         for _ in range(HALVINGS):
             trial = z + length * step
             r, s = problem.linearised(trial[: problem.start.size])
-            objective = _cost(problem, trial, r)
+            objective = float(np.sum(r**2) + np.sum((believed @ trial - wanted) ** 2))
             if np.isfinite(objective) and objective <= before:
                 break
             length /= 2
@@ -83,7 +83,7 @@ def parameters(problem: Refitting, *, constraints: Sequence[Any] | str = "defaul
 
 
 class Refitted:
-    """What a refit ends with.
+    """Result of a refit.
 
     Attributes:
         theta: the vector of unknowns.
@@ -99,12 +99,14 @@ class Refitted:
 
 def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
           ) -> Program:
-    """Pose the programme linearised at theta: one sum of squares, of the record and of what is believed beforehand."""
+    """Build the programme linearised at theta: one sum of squares, of the record and of the prior."""
     if isinstance(constraints, str) and constraints != "default":
         raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
     believed, wanted = problem.believed()
     rows = np.vstack([np.pad(s, ((0, 0), (0, len(problem.curves)))), believed])
-    triangle, target, rest = _compressed(rows, np.concatenate([s @ theta - r, wanted]))
+    q = rows.shape[1]
+    factor: Any = np.linalg.qr(np.column_stack([rows, np.concatenate([s @ theta - r, wanted])]), mode="r")
+    triangle, target, rest = factor[:q, :q], factor[:q, q], float(np.sum(factor[q:, q] ** 2))
     variables = {key: cp.Variable(value.shape, name=key) for key, value in problem.unknowns.items()}
     variables |= {f"lost[{curve.name}]": cp.Variable(1, name=f"lost[{curve.name}]") for curve in problem.curves}
     point = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="C") for v in variables.values()])
@@ -149,21 +151,7 @@ def _not_stronger(curve: Any, mu: Any) -> list[Any]:
     ]
 
 
-def _compressed(s: Array, target: Array) -> tuple[Array, Array, float]:
-    """Triangular factor of [s target]: ‖s z - target‖² = ‖R z - t‖² + rest."""
-    q = s.shape[1]
-    factor: Any = np.linalg.qr(np.column_stack([s, target]), mode="r")
-    rest = float(factor[q, q] ** 2) if len(factor) > q else 0.0
-    return factor[:q, :q], factor[:q, q], rest
-
-
 def _vector(problem: Refitting, values: Values) -> Array:
-    """Return [unknowns; shares lost]; what stays zero is zero exactly."""
+    """Return [unknowns; shares lost], fixed zeros exact."""
     theta = np.where(problem.held, 0.0, problem.pack(values))
     return np.append(theta, [float(np.ravel(values[f"lost[{curve.name}]"])[0]) for curve in problem.curves])
-
-
-def _cost(problem: Refitting, z: Array, r: Array) -> float:
-    """Value of the objective with the innovations r at z, linearised in nothing."""
-    rows, wanted = problem.believed()
-    return float(np.sum(r**2) + np.sum((rows @ z - wanted) ** 2))

@@ -13,7 +13,7 @@ from optid.program.view import View
 def least_squares(name: str, target: np.ndarray, fit: Any, variables: Mapping[str, cp.Variable], start: Values,
                   view: Mapping[str, Any], *, penalty: Any = 0.0,
                   constraints: Mapping[str, tuple[Any, ...]] | None = None, **further: Any) -> Program:
-    """Pose min 1/2 ‖target - fit‖² + penalty, with the residual as a variable of its own.
+    """Build min 1/2 ‖target - fit‖² + penalty, with the residual as a variable of its own.
 
     Args:
         name: of the programme.

@@ -5,7 +5,7 @@
 Q has orthonormal columns, q is the threshold of the exact search for one fault. At lambda = 1 something is active
 exactly when that search raises an alarm: zero is optimal if and only if ‖Q' r‖² <= q for every candidate and onset.
 The sum-of-norms form is that of Ohlsson, Gustafsson, Ljung and Boyd (Automatica 48, 2012). Its magnitudes are biased
-and onsets next to one another share the work, so that the result says where to look, not what the answer is.
+and onsets next to one another share the work, so that the result selects onsets for an exact search.
 
 Named variables: ``a[label]`` (onsets, d); named expressions: ``size[label]`` (onsets, d), in the units of the fault.
 """
@@ -55,44 +55,33 @@ def signature(found: Scan, limits: Thresholds, *, penalty: float = 1.0, constrai
 
 
 def _programme(atoms: Sequence[Atoms], r: np.ndarray, penalty: float) -> Program:
-    """Pose the programme of a window r (N l,)."""
+    """Build the programme of a window r (N l,)."""
     if not (np.isfinite(penalty) and penalty > 0):
-        raise StructureError(f"penalty={penalty!r}; a positive number is needed.")
+        raise StructureError(f"penalty={penalty!r}; it must be a positive number.")
     if not atoms:
-        raise StructureError("No candidate is tested at any onset: there is nothing to look for.")
+        raise StructureError("No candidate is tested at any onset: the programme has no groups.")
     level = cp.Parameter(nonneg=True, name="lambda", value=penalty)
-    variables = {f"a[{atom.label}]": cp.Variable((atom.onsets.size, atom.dimension), name=f"a[{atom.label}]")
-                 for atom in atoms}
-    designs = [np.moveaxis(atom.axes, 1, 0).reshape(r.size, -1) for atom in atoms]
+    variables: dict[str, cp.Variable] = {}
+    start, sizes, designs, norms = {}, {}, [], []
+    for atom in atoms:
+        name, shape = f"a[{atom.label}]", (atom.onsets.size, atom.dimension)
+        a = variables[name] = cp.Variable(shape, name=name)
+        designs.append(np.moveaxis(atom.axes, 1, 0).reshape(r.size, -1))
+        norms.append(np.sqrt(atom.threshold) * (cp.norm1(a) if shape[1] == 1 else cp.sum(cp.norm(a, 2, axis=1))))
+        ones = np.ones((1, shape[1]))  # size[t] = back[t] a[t]
+        sizes[f"size[{atom.label}]"] = sum(
+            cp.multiply(atom.back[:, :, j], a[:, [j]] @ ones) for j in range(shape[1]))
+        along = np.einsum("tkd,k->td", atom.axes, r)
+        best = np.argmax(np.sum(along**2, axis=1))  # the candidate alone, at its best onset
+        start[name] = np.where(np.arange(shape[0])[:, None] == best, along, 0.0)
     fit: Any = sum(design @ cp.vec(a, order="C") for design, a in zip(designs, variables.values()))
-    norms: Any = sum(np.sqrt(atom.threshold) * _lengths(a) for atom, a in zip(atoms, variables.values()))
     edges = np.cumsum([0, *(atom.dimension for atom in atoms for _ in atom.onsets)])
     weights = np.concatenate([np.full(atom.onsets.size, np.sqrt(atom.threshold)) for atom in atoms])
     form = GroupSparseStructure(GroupProblem(np.hstack(designs), r, edges, weights),
                                 {name: a.shape for name, a in variables.items()})
-    sizes = {f"size[{atom.label}]": _sizes(atom, a) for atom, a in zip(atoms, variables.values())}
     return least_squares(
-        "fault.signature", r, fit, variables, {name: _alone(atom, r) for name, atom in zip(variables, atoms)},
-        {**variables, **sizes}, penalty=level * norms, parameters={"lambda": level}, structure=form, certify=certify)
-
-
-def _alone(atom: Atoms, r: np.ndarray) -> np.ndarray:
-    """What every candidate would be if it were alone, at its best onset: a start, and the size that is usual."""
-    along = np.einsum("tkd,k->td", atom.axes, r)
-    best = int(np.argmax(np.sum(along**2, axis=1)))
-    start = np.zeros_like(along)
-    start[best] = along[best]
-    return start
-
-
-def _lengths(a: cp.Variable) -> Any:
-    return cp.norm1(a) if a.shape[1] == 1 else cp.sum(cp.norm(a, 2, axis=1))
-
-
-def _sizes(atom: Atoms, a: cp.Variable) -> Any:
-    """Magnitudes (T, d) as an expression: size[t] = back[t] a[t]."""
-    ones = np.ones((1, atom.dimension))
-    return sum(cp.multiply(atom.back[:, :, j], a[:, [j]] @ ones) for j in range(atom.dimension))
+        "fault.signature", r, fit, variables, start, {**variables, **sizes}, penalty=level * sum(norms),
+        parameters={"lambda": level}, structure=form, certify=certify)
 
 
 def _sparse_result(program: Program, solution: Solution, atoms: Sequence[Atoms], count: int) -> SparseResult:

@@ -1,7 +1,4 @@
-"""Faults: what can break, what the outputs would show of it, who is to blame, and what is left.
-
-The public names are loaded on first use.
-"""
+"""Fault models, detection, isolation, diagnosis, monitoring and reconfiguration; names are loaded on first use."""
 
 from optid.lazy import on_first_use
 

@@ -1,10 +1,10 @@
-"""Disturbances by their directions, and declared ones of any course: predictors that do not feel them.
+"""Directions of disturbances, and predictors that are decoupled from declared disturbances of any course.
 
-A disturbance d of which nothing is known is white noise of unlimited variance for the one who has to guess it, so that
-the steady Kalman predictor of a model with the noise Q + s^2 E E', R + s^2 F F', S + s^2 E F' is, for large s, the
-optimal filter that decouples d (E in the state equation, F in the output equation). Its innovations grow with s along
-as many axes as disturbances can be told apart at the outputs; these axes carry nothing else and are taken out of the
-whitening. On the others thresholds and false alarms are those of a plant without d, whatever its course.
+An unknown disturbance d is modelled as white noise of unlimited variance: the steady Kalman predictor of a model with
+the noise Q + s^2 E E', R + s^2 F F', S + s^2 E F' is, for large s, the optimal filter decoupled from d (E in the state
+equation, F in the output equation). Its innovations grow with s along as many axes as the outputs distinguish
+disturbances; these axes are left out of the whitening. On the others thresholds and false alarm rates are those of a
+plant without d, whatever its course.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,41 +23,47 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 UNLIMITED = 1e5
-"""Standard deviation of a disturbance, in those of the innovations that it reaches."""
+"""Standard deviation of a disturbance, relative to those of the innovations that it affects."""
 
 ROUND = 1e-6
-"""Share of an isotropic covariance that is added where the process noise has no power."""
+"""Isotropic covariance added to the process noise, relative to its trace."""
 
 GENERIC = np.exp(0.7j) * 1.3
-"""A point of the plane at which the rank of the transfer from the disturbances to the outputs is taken."""
+"""Point of the z plane at which the rank of the transfer matrix from disturbances to outputs is computed."""
 
 
 def decoupled(
     model: "HammersteinSS", disturbances: Sequence[str], process: Mapping[str, ArrayLike] | None = None
 ) -> tuple["HammersteinSS", Predictor]:
-    """Return a model whose noise holds disturbances of any course, and its predictor, which does not feel them.
+    """Return a model whose noise includes disturbances of any course, and the predictor decoupled from them.
 
     Args:
         model: with noise covariances.
         disturbances: names as in `Fault`: "actuator:u1", "sensor:y1", "process:load"; the part before the colon may be
-            left out where one channel or direction has the name.
+            omitted where the name is unique.
         process: directions (n,) in the state equation by name.
 
     Raises:
         LookupFailed: no such channel or direction.
-        StructureError: a direction of another shape; disturbances that cover all outputs: nothing is left to judge; or
-            one that no output sees.
+        StructureError: a direction of another shape, disturbances that cover all outputs, or one that affects no
+            output.
     """
     steady = predictor(model)
     kinds = {"actuator": model.inputs, "sensor": model.outputs, "process": tuple(process or {})}
-    parts = [place_of(model, _full_name(name, kinds), None, process) for name in disturbances]
+    parts = []
+    for name in disturbances:
+        here = [kind for kind, names in kinds.items() if name in names]
+        if ":" not in name and len(here) != 1:
+            known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
+            raise LookupFailed(f"disturbance {name!r}: {'several' if here else 'none'} of {known} has this name.")
+        parts.append(place_of(model, name if ":" in name else f"{here[0]}:{name}", None, process))
     E, F = np.hstack([part[0] for part in parts]), np.hstack([part[1] for part in parts])
-    A, into = model.A + model.L @ model.C, E + model.L @ F  # what reaches the reading is fed back
+    A, into = model.A + model.L @ model.C, E + model.L @ F
     transfer = model.C @ np.linalg.solve(GENERIC * np.eye(model.nx) - A, into) + F
     seen = steady.root @ transfer
     sizes = np.linalg.norm(seen, axis=0)
     if not np.all(sizes > 0):
-        raise StructureError(f"No output ever sees one of the disturbances {', '.join(disturbances)}: leave it out.")
+        raise StructureError(f"One of the disturbances {', '.join(disturbances)} affects no output: leave it out.")
     silent = int(np.linalg.matrix_rank(seen / sizes, tol=1e-8))
     if silent >= model.l:
         raise StructureError(
@@ -69,37 +75,25 @@ def decoupled(
     louder = replace(model, noise=replace(noise, Q=noise.Q + E @ E.T, R=noise.R + F @ F.T, S=noise.S + E @ F.T))
     loud = predictor(louder)
     _, axes = np.linalg.eigh(steady.root @ loud.covariance @ steady.root.T)
-    kept = axes[:, : model.l - silent].T @ steady.root  # combinations of the outputs that do not feel them
+    kept = axes[:, : model.l - silent].T @ steady.root  # combinations of the outputs decoupled from them
     white = np.linalg.solve(np.linalg.cholesky(kept @ loud.covariance @ kept.T), kept)
     r: Any = np.linalg.qr(np.vstack([white, np.zeros((silent, model.l))])[:, ::-1], mode="r")  # triangular again
     return louder, replace(loud, root=np.ascontiguousarray(r[::-1, ::-1]), silent=silent)
 
 
-def _full_name(name: str, kinds: Mapping[str, Sequence[str]]) -> str:
-    """The name of a place with the part before the colon."""
-    if ":" in name:
-        return name
-    here = [kind for kind, names in kinds.items() if name in names]
-    if len(here) == 1:
-        return f"{here[0]}:{name}"
-    known = ", ".join(f"{kind}:{one}" for kind, names in kinds.items() for one in names)
-    raise LookupFailed(f"disturbance {name!r}: {'none' if not here else 'several'} of {known} has this name.")
-
-
 def direction_of(model: "HammersteinSS", outputs: Mapping[str, float]) -> Array:
-    """Return the direction (n,) in the state equation that moves the outputs by so much within one sample.
+    """Return the direction (n,) in the state equation that changes the outputs by given amounts within one sample.
 
-    Several directions do where the model has more states than outputs. Taken is the one that its process noise makes
-    most probable, Q C' (C Q C')^-1 d, which is the same fault in any coordinates of the state.
+    With more states than outputs it is not unique; returned is the most probable one under the process noise,
+    Q C' (C Q C')^-1 d, which is the same fault in any coordinates of the state.
 
     Args:
         model: with noise covariances.
-        outputs: {output: change by one unit of the fault}; the others do not move at once.
+        outputs: {output: change by one unit of the fault}; the others do not change at once.
 
     Raises:
         LookupFailed: no such output.
-        StructureError: a direction that is zero or not finite, no noise covariances, outputs that are not moved by the
-            state.
+        StructureError: a direction that is zero or not finite, no noise covariances, changes that no state causes.
     """
     d = np.zeros(model.l)
     for name, value in outputs.items():
@@ -107,12 +101,12 @@ def direction_of(model: "HammersteinSS", outputs: Mapping[str, float]) -> Array:
             raise LookupFailed(f"direction by outputs: there is no output {name!r}. {nearest(name, model.outputs)}")
         d[model.outputs.index(name)] = value
     if not d.any() or not np.isfinite(d).all():
-        raise StructureError(f"direction by outputs {dict(outputs)}: finite numbers, one of them not zero, are needed.")
-    predictor(model)  # which says what is missing
+        raise StructureError(f"direction by outputs {dict(outputs)}: it must be finite and not zero.")
+    predictor(model)  # refuses a model without noise covariances
     assert model.noise is not None
     steady = model.noise.Q
     P = steady + ROUND * max(float(np.trace(steady)), 1e-300) * np.eye(model.nx)
     found = P @ model.C.T @ np.linalg.lstsq(model.C @ P @ model.C.T, d, rcond=1e-10)[0]
     if not np.allclose(model.C @ found, d, rtol=1e-6, atol=1e-9 * np.abs(d).max()):
-        raise StructureError(f"direction by outputs {dict(outputs)}: no disturbance of the state moves them like that.")
+        raise StructureError(f"direction by outputs {dict(outputs)}: no disturbance of the state has this effect.")
     return np.asarray(found)

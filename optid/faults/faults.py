@@ -1,8 +1,8 @@
-"""What breaks: the fault models (1.8)-(1.13) of the dissertation and the practical ones.
+"""Fault models (1.8)-(1.13) of the dissertation, and others of practice.
 
-Timing, for every kind: the onset theta is the first sample of the record that the fault can change. What enters through
-the state equation changes x(theta) first, so it is present in the step from theta - 1 to theta; what enters through the
-output equation, a direct feedthrough included, changes y(theta) first.
+Timing, for every kind: the onset theta is the first sample of the record that the fault can change. A fault in
+the state equation changes x(theta) first, so it is present in the step from theta - 1 to theta; one in the output
+equation, a direct feedthrough included, changes y(theta) first.
 """
 
 from collections.abc import Mapping
@@ -39,21 +39,21 @@ class Fault:
     """One fault. Build it with the class methods: `step`, `jump`, `ramp`, `loss`, `stuck`, `frozen`, ....
 
     Attributes:
-        name: where: "actuator:u1", "sensor:y2", "process:load" (a direction in the state equation), "state".
-        kind: what, one of the keys of `PLACES`.
+        name: place: "actuator:u1", "sensor:y2", "process:load" (a direction in the state equation), "state".
+        kind: one of the keys of `PLACES`.
         onset: first sample of the record that it can change.
-        end: first sample that it no longer changes; None where it stays.
+        end: first sample that it no longer changes; None for a lasting fault.
         size: size of an additive fault, share lost of a loss, value of a stuck one; None where the kind has none.
-        direction: (n,) or (n, d) direction in the state equation of a "process" fault; None where the name says it.
+        direction: (n,) or (n, d) direction in the state equation of a "process" fault; None where the name states it.
         bias: constant added to f of a lost actuator, (1 - size) f(u) + bias.
         std: standard deviation of the added noise.
-        scale: factor of the standard deviation of the noise that is there already, instead of std.
+        scale: factor of the standard deviation of the present noise, instead of std.
         covariance: of the added noise, instead of std and scale.
-        A: (n, n), (N, n, n) or k -> (n, n): what replaces A from the onset on.
-        B: (n, r), (N, n, r) or k -> (n, r): what replaces B from the onset on.
+        A: (n, n), (N, n, n) or k -> (n, n): replaces A from the onset on.
+        B: (n, r), (N, n, r) or k -> (n, r): replaces B from the onset on.
 
     Raises:
-        StructureError: an unknown kind, a name that does not fit the kind, an onset that is not a whole number from 0.
+        StructureError: an unknown kind, a name that does not fit the kind, an onset that is not a nonnegative integer.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Fault:
             )
         for word, value in (("onset", self.onset), ("end", self.end)):
             if value is not None and (value != int(value) or value < 0):
-                raise StructureError(f"{self.name}: {word} = {value!r}; the number of a sample, from 0, is needed.")
+                raise StructureError(f"{self.name}: {word} = {value!r}; it must be a nonnegative integer.")
         if self.end is not None and self.end <= self.onset:
             raise StructureError(f"{self.name}: end = {self.end} is not after onset = {self.onset}.")
 
@@ -95,7 +95,7 @@ class Fault:
         return self.name.partition(":")[2]
 
     def __str__(self) -> str:
-        """Say what breaks, where and when."""
+        """State place, kind, size and onset."""
         until = "" if self.end is None else f" until {self.end}"
         size = "" if self.size is None else f" {np.array2string(np.asarray(self.size), precision=4)}".replace("'", "")
         return f"{self.name}: {self.kind.replace('_', ' ')}{size} from sample {self.onset}{until}"
@@ -125,19 +125,19 @@ class Fault:
             end: first sample that it no longer changes.
             direction: (n,) of a "process" fault.
         """
-        return cls(name, "step", onset, end, _size(name, size), _direction(name, direction))
+        return cls(name, "step", onset, end, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
     def jump(cls, name: str, onset: int, size: ArrayLike, *, direction: ArrayLike | None = None) -> "Fault":
         """Return an offset in one sample only: a jump of the state, a spike of a sensor. Arguments as `step`."""
-        return cls(name, "jump", onset, None, _size(name, size), _direction(name, direction))
+        return cls(name, "jump", onset, None, _finite(name, size, "size"), _finite(name, direction, "direction"))
 
     @classmethod
     def ramp(
         cls, name: str, onset: int, slope: ArrayLike, *, end: int | None = None, direction: ArrayLike | None = None
     ) -> "Fault":
         """Return a drift: slope at the onset, twice the slope one sample later, .... Arguments as `step`."""
-        return cls(name, "ramp", onset, end, _size(name, slope), _direction(name, direction))
+        return cls(name, "ramp", onset, end, _finite(name, slope, "size"), _finite(name, direction, "direction"))
 
     drift = ramp
 
@@ -149,33 +149,33 @@ class Fault:
         bias in units of f (of the output for a sensor); onset and end as `step`. The noise of a sensor stays.
         """
         if not 0 <= fraction <= 1:
-            raise StructureError(f"{name}: fraction = {fraction!r}; a share from 0 to 1 is needed.")
+            raise StructureError(f"{name}: fraction = {fraction!r}; it must be a share from 0 to 1.")
         return cls(name, "loss", onset, end, float(fraction), bias=float(bias))
 
     @classmethod
     def stuck(cls, name: str, onset: int, value: Any = "last", *, end: int | None = None) -> "Fault":
         """Return an actuator that no longer moves, or a sensor that repeats one reading without noise.
 
-        The value is the input at which the actuator stands (the reading of the sensor), or "last": where the plant was
-        last driven from, the input two samples before the onset (the reading before the onset); others as `loss`.
+        The value is the input at which the actuator is stuck (the reading of the sensor), or "last": the input two
+        samples before the onset, which drove the plant last (the reading before the onset); others as `loss`.
         """
         if not isinstance(value, str):
             value = float(_finite(name, value, "value"))
         elif value != "last":
-            raise StructureError(f"{name}: value = {value!r}; a number or 'last' is needed.")
+            raise StructureError(f"{name}: value = {value!r}; it must be a number or 'last'.")
         return cls(name, "stuck", onset, end, value)
 
     @classmethod
     def frozen(cls, name: str, onset: int, *, end: int | None = None) -> "Fault":
-        """Return a sensor that repeats its last reading to the bit, or an actuator that keeps its last position."""
+        """Return a sensor that repeats its last reading exactly, or an actuator that keeps its last position."""
         return cls(name, "frozen", onset, end, "last")
 
     @classmethod
     def hard_over(cls, name: str, onset: int, value: float | None = None, *, end: int | None = None) -> "Fault":
         """Return a complete failure.
 
-        The value is None for the complete loss of the dissertation (the channel contributes nothing, a sensor reads
-        its noise), a number for one that runs to a stop: the input (reading) there; others as `loss`.
+        The value is None for the complete loss of the dissertation (an actuator without effect, a sensor that reads
+        its noise), or the input (reading) at the stop that the channel runs to; others as `loss`.
         """
         return cls(name, "hard_over", onset, end, None if value is None else float(_finite(name, value, "value")))
 
@@ -187,10 +187,10 @@ class Fault:
         """Return additional white noise in the state equation, (1.12).
 
         The name is "process:load" along a direction, or "process" in all states. Give one (`StructureError`) of std,
-        the standard deviation along the direction (of every state), scale, the factor by which the standard deviation
-        of the noise that is there grows, and covariance (n, n); onset, end and direction as `step`.
+        the standard deviation along the direction (of every state), scale, the factor of the standard deviation of the
+        present noise, and covariance (n, n); onset, end and direction as `step`.
         """
-        return cls(name, "process_noise", onset, end, None, _direction(name, direction), 0.0,
+        return cls(name, "process_noise", onset, end, None, _finite(name, direction, "direction"), 0.0,
                    *_noise(name, std, scale, covariance))
 
     @classmethod
@@ -207,8 +207,8 @@ class Fault:
 
         Args:
             onset: first sample that they can change: the step from onset - 1 to onset uses A(onset - 1).
-            A: (n, n), (N, n, n) for every sample k of the record, or a function of k; None leaves A as it is.
-            B: (n, r), (N, n, r) or a function of k; None leaves B as it is.
+            A: (n, n), (N, n, n) for every sample k of the record, or a function of k; None for an unchanged A.
+            B: (n, r), (N, n, r) or a function of k; None for an unchanged B.
             end: first sample that they no longer change.
 
         Raises:
@@ -257,7 +257,7 @@ def place_of(model: "HammersteinSS", name: str, direction: Any = None,
         columns = columns[:, None] if columns.ndim == 1 else columns
         if columns.ndim != 2 or len(columns) != n or not columns.any() or not np.isfinite(columns).all():
             raise StructureError(
-                f"{name}: direction of shape {np.shape(direction)}; ({n},) is needed, finite and not zero."
+                f"{name}: direction of shape {np.shape(direction)}; it must be ({n},), finite and not zero."
             )
         return columns, np.zeros((l, columns.shape[1]))
     if place in ("process", "state") and not channel:
@@ -292,7 +292,7 @@ def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Arra
         label: of the fault, for messages.
         word: "A" or "B".
         given: one matrix, one for each of `count` samples, or a function of k; None for the healthy one.
-        samples: those wanted.
+        samples: those returned.
         healthy: the matrix of the model.
         count: samples of the record.
 
@@ -305,8 +305,8 @@ def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Arra
         values = values[samples.start : samples.stop]
     if values.shape not in (healthy.shape, (len(samples), *healthy.shape)):
         raise StructureError(
-            f"{label}: {word} has shape {values.shape}; {healthy.shape} or {(count, *healthy.shape)} is needed, one "
-            "matrix for each sample."
+            f"{label}: {word} has shape {values.shape}; it must be {healthy.shape}, or {(count, *healthy.shape)} "
+            "with one matrix for each sample."
         )
     if not np.isfinite(values).all():
         raise StructureError(f"{label}: {word} has a value that is not finite.")
@@ -314,26 +314,21 @@ def matrices_of(label: str, word: str, given: Any, samples: range, healthy: Arra
 
 
 def _finite(name: str, value: Any, word: str) -> Any:
-    if not np.all(np.isfinite(value)):
+    if value is None:
+        return None
+    array = np.asarray(value, dtype=float)
+    if not np.isfinite(array).all():
         raise StructureError(f"{name}: {word} = {value!r} is not finite.")
-    return value
-
-
-def _size(name: str, size: ArrayLike) -> Array:
-    return _finite(name, np.atleast_1d(np.asarray(size, dtype=float)), "size")
-
-
-def _direction(name: str, direction: ArrayLike | None) -> Array | None:
-    return None if direction is None else _finite(name, np.asarray(direction, dtype=float), "direction")
+    return np.atleast_1d(array) if word == "size" else array
 
 
 def _noise(name: str, std: Any, scale: Any, covariance: Any) -> tuple[float | None, float | None, Array | None]:
     if sum(given is not None for given in (std, scale, covariance)) != 1:
         raise StructureError(f"{name}: give one of std, scale and covariance.")
     if std is not None and not (np.isfinite(std) and std >= 0):
-        raise StructureError(f"{name}: std = {std!r}; a number from 0 is needed.")
+        raise StructureError(f"{name}: std = {std!r}; it must be nonnegative.")
     if scale is not None and not (np.isfinite(scale) and scale >= 1):
-        raise StructureError(f"{name}: scale = {scale!r}; a factor from 1 is needed: noise is added, not taken away.")
+        raise StructureError(f"{name}: scale = {scale!r}; it must be a factor from 1 on: noise is added, not removed.")
     if covariance is None:
         return None if std is None else float(std), None if scale is None else float(scale), None
     matrix = np.atleast_2d(np.asarray(covariance, dtype=float))

@@ -1,4 +1,4 @@
-"""Simulation of a plant that breaks."""
+"""Simulation of a plant with faults."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -29,7 +29,7 @@ class Trajectory(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """What the faults make of one record; see `optid.faults.kernels.march_faulty`."""
+    """Signals of a record with faults; see `optid.faults.kernels.march_faulty`."""
 
     state: Array
     output: Array
@@ -49,7 +49,7 @@ def inject(
     model: "HammersteinSS", u: Any, faults: Fault | Sequence[Fault] = (), *, seed: int | None = 0, x0: Any = "zero",
     noise: NoiseCovariances | str = "model", process: Mapping[str, ArrayLike] | None = None, feedback: str = "measured",
 ) -> Any:
-    """Simulate a plant with faults, several at once where wanted.
+    """Simulate a plant with one or several faults.
 
     The noise of the healthy plant is the same with and without faults for the same seed. Losses and stuck actuators act
     in the order given, offsets are added after them.
@@ -57,19 +57,19 @@ def inject(
     Args:
         model: the plant.
         u: inputs (N,) or (N, m), or a list of such arrays, or Data; no sample missing.
-        faults: what breaks; none for the healthy plant.
+        faults: one or several; none for the healthy plant.
         seed: of the noise.
         x0: "zero", "rest" (the equilibrium at the first input) or the state (n,), of every experiment.
         noise: "model" for `model.noise`, "none", or covariances (the one of the innovations is not used).
-        process: directions (n,) by name for faults "process:<name>" that bring none.
-        feedback: what a nonlinear feedback and the output injection L of the plant see: "measured" (the readings, as a
-            controller does), or "true" (the outputs with their noise, but without the faults of the sensors).
+        process: directions (n,) by name for faults "process:<name>" without one.
+        feedback: signal of a nonlinear feedback and of the output injection L: "measured" (the readings, as of a
+            controller), or "true" (the outputs with their noise, but without the sensor faults).
 
     Returns:
         (N, l) readings; a tuple of such arrays for several experiments.
 
     Raises:
-        DataError: a missing input, an onset beyond the record, an output that leaves the range of numbers.
+        DataError: a missing input, an onset beyond the record, an output that overflows.
         LookupFailed: a channel or direction that the model does not have.
         StructureError: sizes that do not fit, no noise covariances, functions of the user in the feedback.
     """
@@ -139,7 +139,12 @@ def _planned(
         if fault.kind in ADDITIVE:
             _add(model, plan, fault, now, before, process)
         elif fault.kind == "schedule":
-            plan = _scheduled(plan, fault, before, count)
+            for word, given in (("A", fault.A), ("B", fault.B)):
+                if given is not None:
+                    changed = np.array(getattr(plan, word))
+                    changed[before] = matrices_of(
+                        "schedule", word, given, range(before.start, before.stop), getattr(model, word), count)
+                    plan = plan._replace(**{word: changed})
         elif fault.kind in ("process_noise", "sensor_noise"):
             state, output = place_of(model, fault.name, fault.direction, process)
             where, target, samples, word = (output, plan.v, now, "R") if fault.kind == "sensor_noise" else (
@@ -161,7 +166,7 @@ def _add(
     if size.shape != (into_state.shape[1],):
         raise StructureError(
             f"{fault.name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: give one entry "
-            "each."
+            "for each."
         )
     course = np.zeros(len(plan.shift))
     course[now] = np.arange(1, now.stop - now.start + 1) if fault.kind == "ramp" else 1.0
@@ -175,16 +180,6 @@ def _add(
         plan.shift[:] += np.outer(course, into_output @ size)
         plan.jolt[:-1] += np.outer(course[1:], into_state @ size)
     plan.start[:] += course[0] * (into_state @ size)
-
-
-def _scheduled(plan: _Plan, fault: Fault, before: slice, count: int) -> _Plan:
-    changed = {}
-    for word, given, whole in (("A", fault.A, plan.A), ("B", fault.B, plan.B)):
-        if given is not None:
-            changed[word] = np.array(whole)
-            changed[word][before] = matrices_of("schedule", word, given, range(before.start, before.stop), whole[0],
-                                                count)
-    return plan._replace(**changed)
 
 
 def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice, before: slice, u: Array) -> None:
@@ -214,7 +209,7 @@ def _break_sensor(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice)
 def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> NoiseCovariances | None:
     if isinstance(noise, NoiseCovariances):
         if noise.S.shape != (model.nx, model.l):
-            raise StructureError(f"noise: S has shape {noise.S.shape}; {(model.nx, model.l)} is needed.")
+            raise StructureError(f"noise: S has shape {noise.S.shape}; it must be {(model.nx, model.l)}.")
         return noise
     if noise == "none":
         return None
@@ -242,14 +237,14 @@ def _added(fault: Fault, where: Array, present: Array | None) -> Array:
     if fault.covariance is not None:
         if fault.covariance.shape != (d, d):
             raise StructureError(
-                f"{fault.name}: covariance of shape {fault.covariance.shape}; ({d}, {d}) is needed."
+                f"{fault.name}: covariance of shape {fault.covariance.shape}; it must be ({d}, {d})."
             )
         return fault.covariance
     if fault.std is not None:
         return fault.std**2 * np.eye(d)
     assert fault.scale is not None
     if present is None:
-        raise StructureError(f"{fault.name}: scale multiplies the noise of the model, and there is none; give std.")
+        raise StructureError(f"{fault.name}: scale multiplies the noise of the model, which has none: give std.")
     along = np.linalg.pinv(where)
     return (fault.scale**2 - 1) * along @ present @ along.T
 

@@ -1,8 +1,8 @@
-"""Before any data: how large must a fault be to be noticed, and how large to be named?
+"""Smallest detectable and isolable sizes of faults, without any data.
 
-Simulated in signature space: the whitened innovations of a window are white noise plus the signature of the fault, and
-the search over all candidates and onsets is run on many of them. The formula for two rivals at a known onset is
-optimistic, because the onset is searched, too.
+They are simulated in signature space: the whitened innovations of a window are white noise plus the signature of the
+fault, and the search over all candidates and onsets is run on many such windows. The formula for two candidates at a
+known onset is optimistic, because the onset is searched, too.
 """
 
 from dataclasses import dataclass, field, replace
@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import ndtr, ndtri
 
 from optid.arrays import Array, check_integer
 from optid.errors import DataError, LookupFailed, StructureError, nearest
 from optid.faults.search.calibration import check_draws, family_thresholds
-from optid.faults.search.scanning import shorten
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Dictionary
+from optid.show.wording import short
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,18 +26,18 @@ GRID = np.concatenate([[0.0], np.geomspace(0.5, 600.0, 72)])
 """Deflections at which the probabilities are computed."""
 
 NUMBERS = 200_000_000
-"""Numbers in the simulated windows of one fault, above which a study is refused: they would not fit in memory."""
+"""Numbers in the simulated windows of one fault above which a study is refused, because of the memory."""
 
 MIDDLE = 0.3, 0.7
-"""Where in the window an unknown onset is drawn from."""
+"""Range of a random onset, as shares of the window."""
 
 
 class Forecast(NamedTuple):
-    """What is to be expected of a fault of a given size.
+    """Probabilities of detection and isolation of a fault of a given size.
 
     Attributes:
         detected: probability of an alarm.
-        isolated: probability of an alarm that names the right candidate.
+        isolated: probability of an alarm with the right candidate.
     """
 
     detected: float
@@ -45,27 +46,27 @@ class Forecast(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Isolability:
-    """How large every fault must be; `print` it, or `plot` it.
+    """Smallest detectable and isolable size of every fault; `print` it, or `plot` it.
 
     Attributes:
         labels: the C candidates.
         window: samples of a window.
         onset: "unknown", or the onset that is known.
-        prob: probability asked for.
-        false_alarm: probability that a healthy window alarms.
-        detectable: (C,) smallest size noticed with that probability; inf where none is. Of a fault with several
+        prob: required probability.
+        false_alarm: probability of an alarm in a healthy window.
+        detectable: (C,) smallest size detected with that probability; inf where none is. For a fault with several
             magnitudes the median norm over its directions.
-        isolable: (C,) smallest size noticed and named rightly.
-        matrix: (C, C) smallest size at which fault i is noticed and preferred to j; on the diagonal: noticed.
+        isolable: (C,) smallest size detected and isolated.
+        matrix: (C, C) smallest size at which fault i is detected and preferred to j; on the diagonal: detected.
         sines: (C, C) sine of the smallest angle between the signature of i in mid-window and that of j at any onset.
         unit: (C,) deflection of a size of one in mid-window.
-        rivals: the candidate that takes most of the wrong answers at the isolable size, "" where there are none.
-        bounded: (C,) whether the trace dies out: a longer window does not help.
-        excluded: {label: why} of what no output sees.
+        rivals: the candidate with most of the wrong answers at the isolable size, "" where there are none.
+        bounded: (C,) whether the signature decays, so that a longer window does not help.
+        excluded: {label: why} of faults that affect no output.
         skipped: labels of the candidates whose signature needs data.
         thresholds: (C,) of the statistics.
         detected: (C, G) probability of an alarm at the deflections of `GRID`.
-        isolated: (C, G) probability of the right name.
+        isolated: (C, G) probability of an alarm with the right candidate.
         draws: simulated windows per fault.
     """
 
@@ -89,17 +90,18 @@ class Isolability:
     draws: int = 0
 
     def deflection(self, label: str, size: float) -> float:
-        """Return the deflection of a fault of this size in mid-window: sigma per sample times root of samples."""
+        """Return the deflection of a fault of this size in mid-window: norm of its whitened signature."""
         return float(abs(size) * self.unit[self._index(label)])
 
     def forecast(self, label: str, size: float) -> Forecast:
-        """Return what to expect of a fault of a given size.
+        """Return the probabilities of detection and isolation of a fault of a given size.
 
         Raises:
             LookupFailed: no such candidate.
         """
         c, d = self._index(label), self.deflection(label, size)
-        return Forecast(*(_between(d, curves[c], self.draws) for curves in (self.detected, self.isolated)))
+        curves = (_probits(curve[c], self.draws) for curve in (self.detected, self.isolated))
+        return Forecast(*(float(ndtr(np.interp(d, GRID, curve))) for curve in curves))
 
     def _index(self, label: str) -> int:
         if label not in self.labels:
@@ -108,26 +110,26 @@ class Isolability:
 
     @property
     def ambiguity_groups(self) -> list[tuple[str, ...]]:
-        """Faults that no record can tell apart."""
+        """Faults that no record isolates from each other."""
         return [tuple(label.split(" | ")) for label in self.labels if " | " in label]
 
     def __str__(self) -> str:
-        """Print sizes, rivals and angles, the isolability matrix and what to know about them, in 80 columns."""
+        """Print sizes, rivals and angles, the isolability matrix and remarks, in 80 columns."""
         where = "unknown" if self.onset == "unknown" else f"known, {self.onset}"
         lines = [
             f"window {self.window} samples, onset {where}, false alarm {self.false_alarm:g},",
             f"probability {self.prob:g} ({self.draws} simulated windows per fault)",
             "",
-            f"     {'fault':<24}{'noticed':>9}{'named':>9}  {'worst rival':<23}{'sine':>6}",
+            f"     {'fault':<23}{'detectable':>10}{'isolable':>9}  {'hardest to isolate from':<23}{'sine':>6}",
         ]
         for i, label in enumerate(self.labels):
             rival = self.rivals[i]
             sine = f"{self.sines[i, self.labels.index(rival)]:6.3f}" if rival else ""
             lines.append(
-                f"{i + 1:>3}  {shorten(label, 23):<24}{_size(self.detectable[i]):>9}{_size(self.isolable[i]):>9}"
-                f"  {shorten(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
+                f"{i + 1:>3}  {short(label, 22):<23}{_size(self.detectable[i]):>10}{_size(self.isolable[i]):>9}"
+                f"  {short(rival, 22):<23}{sine:>6}" + " *" * bool(self.bounded[i])
             )
-        lines += ["", "smallest size of the fault of a row that is told from the one of a column"]
+        lines += ["", "smallest size at which the fault of a row is isolated from that of a column"]
         wide = 7
         fits = (80 - 5) // wide
         for first in range(0, len(self.labels), fits):
@@ -137,16 +139,16 @@ class Isolability:
                 f"{i + 1:>3}  " + "".join(f"{_size(self.matrix[i, j]):>{wide}}" for j in columns)
                 for i in range(len(self.labels))
             ]
-        notes = ["on the diagonal: noticed at all"]
+        notes = ["on the diagonal: smallest detectable size"]
         if self.bounded.any():
-            notes.append("* transient only: the trace dies out, waiting does not help")
-        notes += [f"no record tells apart: {', '.join(group)}" for group in self.ambiguity_groups]
-        notes += [f"left out: {label}, {why}" for label, why in self.excluded.items()]
-        notes += [f"needs data, not judged here: {label}" for label in self.skipped]
+            notes.append("* transient: the signature decays, a longer window does not help")
+        notes += [f"not isolable from each other: {', '.join(group)}" for group in self.ambiguity_groups]
+        notes += [f"excluded: {label}, {why}" for label, why in self.excluded.items()]
+        notes += [f"not judged without data: {label}" for label in self.skipped]
         return "\n".join(lines + notes).replace(" \n", "\n")
 
     def plot(self) -> "Figure":
-        """Draw the quantitative isolability matrix, the chances by size and the deflections needed."""
+        """Draw the quantitative isolability matrix and the probabilities by deflection."""
         from optid.faults.isolability_picture import draw
 
         return draw(self)
@@ -162,17 +164,17 @@ def study(
     Args:
         found: the dictionary.
         window: samples of a window.
-        onset: "unknown" (drawn from the middle of the window and searched everywhere), or the sample where it is known.
-        prob: probability with which a fault is to be noticed, and named.
-        false_alarm: probability that a healthy window alarms, over all candidates and onsets.
+        onset: "unknown" (drawn from the middle of the window and searched everywhere), or the known sample.
+        prob: required probability of detection, and of isolation.
+        false_alarm: probability of an alarm in a healthy window, over all candidates and onsets.
         draws: simulated windows per fault.
-        calibration: simulated healthy windows behind the thresholds.
+        calibration: simulated healthy windows for the thresholds.
         seed: of the simulation.
         u: (N, m) a typical input over the window, for losses and stuck actuators.
 
     Raises:
-        DataError: too few calibration windows for the false-alarm rate, an input of another length or one that does
-            not move a suspected actuator.
+        DataError: too few calibration windows for the false-alarm rate, an input of another length or without
+            excitation of a candidate.
         StructureError: a window that is too short or too long, impossible probabilities or numbers of draws, no
             candidate with a signature.
     """
@@ -181,11 +183,11 @@ def study(
     check_integer(seed, "seed", 0, 2**63)
     if window * found.model.l * draws > NUMBERS:
         raise StructureError(
-            f"window={window}: {draws} simulated windows of so many samples do not fit in memory; "
-            f"{NUMBERS // (found.model.l * draws)} samples do, or fewer draws."
+            f"window={window}: {draws} simulated windows of this length do not fit in memory: use at most "
+            f"{NUMBERS // (found.model.l * draws)} samples, or fewer draws."
         )
     if not 0.5 <= prob < 1:
-        raise StructureError(f"prob={prob!r}; a probability from 0.5 to below 1 is needed.")
+        raise StructureError(f"prob={prob!r}; it must be a probability from 0.5 to below 1.")
     if isinstance(onset, str) and onset != "unknown":
         raise StructureError(f"onset={onset!r}: use 'unknown' or the number of a sample.")
     check_draws(false_alarm, calibration)
@@ -199,26 +201,29 @@ def study(
     candidates = [found.candidates[c] for c in named]
     first, second = np.random.SeedSequence(seed).generate_state(2)
     windows = space.simulated(calibration, np.random.default_rng(int(first)))
-    energies = np.nan_to_num(np.vstack([space.largest(part) for part in windows])[:, named])
-    thresholds = family_thresholds(energies, false_alarm)
+    energies = np.vstack([space.largest(part) for part in windows])[:, named]
+    thresholds = family_thresholds(np.nan_to_num(energies), false_alarm)
     rng = np.random.default_rng(int(second))
     healthy = np.concatenate(list(space.simulated(draws, np.random.default_rng(int(second) + 1))))
     noise = _scores(space, healthy)
     curves = [_curves(space, place, noise, thresholds, known, rng) for place in range(named.size)]
-    detected, isolated = np.array([c.detected for c in curves]), np.array([c.isolated for c in curves])
-    unit = np.array([c.unit for c in curves])
-    matrix = np.array([[_crossing(p, prob, draws) for p in c.preferred] for c in curves]) / unit[:, None]
+    detected, isolated, preferred, accused, unit = map(np.array, zip(*curves))
+    matrix = np.array([[_crossing(p, prob, draws) for p in row] for row in preferred]) / unit[:, None]
     isolable = np.array([_crossing(p, prob, draws) for p in isolated])
     detectable = np.array([_crossing(p, prob, draws) for p in detected])
-    # more than the whole cannot be lost
-    whole = np.array([1.0 if c.kind == "loss" else np.inf for c in candidates])
+    whole = np.array([1.0 if c.kind == "loss" else np.inf for c in candidates])  # largest possible size
     sizes = [np.where(d / unit > whole, np.inf, d / unit) for d in (detectable, isolable)]
     labels = tuple(c.label for c in candidates)
+    rivals = []
+    for shares, at in zip(accused, isolable):  # at the isolable deflection or the one before it
+        wrong = shares[:, max(int(np.searchsorted(GRID, at)) - 1, 0)].copy()
+        wrong[int(np.argmax(shares[:, -1]))] = 0.0
+        rivals.append(labels[int(np.argmax(wrong))] if wrong.max() > 0 else "")
     return Isolability(
         labels=labels, window=window, onset=onset, prob=prob, false_alarm=false_alarm, detectable=sizes[0],
         isolable=sizes[1], matrix=np.where(matrix > whole[:, None], np.inf, matrix),
         sines=np.array([_sines(space, int(c), known) for c in named]), unit=unit,
-        rivals=tuple(_rival(labels, c, at) for c, at in zip(curves, isolable)),
+        rivals=tuple(rivals),
         bounded=np.array([c.bounded_deflection for c in candidates]), excluded=dict(found.excluded),
         skipped=tuple(c.label for c in found.candidates if c not in candidates), thresholds=thresholds,
         detected=detected, isolated=isolated, draws=draws,
@@ -231,27 +236,14 @@ def _scores(space: Sweep, windows: Array) -> list[Array]:
     return [space.coordinates(found, int(c))[:, space.tested[c]] for c in np.flatnonzero(space.tables.sizes)]
 
 
-class _Curves(NamedTuple):
-    """Probabilities of one fault over the grid of deflections.
-
-    Attributes:
-        detected: (G,).
-        isolated: (G,).
-        preferred: (C, G) noticed and preferred to each other candidate; noticed by itself in its own row.
-        accused: (C, G) share of the answers.
-        unit: deflection of a size of one.
-    """
-
-    detected: Array
-    isolated: Array
-    preferred: Array
-    accused: Array
-    unit: float
-
-
 def _curves(
     space: Sweep, place: int, noise: list[Array], thresholds: Array, known: int | None, rng: np.random.Generator
-) -> _Curves:
+) -> tuple[Array, Array, Array, Array, float]:
+    """Probabilities of one fault over the grid of deflections, and the deflection of a size of one.
+
+    They are those of detection (G,), of isolation (G,), of detection and preference to each other candidate (C, G), in
+    its own row of detection, and of an alarm for each candidate (C, G).
+    """
     c, draws, window = int(np.flatnonzero(space.tables.sizes)[place]), len(noise[0]), space.window
     low, high = (int(share * window) for share in MIDDLE)
     onsets = np.full(draws, known) if known is not None else rng.integers(low, max(high, low + 1), draws)
@@ -273,7 +265,7 @@ def _curves(
         preferred[:, g] = np.mean((own > 0) & (own >= excess), axis=0)
         preferred[place, g] = detected[g]
         accused[:, g] = [np.mean(alarm & (answer == j)) for j in range(count)]
-    return _Curves(detected, isolated, preferred, accused, unit)
+    return detected, isolated, preferred, accused, unit
 
 
 def _directions(
@@ -300,22 +292,11 @@ def _directions(
 
 def _probits(probabilities: Array, draws: int) -> Array:
     """Quantiles of the normal law, in which these curves are nearly straight lines."""
-    from scipy.special import ndtri
-
     return np.asarray(ndtri(np.clip(probabilities, 0.5 / draws, 1 - 0.5 / draws)))
 
 
-def _between(d: float, probabilities: Array, draws: int) -> float:
-    """Interpolate a curve over the grid."""
-    from scipy.special import ndtr
-
-    return float(ndtr(np.interp(d, GRID, _probits(probabilities, draws))))
-
-
 def _crossing(probabilities: Array, prob: float, draws: int) -> float:
-    """The deflection from which on the probability stays at or above prob; inf where it never does."""
-    from scipy.special import ndtri
-
+    """Deflection from which on the probability is at least prob; inf where there is none."""
     below = np.flatnonzero(probabilities < prob)
     last = int(below[-1]) if below.size else 0
     if not below.size or last + 1 >= GRID.size:
@@ -323,14 +304,6 @@ def _crossing(probabilities: Array, prob: float, draws: int) -> float:
     first, second = _probits(probabilities[last : last + 2], draws)
     rise = (float(ndtri(prob)) - first) / (second - first)
     return float(GRID[last] + min(max(rise, 0.0), 1.0) * (GRID[last + 1] - GRID[last]))
-
-
-def _rival(labels: tuple[str, ...], curves: _Curves, at: float) -> str:
-    """The candidate most often accused instead, at the isolable deflection or the one before it."""
-    g = GRID.size - 1 if not np.isfinite(at) else max(int(np.searchsorted(GRID, at)) - 1, 0)
-    wrong = curves.accused[:, g].copy()
-    wrong[int(np.argmax(curves.accused[:, -1]))] = 0.0
-    return labels[int(np.argmax(wrong))] if wrong.max() > 0 else ""
 
 
 def _sines(space: Sweep, c: int, known: int | None) -> Array:

@@ -1,4 +1,4 @@
-"""The quantitative isolability matrix as a picture."""
+"""Figure of the quantitative isolability matrix."""
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -10,7 +10,7 @@ from optid.show.panels import shorten, styled
 
 @styled
 def draw(found: Isolability) -> Figure:
-    """Draw the deflections that tell each fault from each other, and the chances by deflection."""
+    """Draw the deflections that isolate each fault from each other, and the probabilities by deflection."""
     needed = found.matrix * found.unit[:, None]
     count = len(found.labels)
     names = [shorten(label, 22) for label in found.labels]
@@ -29,13 +29,13 @@ def draw(found: Isolability) -> Figure:
     left.set_xticks(range(count), names, rotation=40, ha="right")
     left.set_yticks(range(count), names)
     left.grid(False)
-    left.set(title=f"size of the row told from the column, P = {found.prob:g}")
-    figure.colorbar(shown, ax=left, label="deflection needed", shrink=0.8)
+    left.set(title=f"size at which the row is isolated from the column, P = {found.prob:g}")
+    figure.colorbar(shown, ax=left, label="required deflection", shrink=0.8)
     for number, (label, chance) in enumerate(zip(names, found.isolated)):
         right.semilogx(GRID[1:], chance[1:], ("-", "-.", ":")[number // 3 % 3], label=label)
-    right.semilogx(GRID[1:], found.detected.mean(axis=0)[1:], "--", color="0.5", label="noticed at all (mean)")
+    right.semilogx(GRID[1:], found.detected.mean(axis=0)[1:], "--", color="0.5", label="detection (mean)")
     right.axhline(found.prob, color="0.6", linewidth=0.8)
-    right.set(title="chance of the right name", xlabel="deflection", ylim=(0, 1))
+    right.set(title="probability of isolation", xlabel="deflection", ylim=(0, 1))
     right.set_xlim(1, min(2.5 * top, GRID[-1]))
     right.legend(fontsize=8)
     figure.suptitle(f"window of {found.window} samples, onset {found.onset}, false alarm {found.false_alarm:g}")

@@ -1,4 +1,4 @@
-"""Compiled recursions of faulty plants and of what a fault leaves in the innovations."""
+"""Compiled recursions of faulty plants, and of the effect of faults on the innovations."""
 
 import numpy as np
 from numba import njit
@@ -12,23 +12,23 @@ def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, 
 
     Args:
         parts: matrices and tables of the plant.
-        A: (M, n, n) the matrices that A(k) takes.
-        which: (N,) which of them governs the step from sample k to k + 1.
-        jolt: (N, n) what inputs, constants and faults add in the step from k to k + 1.
-        direct: (N, l) what inputs and constants add to the output.
+        A: (M, n, n) the values of A(k).
+        which: (N,) index into A of the step from sample k to k + 1.
+        jolt: (N, n) inputs, constants and faults in the step from k to k + 1.
+        direct: (N, l) inputs and constants in the output.
         w: (N, n) process noise.
         gain: (N, l) factor of the output.
-        shift: (N, l) what is added to the output after it.
+        shift: (N, l) added to the output after it.
         v: (N, l) measurement noise.
-        fixed: (N, l) reading that replaces the output, NaN where there is none.
+        fixed: (N, l) reading that replaces the output; NaN for none.
         hold: (N, l) whether the reading of the sample before is repeated.
-        true_feedback: whether the plant feeds back its outputs as they are, not as the broken sensors show them.
+        true_feedback: whether the plant feeds back its true outputs, not those of the faulty sensors.
         x: (n,) state, changed in place.
         states: (N, n) written.
         outputs: (N, l) written.
 
     Returns:
-        how the run ended and the sample at which it did.
+        the outcome of the run and the sample at which it ended.
     """
     C, E, L = parts.C, parts.E, parts.L
     n, l, s = x.size, C.shape[0], E.shape[1]  # noqa: E741
@@ -67,21 +67,22 @@ def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def respond(A, C, K, L, present, into_state, into_output, response):
-    """What additions to the state and to the output leave in the innovations of the steady predictor.
+    """Write the response of the innovations of the steady predictor to additions to state and output.
 
     Args:
-        A: (n, n).
+        A: (1, n, n), or (N, n, n) of every sample.
         C: (l, n).
         K: (n, l) gain.
         L: (n, l) output injection of the plant.
-        present: (N, l) whether the reading is there; one that is missing corrects nothing.
+        present: (N, l) whether there is a reading; a missing one is not used for correction.
         into_state: (N, n, d) added to x(k).
         into_output: (N, l, d) added to y(k).
         response: (N, l, d) written.
     """
-    n, l, d = A.shape[0], C.shape[0], into_state.shape[2]  # noqa: E741
+    n, l, d = A.shape[1], C.shape[0], into_state.shape[2]  # noqa: E741
     x, later = np.zeros((n, d)), np.zeros((n, d))
     for k in range(present.shape[0]):
+        t = k if A.shape[0] > 1 else 0
         for p in range(d):
             for i in range(n):
                 x[i, p] += into_state[k, i, p]
@@ -93,7 +94,7 @@ def respond(A, C, K, L, present, into_state, into_output, response):
             for i in range(n):
                 later[i, p] = 0.0
                 for j in range(n):
-                    later[i, p] += A[i, j] * x[j, p]
+                    later[i, p] += A[t, i, j] * x[j, p]
                 for o in range(l):
                     later[i, p] += (-K[i, o] if present[k, o] else L[i, o]) * response[k, o, p]
             for i in range(n):

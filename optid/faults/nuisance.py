@@ -1,20 +1,18 @@
-"""What an identified model does not know about itself, as noise in its innovations.
+"""The uncertainty of an identified model as additional noise in its innovations.
 
-The parameters of an identified model scatter with a covariance P. In a window of new data their error leaves Psi times
-itself in the whitened innovations, Psi being the sensitivity of the predictor. So the innovations of a healthy plant
-have the covariance I + Psi P Psi', by which they are whitened once more. P is the inverse of the information in the
-record the model was identified from. Turning the states, or moving a factor between f and B, changes no prediction:
-the information says nothing of such directions, Psi is zero along them, and the pseudo-inverse leaves them out.
+Let P be the covariance of the parameters of an identified model and Psi the sensitivity of the whitened innovations of
+a window to them. The innovations of a healthy plant then have the covariance I + Psi P Psi', by which they are whitened
+again. P is the inverse of the information in the record of identification. Changes of state coordinates, and factors
+moved between f and B, change no prediction: Psi is zero along them, and the pseudo-inverse leaves them out.
 
-Two more things that a short record leaves open are counted. Its innovations are too small, because the parameters were
-fitted to them: their covariance is taken from their energy over the degrees of freedom that are left. And an estimated
-noise may have no power at some frequency (often at zero, where a constant and an initial state were fitted, too): a
-predictor that believes it never forgets a deviation. So measurement noise is added, the share of the innovations that
-the gain has parameters for every sample of the record.
+Two more effects of a short record are taken into account. Its innovations are too small, because the parameters were
+fitted to them: their covariance is their energy over the remaining degrees of freedom. And an estimated noise may have
+no power at some frequency (often zero, where a constant and an initial state were fitted), so that its predictor never
+forgets a deviation: measurement noise is added, n / N of the covariance of the innovations.
 
-The covariance is that of the linearised predictions. The errors of a model by maximum likelihood from a short record
-are larger. A later healthy record shows by how much: `model_uncertainty(model, data, healthy=...)` multiplies P by the
-largest factor that the record allows.
+The covariance is that of the linearised predictions; the errors of a maximum-likelihood model from a short record are
+larger. With a later healthy record, `model_uncertainty(model, data, healthy=...)` multiplies P by the largest factor
+that this record allows.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,7 +26,7 @@ from optid.arrays import Array, as_list
 from optid.data.record import Data, Experiment
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
-from optid.faults.whitening import Predictor, predictor
+from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
 
@@ -41,19 +39,19 @@ STEP = 1e-5
 """Step of the central differences, relative to the parameter and to the size of its matrix."""
 
 KNOWN = 1e-12
-"""Directions with less than this share of the largest information are those that change no prediction."""
+"""Share of the largest information below which a direction changes no prediction."""
 
 CONFIDENCE = 0.95
-"""Of the upper bound of the factor of the covariance that a healthy record shows."""
+"""Of the upper bound of the factor of the covariance from a healthy record."""
 
 FACTORS = 1.0, 1000.0, 300
-"""The smallest factor, the largest, and how many are looked at."""
+"""The smallest factor, the largest, and their number."""
 
 DRAWS = 4000
 """Simulated energies behind the bound of the factor."""
 
 DIFFUSE = 1e6
-"""Standard deviation, in sizes of its effect, of an initial state of which nothing is known."""
+"""Standard deviation of an unknown initial state, relative to its effect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +61,7 @@ class Nuisance:
     Attributes:
         U: (N l, q) orthonormal.
         s: (q,).
-        unknown: number of axes along which nothing is known beside the initial state.
+        unknown: number of unknown axes beside the initial state.
     """
 
     U: Array
@@ -83,10 +81,10 @@ class ModelUncertainty:
 
     Attributes:
         model: the model, with the gain of the predictor.
-        predictor: of the noise with what the record leaves open; windows are judged by it.
+        predictor: of the noise with the corrections for a short record; used for windows.
         root: (parameters, q) with covariance root root'.
         readings: number of readings behind it, less one for each initial state estimated.
-        inflation: factor of the covariance that a healthy record asked for; 1 without one.
+        inflation: factor of the covariance from a healthy record; 1 without one.
     """
 
     model: "HammersteinSS"
@@ -97,17 +95,17 @@ class ModelUncertainty:
 
     @cached_property
     def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
-        """Two models beside the model along every column of root, and what their difference is multiplied by."""
+        """Two models beside the model along every column of root, and the factor of their difference."""
         return list(moved_models(self.model, self.root))
 
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
-        """Return what the uncertainty leaves in the whitened innovations of a record.
+        """Return the effect of the uncertainty on the whitened innovations of a record.
 
         Args:
             part: the record, in raw units.
             x0: (n,) its initial state.
-            present: (N, l) whether a reading is there.
-            free_start: whether the initial state was estimated from this very record, so that nothing is known of it.
+            present: (N, l) whether there is a reading.
+            free_start: whether the initial state is unknown, because it was estimated from this record.
         """
         by_parameter, by_start = sensitivities(self.model, self.predictor, part, x0, present, self.root)
         columns = [by_parameter]
@@ -137,19 +135,23 @@ def model_uncertainty(
         model: with noise covariances.
         data: the record it was identified from.
         healthy: a later healthy record, which was not used to identify it. The covariance is multiplied by the upper
-            bound (`CONFIDENCE`) of the factor that this record asks for, never by less than one.
-        decoupled: a predictor that does not feel declared disturbances, in place of that of the model.
+            bound (`CONFIDENCE`) of the factor of this record, at least one.
+        decoupled: a predictor decoupled from declared disturbances, in place of that of the model.
 
     Raises:
         DataError: fewer than two readings for each direction of the parameters that changes the predictions.
         StructureError: no noise covariances.
     """
     count = sum(len(part.y) for part in data.experiments)
-    steady = _forgetting(model, count) if decoupled is None else decoupled
+    steady = decoupled
+    if steady is None:
+        noise = model.noise
+        steady = predictor(model if noise is None else replace(
+            model, noise=replace(noise, R=noise.R + model.nx / count * noise.innovation)))
     gained = replace(model, K=steady.K)
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
-    for part, x0, present, white in _predicted(gained, steady, data):
+    for part, x0, present, white in _whitened_parts(gained, steady, data):
         by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
@@ -175,23 +177,21 @@ def model_uncertainty(
 
 def _inflated(found: ModelUncertainty, healthy: Data) -> ModelUncertainty:
     """Multiply the covariance by the largest factor that a healthy record allows."""
-    spreads, seen = [], []
-    for part, x0, present, white in _predicted(found.model, found.predictor, healthy):
+    spreads, squares = [], []
+    for part, x0, present, white in _whitened_parts(found.model, found.predictor, healthy):
         nuisance = found.nuisance(part, x0, present)
         axes = nuisance.s < np.sqrt(DIFFUSE)  # the others are those of the initial state
         spreads.append(nuisance.s[axes] ** 2)
-        seen.append((nuisance.U[:, axes].T @ white) ** 2)
-    s2, z2 = np.concatenate(spreads), np.concatenate(seen)
-    factor = largest_factor(s2, z2)
+        squares.append((nuisance.U[:, axes].T @ white) ** 2)
+    factor = largest_factor(np.concatenate(spreads), np.concatenate(squares))
     return replace(found, root=np.sqrt(factor) * found.root, inflation=factor)
 
 
 def largest_factor(s2: Array, z2: Array) -> float:
-    """Return the upper bound of the factor c of the variances 1 + c s^2, one at least.
+    """Return the upper bound of the factor c of the variances 1 + c s^2, at least one.
 
-    It is the largest c with which so small an energy has a probability of 1 - `CONFIDENCE`, the axes weighted by what
-    they tell of c near one: exact for Gaussian innovations that are linear in the parameters. Few axes, or a small
-    effect of the parameters on them, say little of c and leave it large.
+    It is the largest c for which so small an energy has a probability of 1 - `CONFIDENCE`, the axes weighted by their
+    information on c near one: exact for Gaussian innovations that are linear in the parameters.
 
     Args:
         s2: (q,) squared singular values of the nuisance.
@@ -204,39 +204,24 @@ def largest_factor(s2: Array, z2: Array) -> float:
     return float(allowed[-1]) if allowed.size else 1.0
 
 
-def _forgetting(model: "HammersteinSS", samples: int) -> Predictor:
-    """The predictor of the noise with a little more measurement noise."""
-    if model.noise is None:
-        return predictor(model)  # which refuses
-    more = model.noise.R + model.nx / samples * model.noise.innovation
-    return predictor(replace(model, noise=replace(model.noise, R=more)))
-
-
-def _predicted(
+def _whitened_parts(
     model: "HammersteinSS", steady: Predictor, data: Data
 ) -> "Iterator[tuple[Experiment, Array, np.ndarray, Array]]":
-    """Every experiment with its initial state, whether a reading is there, and its whitened innovations (N l,)."""
+    """Yield every experiment with its estimated initial state, its readings present, and its whitened innovations."""
     raw = in_units_of(model, data)
-    given = model.initial_state(raw, "predict")
-    for part, x0 in zip(raw.experiments, as_list(given)):
-        present = ~np.isnan(part.y)
-        yield part, x0, present, _whitened(model, steady, part, x0, present)
-
-
-def _whitened(model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: np.ndarray) -> Array:
-    job = simulation.prepared(model, "predict", part.u, part.y, None, "")
-    errors = np.where(present, part.y - simulation.run(job, x0), 0.0)
-    return steady.whitened(errors, present).ravel()
+    found: list[Any] = as_list(whiten(model, raw, scale=steady))
+    for part, white in zip(raw.experiments, found):
+        yield part, white.states[0], white.present, white.r.ravel()
 
 
 def uncertain_start(model: "HammersteinSS", steady: Predictor) -> ModelUncertainty:
-    """Return the uncertainty of a model that is exact, in records whose initial state is estimated."""
+    """Return the uncertainty of an exact model in records whose initial state is estimated."""
     gained = replace(model, K=steady.K)
     return ModelUncertainty(gained, steady, np.zeros((len(parameters(gained)[0]), 0)), 0)
 
 
 def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], "HammersteinSS"]]:
-    """Return the parameters, a step for each, and the way back."""
+    """Return the parameters, a step for each, and the function that builds the model of given parameters."""
     used = [name for name in MATRICES if np.any(getattr(model, name))]
     functions = [*model.nonlinearities, *model.feedback]
     parts = [np.ravel(getattr(model, name)) for name in used] + [np.ravel(f.mu) for f in functions]
@@ -258,7 +243,7 @@ def parameters(model: "HammersteinSS") -> tuple[Array, Array, Callable[[Array], 
 def moved_models(
     model: "HammersteinSS", root: Array
 ) -> "Iterator[tuple[HammersteinSS, HammersteinSS, float]]":
-    """Yield two models on both sides along every column of root, and what their difference is multiplied by."""
+    """Yield two models on both sides along every column of root, and the factor of their difference."""
     theta, steps, back = parameters(model)
     largest = np.abs(root / steps[:, None]).max(axis=0, initial=0.0)
     largest[largest == 0] = 1.0
@@ -272,6 +257,10 @@ def sensitivities(
     """Derivatives (N l, q) and (N l, n) of the whitened innovations along the columns of root and by the start."""
     columns = np.empty((present.size, root.shape[1]))
     for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
-        sides = [_whitened(moved, steady, part, x0, present) for moved in (plus, minus)]
-        columns[:, j] = (sides[0] - sides[1]) * factor
+        first, second = (
+            simulation.run(simulation.prepared(moved, "predict", part.u, part.y, None, ""), x0)
+            for moved in (plus, minus)
+        )
+        change = np.where(present, (second - first) * factor, 0.0)  # of the innovations
+        columns[:, j] = steady.whitened(change, present).ravel()
     return columns, steady.whitened(steady.jumps(0, present), present).reshape(present.size, model.nx)

@@ -1,4 +1,4 @@
-"""The frame of the pages of a diagnosis and of a reformulation."""
+"""Layout of the pages of a diagnosis and of a reformulation."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

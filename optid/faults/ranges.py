@@ -1,7 +1,7 @@
-"""Inputs outside the range that a nonlinearity was identified over: what the actuator does there is not known.
+"""Inputs outside the range over which a nonlinearity was identified, where the effect of the actuator is unknown.
 
-At such samples the effect f(u) may be anything. So it is a disturbance of unlimited variance at these samples, and at
-these alone: innovations and signatures are freed of it like of the unknown initial state.
+At such samples the effect f(u) is modelled as a disturbance of unlimited variance, which is removed from innovations
+and signatures like the unknown initial state.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 TOLERATED = 0.02
-"""Share of the range by which an input may leave it without a word, as long as nothing is seen of that."""
+"""Share of the range by which an input may leave it as long as no output shows it."""
 
 UNSEEN = 0.1
-"""Standard deviations of the noise that the unknown part of the effect may shift an output by."""
+"""Largest shift of an output by the unknown effect that is tolerated, in standard deviations of the noise."""
 
 REACH = 50
-"""Samples after which the effect of an input is not looked at any more."""
+"""Samples of the impulse response that are considered."""
 
 MOST = 400
-"""Samples outside at most."""
+"""Largest number of samples outside."""
 
 
 class Outside(NamedTuple):
@@ -45,11 +45,11 @@ class Outside(NamedTuple):
     samples: np.ndarray
 
     def __str__(self) -> str:
-        """Say which, since when, and what follows."""
+        """State the input, the range and the samples."""
         low, high = self.interval
         return (
             f"{self.name} is outside the identified range [{low:.4g}, {high:.4g}] in {self.samples.size} samples, "
-            f"first in sample {self.samples[0]}: what the actuator does there is not judged."
+            f"first in sample {self.samples[0]}: its effect there is not judged."
         )
 
 
@@ -69,10 +69,10 @@ def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
 
 
 def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
-    """Return (low, high), both (K,), between which every function of an input is known well enough.
+    """Return (low, high), both (K,), between which every function of an input is known with sufficient accuracy.
 
-    That is its interval and what is `TOLERATED` beyond, less where the outputs would show it: outside its interval a
-    function may stand still or go on as it likes, and an input with direct effect tells that from the noise at once.
+    This is its interval, extended by `TOLERATED` of its length, or by less where the outputs would show the difference
+    between a function that is held and one that is extrapolated there.
     """
     low, high = np.full((2, len(model.nonlinearities)), np.inf) * [[-1.0], [1.0]]
     response = impulse_response(model.A, model.B, model.C, model.D, REACH)
@@ -90,7 +90,7 @@ def known_range(model: "HammersteinSS") -> tuple[Array, Array]:
 
 
 def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
-    """Return which samples (N,) lie at most so many samples behind an input that is outside its range."""
+    """Return which samples (N,) follow an input outside its range within `memory` samples."""
     edges = np.zeros(len(u) + memory + 2, dtype=int)
     for one in outside(model, u):
         np.add.at(edges, one.samples, 1)
@@ -99,17 +99,17 @@ def unsure_since(model: "HammersteinSS", u: Array, memory: int) -> np.ndarray:
 
 
 def unknown_effects(model: "HammersteinSS", u: Array) -> tuple[Array, Array]:
-    """Return what unknown effects outside the range add to the state (N, n, K) and to the output (N, l, K).
+    """Return the unknown effects outside the range in the state (N, n, K) and in the output (N, l, K).
 
     Raises:
-        DataError: more samples outside than can be judged without.
+        DataError: too many samples outside.
     """
     count, there = len(u), outside(model, u)
     total = sum(one.samples.size for one in there)
     if total > min(MOST, count // 2):
         raise DataError(
-            f"{' '.join(map(str, there))} So much of the record cannot be judged: identify the model over the wider "
-            "range, or cut the record."
+            f"{' '.join(map(str, there))} This part is too long to be left out: identify the "
+            "model over the wider range, or cut the record."
         )
     into_state, into_output = np.zeros((count, model.nx, total)), np.zeros((count, model.l, total))
     k = 0

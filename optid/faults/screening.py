@@ -1,4 +1,4 @@
-"""What is wrong with a record before any statistics: flat lines, swapped channels, jumps of the unit."""
+"""Checks of a record before any statistics: flat lines, swapped channels, changes of unit."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 FLAT = 3
-"""Readings identical to the bit that are no coincidence when the noise is continuous."""
+"""Number of identical readings that is not a coincidence with continuous noise."""
 
 UNITS = (1000.0, 100.0, 60.0, 25.4, 10.0, 9.81, 9 / 5, np.pi / 180)
 FACTORS = (*UNITS, *(1 / unit for unit in UNITS))
-"""Factors by which units of the same quantity differ."""
+"""Factors between units of the same quantity."""
 
 BETTER = 0.1
-"""A share of the energy of the innovations below which another reading of the record is the right one."""
+"""Share of the energy of the innovations below which another order or unit of the channels is accepted."""
 
 
 @dataclass(frozen=True)
 class FlatLine:
-    """A sensor that repeats one reading to the bit.
+    """A sensor that repeats one reading exactly.
 
     Attributes:
         name: "sensor:y1".
-        experiment: which experiment, from 0.
+        experiment: index of the experiment.
         first: first sample of the run of equal readings.
         count: their number.
         value: the reading.
@@ -46,14 +46,14 @@ class FlatLine:
     value: float
 
     def __str__(self) -> str:
-        """Say where."""
+        """State sensor, reading and samples."""
         return f"{self.name}: {self.count} readings of exactly {self.value:.6g} from sample {self.first} on"
 
 
 def flat_lines(data: Data, at_least: int = FLAT) -> tuple[FlatLine, ...]:
-    """Find runs of readings that are identical to the bit; a missing reading ends a run.
+    """Find runs of identical readings; a missing reading ends a run.
 
-    A sensor with a resolution coarser than its noise repeats readings by itself: an output with fewer than ten
+    A sensor whose resolution is coarser than its noise repeats readings when healthy: an output with fewer than ten
     different readings per hundred outside its longest run is left out.
 
     Args:
@@ -79,19 +79,18 @@ def flat_lines(data: Data, at_least: int = FLAT) -> tuple[FlatLine, ...]:
 
 
 def check_channels(model: "HammersteinSS", data: Data) -> None:
-    """Refuse a healthy record whose outputs or inputs are swapped or whose unit jumps.
+    """Refuse a healthy record with swapped outputs or inputs, or with a change of unit.
 
-    All are told by the innovations: another order of the channels, or another factor of an output from some sample on,
-    makes them ten times smaller in energy, and the size that the model says. Of an input a factor of the whole record
-    is tried.
+    The criterion is the energy of the innovations: another order of the channels, or another factor of an output from
+    some sample on (of an input in the whole record), makes it ten times smaller, and as large as the model predicts.
 
     Args:
         model: with noise covariances.
         data: the record.
 
     Raises:
-        DataError: outputs or inputs that look swapped, named; a change of the unit of an output, with the sample and
-            the factor; an input in another unit, with the factor.
+        DataError: swapped outputs or inputs; a change of the unit of an output, with sample and factor; an input in
+            another unit, with the factor.
     """
     raw = in_units_of(model, data)
     energy = _energy(model, raw)
@@ -121,7 +120,7 @@ def check_channels(model: "HammersteinSS", data: Data) -> None:
 
 
 def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[[list[int]], float]) -> None:
-    """Refuse channels whose innovations have a tenth of the energy in another order, of which `of` is the energy."""
+    """Refuse channels for which another order reduces the energy `of` the innovations to a tenth."""
     if not 1 < len(names) <= 5:
         return
     orders = list(permutations(range(len(names))))[1:]  # the first is that of the record
@@ -136,7 +135,7 @@ def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[
 
 
 def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float] | None:
-    """The first sample and the factor of the change of a unit, if that explains a record of one experiment."""
+    """First sample and factor of a change of unit that explains a record of one experiment."""
     energy, found = _energy(model, alone), whiten(model, alone)
     large = np.abs(found.innovations[:, o]) / np.sqrt(predictor(model).covariance[o, o])
     for onset, factor in product(np.flatnonzero(large > 6)[:3], FACTORS):
@@ -149,7 +148,7 @@ def _unit_jump(model: "HammersteinSS", alone: Data, o: int) -> tuple[int, float]
 
 
 def _energy(model: "HammersteinSS", data: Data) -> float:
-    """Energy of the innovations; infinite where the model is not defined for such inputs."""
+    """Energy of the innovations; infinite where the model is not defined for the inputs."""
     try:
         found: list[Any] = as_list(whiten(model, data))
     except DataError:
@@ -158,7 +157,7 @@ def _energy(model: "HammersteinSS", data: Data) -> float:
 
 
 def _runs(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First samples and lengths of the runs of equal readings; missing ones belong to none."""
+    """First samples and lengths of the runs of equal readings; missing ones are skipped."""
     edges = np.flatnonzero(np.concatenate([[True], y[1:] != y[:-1]]))
     counts = np.diff(np.append(edges, y.size))
     there = ~np.isnan(y[edges])

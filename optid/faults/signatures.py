@@ -1,4 +1,4 @@
-"""The dictionary: what every possible fault leaves in the whitened innovations, and which of them look the same."""
+"""Dictionary of possible faults: their signatures in the whitened innovations, and groups that are not isolable."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,6 @@ from optid.arrays import Array
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
 from optid.faults.directions import decoupled
 from optid.faults.faults import Fault, channel_of, place_of
-from optid.faults.scheduled import with_schedules
 from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 ADDITIVE = ("bias", "drift", "jump", "spike")
-"""Kinds whose signature depends on nothing but the model and the time since the onset."""
+"""Kinds whose signature depends on the model and the time since the onset alone."""
 
 KINDS = {
     "bias": ("actuator", "sensor", "process"),
@@ -32,40 +31,40 @@ KINDS = {
     "frozen": ("sensor",),
     "noise": ("sensor", "process"),
 }
-"""The places where each kind can be."""
+"""Possible places of each kind."""
 
 SAME = 1e-3
-"""Two signatures at an angle with a smaller sine cannot be told apart by any record."""
+"""Sine of the angle between two signatures below which no record isolates them."""
 
 NEAR = 0.3
-"""Two signatures at an angle with a smaller sine need a large fault to be told apart."""
+"""Sine of the angle between two signatures below which only large faults are isolable."""
 
 UNSEEN = 1e-9
-"""A signature below this share of what it could be is none."""
+"""Share of its largest possible size below which a signature is zero."""
 
 FORGOTTEN = 1e-4
-"""A signature that falls below this share of its largest value is transient."""
+"""Share of its largest value below which a signature has decayed."""
 
 LONGEST = 4000
-"""Samples over which signatures are compared at most."""
+"""Largest number of samples over which signatures are compared."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A fault that may be the answer; several where no record can tell them apart.
+    """A possible fault, or a group of faults that no record isolates from each other.
 
     Attributes:
-        name: where, as in `Fault`.
+        name: place, as in `Fault`.
         kind: one of `KINDS`.
         into_state: (n, d) where it enters the state equation.
         into_output: (l, d) where it enters the output equation.
-        columns: the functions of the input that a loss or a stuck actuator concerns.
-        members: labels of all faults that leave the same trace, its own first.
-        places: names of the parts that these faults are in.
-        bounded_deflection: whether the trace dies out: waiting does not help.
+        columns: the functions of the input of a loss or a stuck actuator.
+        members: labels of all faults with the same signature, its own first.
+        places: places of these faults.
+        bounded_deflection: whether the signature decays, so that a longer window does not help.
         schedule: the matrices A(k) and B(k) of a scheduled change.
-        constants: whether constants are added to what a loss leaves.
-        zero: the input at which the actuator of a loss does nothing; None where that of f is meant.
+        constants: whether a loss adds constants.
+        zero: the input at which the actuator of a loss has no effect; None for the zero of f.
     """
 
     name: str
@@ -82,12 +81,12 @@ class Candidate:
 
     @property
     def own_label(self) -> str:
-        """The name, and the kind where the name does not say it."""
+        """The name, and the kind unless the name implies it."""
         return self.name if self.kind in ("bias", "jump") else f"{self.name} {self.kind}"
 
     @property
     def label(self) -> str:
-        """What an answer calls it: the whole group where it is one."""
+        """Its name in answers; that of the whole group where it is one."""
         return " | ".join(self.members or (self.own_label,))
 
     @property
@@ -105,16 +104,16 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Dictionary:
-    """All faults that are thought possible; build it with `dictionary`.
+    """All faults considered; build it with `dictionary`.
 
     Attributes:
         model: the healthy model.
         predictor: its steady predictor.
-        candidates: the faults that can be told apart, in the order given.
-        excluded: {label: why} of those that no output ever sees.
+        candidates: the isolable faults, in the order given.
+        excluded: {label: why} of those that affect no output.
         sines: (c, c) sine of the smallest angle between the signatures of candidates c with the same onset; NaN where
             one of them depends on the input.
-        unknown: whether "none of these" is an answer.
+        unknown: whether "none of these" is a possible answer.
     """
 
     model: "HammersteinSS"
@@ -126,22 +125,22 @@ class Dictionary:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What the candidates are called."""
+        """Labels of the candidates."""
         return tuple(c.label for c in self.candidates)
 
     @property
     def ambiguity_groups(self) -> list[tuple[str, ...]]:
-        """The groups of faults that no record can tell apart."""
+        """The groups of faults that no record isolates from each other."""
         return [c.members for c in self.candidates if len(c.members) > 1]
 
     @property
     def near(self) -> list[tuple[str, str, float]]:
-        """Pairs that can be told apart only when the fault is large, with the sine of their angle."""
+        """Pairs that are isolable only when the fault is large, with the sine of their angle."""
         rows, columns = np.nonzero(np.triu(np.nan_to_num(self.sines, nan=1.0) < NEAR, 1))
         return [(self.labels[i], self.labels[j], float(self.sines[i, j])) for i, j in zip(rows, columns)]
 
     def with_candidates(self, more: Sequence[Candidate]) -> "Dictionary":
-        """Return the dictionary with further candidates behind its own."""
+        """Return the dictionary with further candidates appended."""
         count = len(self.candidates) + len(more)
         sines = np.full((count, count), np.nan)
         sines[: len(self.candidates), : len(self.candidates)] = self.sines
@@ -165,18 +164,18 @@ class Dictionary:
 
     def signature(self, candidate: Candidate | str, count: int, onset: int = 0, u: ArrayLike | None = None,
                   present: Array | None = None) -> Array:
-        """Return what one unit of each magnitude leaves in the whitened innovations, (N, l, d).
+        """Return the whitened innovations (N, l, d) of one unit of each magnitude.
 
         The magnitudes are the size of a bias, the slope of a drift, the jump of the state, the share lost, or the share
-        lost and the constants added (stuck). Arguments and errors as of `additions`; `present` (N, l) says which
-        readings are there.
+        lost and the constants added (stuck). Arguments and errors as of `additions`; `present` (N, l) marks the
+        readings.
         """
         into_state, into_output = self.additions(candidate, count, onset, u)
         return self.predictor.whitened(self.predictor.respond(into_state, into_output, present), present)
 
     def additions(self, candidate: Candidate | str, count: int, onset: int = 0, u: ArrayLike | None = None
                   ) -> tuple[Array, Array]:
-        """Return what one unit of each magnitude adds to the state (N, n, d) and to the output (N, l, d).
+        """Return the additions of one unit of each magnitude to the state (N, n, d) and the output (N, l, d).
 
         Args:
             candidate: the candidate or its label.
@@ -185,7 +184,7 @@ class Dictionary:
             u: (N, m) inputs, for a loss and a stuck actuator.
 
         Raises:
-            StructureError: a frozen sensor or a noise, which have no course of their own; a loss without u.
+            StructureError: a frozen sensor or a noise, which have no signature; a loss without u.
         """
         c = self[candidate] if isinstance(candidate, str) else candidate
         since = np.arange(count) - onset
@@ -193,15 +192,12 @@ class Dictionary:
             course = course_of(c.kind, since)
             return course[:, None, None] * c.into_state, course[:, None, None] * c.into_output
         if c.kind == "schedule":
-            raise StructureError(f"{c.label}: its signature depends on the states: ask scan(...) for it.")
+            raise StructureError(f"{c.label}: its signature depends on the states of a window: see Scan.signature.")
         if not c.columns:
             raise StructureError(
-                f"{c.label}: its course may be anything, so that there is no signature: test it as an arbitrary "
-                "waveform or by its covariance."
+                f"{c.label} has no signature, because its course is not known: test it as an arbitrary waveform or by "
+                "its covariance."
             )
-        return self._multiplicative(c, since, u)
-
-    def _multiplicative(self, c: Candidate, since: np.ndarray, u: ArrayLike | None) -> tuple[Array, Array]:
         if u is None:
             raise StructureError(f"{c.label}: its signature depends on the input: pass u (N, m).")
         inputs = np.asarray(u, dtype=float).reshape(since.size, -1)
@@ -211,7 +207,7 @@ class Dictionary:
         if c.zero is not None and c.kind == "loss":
             f = f - self.model.expanded(np.full((1, self.model.m), c.zero))[:, list(c.columns)]
         on = (since >= 0).astype(float)[:, None]
-        before = np.vstack([np.zeros((1, f.shape[1])), f[:-1]])  # what drives x(k) is the input before
+        before = np.vstack([np.zeros((1, f.shape[1])), f[:-1]])  # x(k) is driven by the input before
         begun = on.copy()
         begun[:1] = 0.0
         into_state, into_output = [-(on * before) @ c.into_state.T], [-(on * f) @ c.into_output.T]
@@ -222,19 +218,19 @@ class Dictionary:
         return np.stack(into_state, axis=2), np.stack(into_output, axis=2)
 
     def isolability(self, window: int = 100, **how: Any) -> "Isolability":
-        """Return how large every fault must be to be noticed and to be named; see `optid.faults.isolability.study`."""
+        """Return the smallest detectable and isolable sizes; see `optid.faults.isolability.study`."""
         from optid.faults.isolability import study
 
         return study(self, window, **how)
 
     def __str__(self) -> str:
-        """List the candidates, the groups and what is left out."""
-        lines = [f"{len(self.candidates)} faults can be told apart"]
+        """List the candidates, the groups and the excluded faults."""
+        lines = [f"{len(self.candidates)} isolable faults"]
         for c in self.candidates:
-            marks = ["transient only"] * c.bounded_deflection + ["one name for all"] * (len(c.members) > 1)
+            marks = ["transient only"] * c.bounded_deflection + ["not isolable from each other"] * (len(c.members) > 1)
             lines.append(f"  {c.label}" + f"  ({', '.join(marks)})" * bool(marks))
         lines += [f"  {a} and {b} are close: sine {sine:.3f}" for a, b, sine in self.near]
-        lines += [f"  left out: {label}, {why}" for label, why in self.excluded.items()]
+        lines += [f"  excluded: {label}, {why}" for label, why in self.excluded.items()]
         return "\n".join(lines + ["  unknown: none of these"] * self.unknown)
 
 
@@ -250,29 +246,28 @@ def dictionary(
     schedules: Mapping[str, Fault] | None = None, unknown: bool = True, zeros: Mapping[str, float] | None = None,
     disturbances: Sequence[str] = (),
 ) -> Dictionary:
-    """List the faults that are thought possible, merge those that look the same, leave out those nobody sees.
+    """Build the dictionary of possible faults; merge those that are not isolable, exclude those without effect.
 
     Args:
         model: the healthy model, with noise covariances.
         actuators: "all" or names of inputs.
         sensors: "all" or names of outputs.
-        kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise", "spike"; each where it can be.
+        kinds: of "bias", "loss", "stuck", "frozen", "drift", "noise", "spike"; each at its possible places.
         process: directions (n,) of disturbances in the state equation, by name.
         state_jump: whether the state may jump, in any direction.
-        schedules: known changes of A and B by name, see `optid.faults.scheduled`.
-        unknown: whether "none of these" is an answer. A constant disturbance of unknown direction is then one, too.
-        zeros: {input: the value at which its actuator does nothing}. A loss is the share (1 - gamma) of what the
-            actuator does beyond that; without it any constant may be added.
-        disturbances: names, as in `Fault`, of what may do anything at any time without being a fault: inputs, outputs,
-            directions of `process`. The predictor does not feel them (`optid.faults.directions`), and a direction that
-            is declared a disturbance is no fault.
+        schedules: known changes of A and B by name.
+        unknown: whether "none of these" is a possible answer; a constant disturbance of unknown direction is then, too.
+        zeros: {input: the value at which its actuator has no effect}. A loss reduces the effect beyond that value to
+            the share (1 - gamma); without it any constant may be added.
+        disturbances: names, as in `Fault`, of inputs, outputs and directions of `process` with disturbances of any
+            course. The predictor is decoupled from them (`optid.faults.directions`), and they are not candidates.
 
     Raises:
         LookupFailed: an unknown kind or channel.
         StructureError: no noise covariances, no candidate left.
 
     Warns:
-        DataWarning: faults that were merged or left out.
+        DataWarning: faults that were merged or excluded.
     """
     wanted = [kinds] if isinstance(kinds, str) else list(kinds)
     unknown_kinds = [kind for kind in wanted if kind not in KINDS]
@@ -295,10 +290,19 @@ def dictionary(
     excluded: dict[str, str] = {}
     found = [kept for candidate in raw for kept in _seen(steady, candidate, excluded)]
     if not found:
-        raise StructureError("No output sees any of the faults: there is nothing to look for.")
+        raise StructureError("None of the faults affects an output: there is no candidate.")
     merged, sines = _merged(steady, found)
     listed = Dictionary(model, steady, merged, excluded, sines, unknown)
-    return with_schedules(listed, schedules) if schedules else listed
+    changes = []
+    for name, fault in (schedules or {}).items():
+        if fault.kind != "schedule":
+            raise StructureError(f"{name}: a fault of kind {fault.kind!r}; it must be Fault.schedule(A=, B=).")
+        place, label = f"process:{name}", f"process:{name} schedule"
+        if label in listed.labels:
+            raise StructureError(f"{label} is in the dictionary already.")
+        none = np.zeros((model.nx, 1)), np.zeros((model.l, 1))
+        changes.append(Candidate(place, "schedule", *none, members=(label,), places=(place,), schedule=fault))
+    return listed.with_candidates(changes) if changes else listed
 
 
 def _chosen(wanted: str | Sequence[str], names: tuple[str, ...]) -> list[str]:
@@ -329,13 +333,13 @@ def _horizon(steady: Predictor) -> int:
 
 
 def response(steady: Predictor, candidate: Candidate, count: int) -> Array:
-    """Return the signature (N, l, d) from the onset on; of a candidate that has none, that of a bias in its place."""
+    """Return the signature (N, l, d) from the onset on; that of a bias for a candidate without a signature."""
     course = course_of(candidate.kind, np.arange(count))[:, None, None]
     return steady.whitened(steady.respond(course * candidate.into_state, course * candidate.into_output))
 
 
 def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> list[Candidate]:
-    """Keep the directions that some output sees, and flag a trace that dies out; nothing where none is seen."""
+    """Keep the directions that affect an output, and flag a signature that decays; nothing where there are none."""
     trace = response(steady, candidate, _horizon(steady))
     possible = np.linalg.norm(steady.root) * (
         np.linalg.norm(candidate.into_state, axis=0) * max(np.linalg.norm(steady.C), 1e-300)
@@ -344,16 +348,16 @@ def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> 
     _, sizes, axes = np.linalg.svd(trace.reshape(-1, trace.shape[2]), full_matrices=False)
     there = sizes > UNSEEN * max(float(possible.max(initial=0.0)), 1e-300)
     if not there.any():
-        excluded[candidate.own_label] = "no output ever sees it"
+        excluded[candidate.own_label] = "it affects no output"
         warnings.warn(
-            f"{candidate.own_label}: no output ever sees this fault; it is left out and cannot be an answer.",
+            f"{candidate.own_label}: this fault affects no output; it is excluded.",
             DataWarning, stacklevel=4,
         )
         return []
     if not there.all() and candidate.additive:
         warnings.warn(
-            f"{candidate.own_label}: {int(np.sum(~there))} of {there.size} directions are seen by no output; they are "
-            "left out.", DataWarning, stacklevel=4,
+            f"{candidate.own_label}: {int(np.sum(~there))} of {there.size} directions affect no output; they are "
+            "excluded.", DataWarning, stacklevel=4,
         )
         into_state, into_output = (part @ axes[there].T for part in (candidate.into_state, candidate.into_output))
         candidate = replace(candidate, into_state=into_state, into_output=into_output)
@@ -363,7 +367,7 @@ def _seen(steady: Predictor, candidate: Candidate, excluded: dict[str, str]) -> 
 
 
 def _merged(steady: Predictor, found: list[Candidate]) -> tuple[tuple[Candidate, ...], Array]:
-    """Put candidates whose signatures span the same space into one group; and the sines between the groups."""
+    """Group candidates whose signatures span the same space; return the sines between the groups, too."""
     groups: list[list[Candidate]] = []
     axes: list[Array | None] = []
     for candidate in found:
@@ -378,8 +382,8 @@ def _merged(steady: Predictor, found: list[Candidate]) -> tuple[tuple[Candidate,
             if sine < SAME:
                 group.append(candidate)
                 warnings.warn(
-                    f"{group[0].own_label} and {candidate.own_label} leave the same trace (sine of the angle "
-                    f"{sine:.1e}): no record can tell them apart, and an answer names both.",
+                    f"{group[0].own_label} and {candidate.own_label} have the same signature (sine of the angle "
+                    f"{sine:.1e}): they are not isolable from each other, and an answer names both.",
                     DataWarning, stacklevel=4,
                 )
                 break

@@ -1,4 +1,4 @@
-"""Innovations of the steady Kalman predictor in units of their own covariance: white and of unit size when healthy."""
+"""Innovations of the steady Kalman predictor, whitened: white with unit covariance for a healthy plant."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -23,16 +23,16 @@ LAGS = 20
 """Lags of the whiteness test."""
 
 NOT_WHITE = 1e-3
-"""Thresholds are refused below this p-value."""
+"""p-value of whiteness below which thresholds are refused."""
 
 FORGETS = 1 - 1e-9
-"""Largest radius of the error of a predictor."""
+"""Largest spectral radius of A - K C."""
 
 ADDED = 1e-2
 """Measurement noise, as a share of the innovations, that is added where the noise has no power at some frequency."""
 
 OTHER_SCALE = 1.3
-"""Thresholds are refused above this ratio of the innovations to their predicted size."""
+"""Ratio of the innovations to their predicted size above which thresholds are refused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class Predictor:
         K: (n, l) gain.
         covariance: (l, l) of the innovations.
         root: (l, l) lower triangular; root times an innovation has unit covariance.
-        silent: number of axes of the innovations that are left out, because declared disturbances reach them.
+        silent: number of axes of the innovations left out, because declared disturbances affect them.
     """
 
     A: Array
@@ -59,24 +59,27 @@ class Predictor:
 
     @property
     def F(self) -> Array:  # noqa: N802 - the field's letter
-        """A - K C, with which what is left of a past error decays."""
+        """A - K C, the transition of the prediction error."""
         return np.asarray(self.A - self.K @ self.C)
 
     @property
     def settling(self) -> int:
-        """Samples after which a past error has fallen below 1e-6 of itself."""
+        """Samples after which a past error has decayed to 1e-6."""
         radius = float(np.max(np.abs(np.linalg.eigvals(self.F)), initial=0.0))
         return len(self.F) if radius == 0 else len(self.F) + int(np.ceil(np.log(1e-6) / np.log(min(radius, 1 - 1e-9))))
 
-    def respond(self, into_state: Array, into_output: Array, present: Array | None = None) -> Array:
-        """Return what additions to x(k) (N, n, d) and to y(k) (N, l, d) leave in the innovations, (N, l, d).
+    def respond(
+        self, into_state: Array, into_output: Array, present: Array | None = None, A: Array | None = None
+    ) -> Array:
+        """Return the response (N, l, d) of the innovations to additions to x(k) (N, n, d) and to y(k) (N, l, d).
 
         Args:
             into_state: (N, n, d).
             into_output: (N, l, d).
-            present: (N, l) whether a reading is there; all by default.
+            present: (N, l) whether there is a reading; all by default.
+            A: (N, n, n) of a plant that changes; that of the model by default.
         """
-        if present is None and len(into_output) <= SHORT:
+        if A is None and len(into_output) <= SHORT and (present is None or present.all()):
             drive = into_state.copy()
             drive[1:] -= self.K @ into_output[:-1]
             return into_output + self.C @ propagated(self.F, drive)
@@ -84,21 +87,22 @@ class Predictor:
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
         response = np.empty(into_output.shape)
-        A, C, K, L, state, output = map(compact, (self.A, self.C, self.K, self.L, into_state, into_output))
+        followed = self.A[None] if A is None else A
+        A, C, K, L, state, output = map(compact, (followed, self.C, self.K, self.L, into_state, into_output))
         kernels.respond(A, C, K, L, shown, state, output, response)
         return response
 
     def jumps(self, onset: int, present: Array) -> Array:
-        """Return what unit jumps of the state at a sample leave in the innovations (N, l, n) of readings (N, l)."""
+        """Return the response (N, l, n) of the innovations of readings (N, l) to unit jumps of the state at `onset`."""
         (count, l), n = present.shape, len(self.A)  # noqa: E741
         into_state = np.zeros((count, n, n))
         into_state[onset] = np.eye(n)
         return self.respond(into_state, np.zeros((count, l, n)), present)
 
     def whitened(self, innovations: Array, present: Array | None = None) -> Array:
-        """Return innovations (N, l) or (N, l, d) in units of their covariance, zero where a reading is missing.
+        """Return whitened innovations (N, l) or (N, l, d), zero where a reading is missing.
 
-        Readings that are left of a sample are whitened by the covariance among themselves.
+        The remaining readings of a sample are whitened by the covariance among themselves.
         """
         if present is None or present.all():
             return np.einsum("ij,nj...->ni...", self.root, innovations)
@@ -123,8 +127,8 @@ def predictor(model: "HammersteinSS") -> Predictor:
     """
     if model.noise is None:
         raise StructureError(
-            "The model has no noise covariances, and without them nothing says how large a deviation is: estimate "
-            "them with optid.noise.with_noise(model, data)."
+            "The model has no noise covariances, which give the scale of its innovations: estimate them with "
+            "optid.noise.with_noise(model, data)."
         )
     noise, failure = model.noise, ""
     for added in (0.0, ADDED):
@@ -150,11 +154,10 @@ class Whitened:
     Attributes:
         r: (N, l), zero where a reading is missing; N(0, I) for a healthy plant.
         innovations: (N, l) before whitening, NaN where a reading is missing.
-        present: (N, l) whether a reading is there.
+        present: (N, l) whether there is a reading.
         predictor: the predictor behind them.
         outputs: names of the outputs.
-        nuisance: what uncertain parameters of the model leave in the innovations, taken out of r; None for a model
-            that is taken as exact.
+        nuisance: effect of uncertain parameters on the innovations, removed from r; None for a model taken as exact.
         states: (N, n) of the predictor, for faults that change the matrices; None where they are not known.
     """
 
@@ -167,7 +170,7 @@ class Whitened:
     states: Array | None = None
 
     def seen(self, signature: Array) -> Array:
-        """Return what a signature (N, l, d) of the innovations is in r: whitened like them."""
+        """Return a signature (N, l, d) of the innovations, whitened like r."""
         white = self.predictor.whitened(signature, self.present)
         return white if self.nuisance is None else self.nuisance(white)
 
@@ -178,11 +181,11 @@ def check_window(
     """Refuse whitened innovations that a search or a test cannot take.
 
     Args:
-        model: whose innovations they should be.
+        model: of the innovations.
         whitened: the window.
         what: the search or the test, for messages.
-        onset: sample of the window from which something is supposed to have changed.
-        longest: readings of a window at most.
+        onset: sample of the window at which a change is assumed.
+        longest: largest number of readings of a window.
 
     Raises:
         StructureError: several experiments, an onset outside the window, a window that is too long.
@@ -190,7 +193,7 @@ def check_window(
     """
     if not isinstance(whitened, Whitened):
         raise StructureError(
-            f"{what} takes the whitened innovations of one experiment, as optid.faults.whiten returns them: take the "
+            f"{what} takes the whitened innovations of one experiment, as returned by optid.faults.whiten: pass the "
             "experiments of a record one by one."
         )
     count, outputs = whitened.r.shape
@@ -212,13 +215,13 @@ def whiten(
 ) -> Any:
     """Return the whitened innovations of a record; a tuple for several experiments.
 
-    A missing reading corrects no state and counts for nothing.
+    A missing reading is not used for correction.
 
     Args:
         model: a model with noise covariances.
         data: the record; detrended or scaled data are taken back to raw units.
         x0: "fit" (least squares of the innovations), "zero", or the state (n,), one for each experiment.
-        uncertainty: of an identified model (`model_uncertainty`); its effect counts as noise; its predictor is used.
+        uncertainty: of an identified model (`model_uncertainty`), treated as noise; its predictor is used.
         scale: a predictor whose covariance replaces that of the model, as `Health.predictor` returns.
 
     Raises:
@@ -247,13 +250,13 @@ def whiten(
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """Whether the innovations of a healthy record are what the model says.
+    """Whiteness and size of the innovations of a healthy record, compared with the model.
 
     Attributes:
         ratios: {output: size of its innovations over the predicted one}.
         p_value: of the hypothesis that the innovations are white (portmanteau test of Hosking).
         lags: its lags.
-        samples: complete samples behind both.
+        samples: number of complete samples.
         covariance: (l, l) of the whitened innovations; the identity is expected.
     """
 
@@ -270,16 +273,16 @@ class Health:
 
     @property
     def white(self) -> bool:
-        """Whether the whiteness test keeps its hypothesis."""
+        """Whether whiteness is not rejected."""
         return not self.p_value < NOT_WHITE
 
     @property
     def scaled(self) -> bool:
-        """Whether the innovations are of the size predicted."""
+        """Whether the innovations have the predicted size."""
         return self.ratio <= OTHER_SCALE
 
     def __str__(self) -> str:
-        """Say both, with the numbers."""
+        """State the p-value and the sizes."""
         sizes = ", ".join(f"{name} {ratio:.3f}" for name, ratio in self.ratios.items())
         return (
             f"innovations over {self.samples} samples: p-value of whiteness {self.p_value:.3g} ({self.lags} lags)\n"
@@ -287,23 +290,23 @@ class Health:
         )
 
     def predictor(self, steady: Predictor, *, rescale: bool = False) -> Predictor:
-        """Return the predictor that thresholds may be built on.
+        """Return the predictor to use for thresholds.
 
         Args:
             steady: the predictor that was judged.
-            rescale: take the covariance of the innovations from the healthy record where it is larger or smaller.
+            rescale: take the covariance of the innovations from the healthy record.
 
         Raises:
             DataError: innovations that are not white, or larger than predicted without `rescale`.
 
         Warns:
-            DataWarning: innovations much smaller than predicted: thresholds are on the safe side.
+            DataWarning: innovations much smaller than predicted: thresholds are conservative.
         """
         if not self.white:
             raise DataError(
                 f"The innovations of the healthy record are not white (p-value {self.p_value:.2g}): thresholds from "
                 "this model would be wrong. Fit the model again, calibrate the thresholds on healthy records "
-                "(empirical_thresholds), or count the uncertainty of the identified model (model_uncertainty)."
+                "(empirical_thresholds), or include the uncertainty of the identified model (model_uncertainty)."
             )
         if rescale:
             covariance = np.linalg.solve(steady.root, np.linalg.solve(steady.root, self.covariance).T)
@@ -311,13 +314,13 @@ class Health:
             return replace(steady, covariance=covariance, root=_root(covariance))
         if not self.scaled:
             raise DataError(
-                f"The innovations of the healthy record are {self.ratio:.2f} times as large as the model says "
+                f"The innovations of the healthy record are {self.ratio:.2f} times as large as the model predicts "
                 f"({', '.join(f'{name} {ratio:.2f}' for name, ratio in self.ratios.items())}): the scale of the noise "
                 "is wrong. Pass rescale=True to take it from this record, or estimate the noise again."
             )
         if self.ratio < 1 / OTHER_SCALE:
             warnings.warn(
-                f"The innovations are only {self.ratio:.2f} times as large as the model says: small faults will be "
+                f"The innovations are only {self.ratio:.2f} times as large as the model predicts: small faults will be "
                 "missed. rescale=True takes the scale from the healthy record.",
                 DataWarning,
                 stacklevel=2,
@@ -326,14 +329,14 @@ class Health:
 
 
 def health(whitened: Any, lags: int = LAGS) -> Health:
-    """Judge the whitened innovations of a healthy record: are they white, and of the size predicted?
+    """Test the whitened innovations of a healthy record for whiteness and for the predicted size.
 
     Args:
         whitened: from `whiten`, one or several experiments.
         lags: of the whiteness test; fewer in a short record.
 
     Raises:
-        DataError: too few complete samples: 10 per output are needed.
+        DataError: fewer than 10 complete samples per output.
     """
     from scipy.special import chdtrc
 
@@ -342,7 +345,7 @@ def health(whitened: Any, lags: int = LAGS) -> Health:
     rows = np.vstack([part.r[there] for part, there in zip(parts, complete)])
     count, outputs = rows.shape
     if count < 10 * outputs:
-        raise DataError(f"{count} complete samples are too few to judge the noise: {10 * outputs} are needed.")
+        raise DataError(f"{count} complete samples are too few to judge the noise; {10 * outputs} are required.")
     covariance = rows.T @ rows / count
     lags = max(1, min(lags, count // (4 * outputs)))
     root = _root(covariance + 1e-300 * np.eye(outputs))

@@ -1,13 +1,11 @@
-"""Explanations that a search for the dictionary alone would miss or confuse.
+"""Explanations beside those of the dictionary.
 
-A broken actuator does (1 - gamma) f(u) + c. It is *stuck* where gamma = 1, and has *lost* a share where 0 < gamma < 1;
-c is free unless the input is known at which the actuator does nothing, because an identified f is known up to a
-constant only. Both are parts of one family, and which of them it is follows from how probable gamma = 1 is beside all
-other shares (the ratio of Savage and Dickey), not from an order.
+A broken actuator contributes (1 - gamma) f(u) + c. It is *stuck* where gamma = 1, and has *lost* a share where
+0 < gamma < 1; c is free unless the input without effect is known, because an identified f is known up to a constant
+only. The probability of gamma = 1 relative to all other shares (Savage-Dickey ratio) decides between them.
 
-A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary. It is thought
-possible beside all entries: a named fault has to explain the record as well as the best direction does, for the number
-of magnitudes that this takes.
+A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary. It competes
+with all entries: a fault has to explain the record as well as the best direction does, given its number of magnitudes.
 """
 
 from collections.abc import Sequence
@@ -24,30 +22,30 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 UNLISTED = 0.1
-"""Prior of a fault that the dictionary does not hold, beside one that it does."""
+"""Prior of a fault outside the dictionary, relative to one inside."""
 
 UNKNOWN_DIRECTION = "process"
 """Name of a disturbance whose direction is estimated."""
 
 INTEGRATES = 1e10
-"""Condition above which a plant integrates, so that a constant disturbance has no final effect."""
+"""Condition number above which the plant integrates: a constant disturbance has no steady-state effect."""
 
 EXACT = 1e-12
 """Variance of a share lost that is known."""
 
 
 def extended(found: Dictionary) -> Dictionary | None:
-    """Return the candidates that are thought possible beside those of a dictionary; None for none.
+    """Return the candidates beside those of a dictionary; None for none.
 
-    They are actuators with a loss whose zero is not stated and that are not looked for as stuck, and, where "none of
-    these" is an answer, the constant disturbance of unknown direction.
+    They are actuators with a loss without a stated zero and without a stuck candidate, and, where "none of these" is a
+    possible answer, the constant disturbance of unknown direction.
     """
     stuck = {c.name for c in found.candidates if c.kind == "stuck"}
     more = [
         replace(c, kind="stuck") for c in found.candidates
         if c.kind == "loss" and c.columns and c.zero is None and c.name not in stuck
     ]
-    known = found.model.l > 1 or any(c.kind != "frozen" for c in found.candidates)  # else any course explains a record
+    known = found.model.l > 1 or any(c.kind != "frozen" for c in found.candidates)
     if found.unknown and known and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
         more.append(candidate_of(found.model, UNKNOWN_DIRECTION, "bias"))
     sines = np.full((len(more), len(more)), np.nan)
@@ -55,10 +53,7 @@ def extended(found: Dictionary) -> Dictionary | None:
 
 
 def parted(found: Explanation, listed: Sequence[Candidate]) -> list[Explanation]:
-    """Return a broken actuator as a stuck one and as one that lost a share; anything else as it is.
-
-    Only kinds among the candidates that are listed are offered.
-    """
+    """Return a broken actuator as a stuck one and as one that lost a share, of the listed kinds; others unchanged."""
     family = found.candidates[0]
     if len(found.candidates) == 1 and family.kind == "loss" and family.columns and not family.constants:
         return [found._replace(logs=np.logaddexp(found.logs, _all_lost(found)) - np.log(2))]
@@ -83,7 +78,7 @@ def _all_lost(found: Explanation) -> Array:
 
 
 def _stuck(found: Explanation) -> Explanation:
-    """The share fixed to one: the constants that belong to it, and the density of the share there."""
+    """The explanation with the share fixed to one, and the constants conditional on it."""
     share, variance = found.sizes[:, 0], np.maximum(found.covariances[:, 0, 0], EXACT)
     logs = _all_lost(found)
     slope = found.covariances[:, 1:, 0] / variance[:, None]
@@ -99,9 +94,9 @@ def _stuck(found: Explanation) -> Explanation:
 
 
 def final_effect(model: "HammersteinSS", name: str, size: Array) -> dict[str, float]:
-    """Return what a constant disturbance of estimated direction (n,) changes of every output in the end.
+    """Return the steady-state effect on every output of a constant disturbance of estimated direction (n,).
 
-    Other faults than the disturbance of unknown direction, and sizes that are not known, have no effect to report.
+    It is empty for other faults and for unknown sizes.
     """
     A = np.eye(model.nx) - model.A - model.L @ model.C
     if name != UNKNOWN_DIRECTION or size.shape != (model.nx,) or np.linalg.cond(A) > INTEGRATES:

@@ -1,4 +1,4 @@
-"""What a diagnosis says: a verdict, a set of answers with probabilities, estimates with intervals, and a proof."""
+"""Results of a diagnosis: verdict, set of answers with probabilities, estimates with intervals, certificate."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
@@ -21,11 +21,11 @@ FORMAT = "optid diagnosis"
 VERSION = 1
 
 CANDIDATE = "into_state", "into_output", "columns", "members", "places", "bounded_deflection"
-"""What is saved of the candidate of an estimate, beside its name and kind."""
+"""Saved fields of the candidate of an estimate, beside its name and kind."""
 
 VERDICTS = ("healthy", "faulty", "unknown", "untestable", "not isolable")
-"""What a diagnosis may say: nothing is wrong, these faults, a fault that is none of these, the record cannot tell
-because the input does not move what is suspected, the record cannot tell because there is one output only."""
+"""Possible verdicts: no fault; these faults; a fault outside the dictionary; no verdict without excitation of the
+candidates; no verdict with one output only."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,23 +33,23 @@ class Estimate:
     """One fault of an answer.
 
     Attributes:
-        label: what it is called; the whole group where no record can tell its members apart.
-        name: where it is, as in `Fault`; of a group the first member.
+        label: its label; that of the whole group where its members are not isolable from each other.
+        name: its place, as in `Fault`; of a group the first member.
         kind: a kind of the dictionary ("bias", "loss", "stuck", "jump", "drift", "frozen", "noise", "spike",
             "schedule").
         candidate: the entry of the dictionary; read from a file, without the matrices of a scheduled change.
         onset: most probable first sample that it changes.
         onset_interval: first and last sample of its interval.
-        onset_censored: whether the record starts (or ends) so near the onset that only the interval of the size is
-            known; the onset is then "at or before" the end of its interval (or "at or after" its start).
+        onset_censored: whether the onset is so near the start (or end) of the record that only the interval of the size
+            is known; it is then "at or before" the end of its interval (or "at or after" its start).
         size: (d,) estimates of the magnitudes: size of a bias, slope of a drift, jump of the state, share lost of a
             loss, share lost and constants added of a stuck actuator, standard deviation of an added noise, reading of a
             frozen sensor, share of a scheduled change; NaN where only the interval is known.
-        size_interval: (d, 2) intervals that account for the search for the onset. Not cut to what is possible: the
-            interval of a share lost may reach above one, and does where all is lost.
+        size_interval: (d, 2) intervals that account for the search for the onset; not clipped: the interval of a share
+            lost may exceed one.
         covariance: (d, d) of the size, with the spread over the onsets.
-        deflection: sigma per sample times root of samples.
-        effect: {output: change that it makes in the end} of a lasting disturbance whose direction was estimated.
+        deflection: norm of the whitened signature.
+        effect: {output: steady-state change} of a lasting disturbance whose direction was estimated.
     """
 
     label: str
@@ -66,7 +66,7 @@ class Estimate:
     effect: Mapping[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        """Say what, since when and how large, with the intervals."""
+        """State label, onset and size, with the intervals."""
         from optid.faults.diagnosis.words import estimate_line
 
         return estimate_line(self)
@@ -78,7 +78,7 @@ class Answer:
 
     Attributes:
         faults: one or several estimates, in the order of their onsets.
-        posterior: probability of this explanation among those considered, magnitudes and onsets summed out.
+        posterior: probability of this explanation among those considered, marginalised over magnitudes and onsets.
         gain: energy that it explains beyond the thresholds of its faults.
     """
 
@@ -92,12 +92,12 @@ class Answer:
 
     @property
     def label(self) -> str:
-        """The names of its faults."""
+        """The labels of its faults, joined."""
         return " + ".join(fault.label for fault in self.faults)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """The names of its faults, one by one."""
+        """The labels of its faults."""
         return tuple(fault.label for fault in self.faults)
 
     def __str__(self) -> str:
@@ -107,16 +107,15 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
-    """Why the best answer is the best.
+    """Evidence that the best answer is the best.
 
     Attributes:
         kind: "exhaustive" (every candidate and onset was tried), "grid" (every candidate at some onsets), "duality gap"
             (of a convex programme), "infeasible healthy" (no healthy record within the bounds of the noise), "flat
-            line" (readings identical to the bit), or "none".
-        value: energy explained beyond the threshold, duality gap, the factor by which the bounds of the noise would
-            have to grow, or the number of equal readings.
-        runner_up_margin: twice the logarithm of the odds of the best answer against the next one, comparable with an
-            energy; inf where there is no other.
+            line" (identical readings), or "none".
+        value: energy explained beyond the threshold, duality gap, the least factor of the bounds of the noise, or the
+            number of identical readings.
+        runner_up_margin: twice the log-odds of the best answer against the next one; inf where there is no other.
         parity_vector: (N, l) multipliers of the proof "infeasible healthy"; None for the other kinds.
     """
 
@@ -128,15 +127,15 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False)
 class Remaining:
-    """What the best answer (or health, where there is none) leaves unexplained.
+    """Residual of the best answer, or of the healthy plant where there is none.
 
     Attributes:
-        energy: sum of squares of the whitened innovations that are left.
-        readings: their number, less the magnitudes estimated; about the energy where the answer is right.
-        p_value: probability of so much, so concentrated in time or so periodic a rest, were the answer right.
-        test: which of the tests is the one that fails: "energy", "period", "burst" or "candidate".
-        direction: (l,) unit vector of the outputs, in their units, along which most of it lies.
-        frequency: cycles per sample where the spectrum of the rest is largest.
+        energy: sum of squares of the residual, whitened.
+        readings: their number, less the estimated magnitudes; about the energy where the answer is right.
+        p_value: smallest p-value of the tests of the residual, corrected for their number.
+        test: the test with this p-value: "energy", "period", "burst" or "candidate".
+        direction: (l,) unit vector of the outputs, in their units, with most of the energy.
+        frequency: peak of the spectrum of the residual, in cycles per sample.
         share: of the energy, within one line of that frequency.
     """
 
@@ -151,12 +150,12 @@ class Remaining:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The record behind a diagnosis, for pictures and for the course of a fault.
+    """Innovations and statistics of a diagnosis, for figures and for the course of a fault.
 
     Attributes:
         r: (N, l) whitened innovations.
-        present: (N, l) whether a reading is there.
-        fitted: (N, l) what the best answer leaves in them; zero where there is none.
+        present: (N, l) whether there is a reading.
+        fitted: (N, l) fit of the best answer; zero where there is none.
         gains: (C, N) energy explained less the threshold, NaN where a candidate is not tested.
         labels: the C candidates.
         search: the scan; None where no candidate has a signature.
@@ -172,7 +171,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What a record says about the health of a plant; `print`, `explain()` or `plot()` it.
+    """Diagnosis of a record; `print`, `explain()` or `plot()` it.
 
     Attributes:
         verdict: one of `VERDICTS`.
@@ -180,19 +179,19 @@ class Diagnosis:
         best: the most probable answer; None where healthy, unknown, or without a certificate.
         candidates: the smallest set of answers that holds `coverage` of the probability, the most probable first; never
             empty when a fault was detected, except for the verdicts "unknown" and "not isolable".
-        p_value: probability of so strong an alarm from a healthy plant.
-        certificate: why the best answer is the best.
-        untestable: {label: why} of candidates that this record can say nothing about.
+        p_value: of the healthy plant.
+        certificate: evidence of the best answer.
+        untestable: {label: why} of candidates that this record cannot test.
         window: samples N of the record.
         false_alarm: probability of an alarm of a healthy plant.
         coverage: nominal probability of the set and of the intervals.
-        method: how it was found.
-        status: what else is to know: one sentence, "" where nothing.
+        method: of the search.
+        status: remarks.
         model: title of the model.
         outputs: names of the outputs.
         dt: sampling time.
-        remaining: what is left unexplained; None where there was no alarm.
-        evidence: the record and the statistics behind it, for the picture; not saved.
+        remaining: residual; None where there was no alarm.
+        evidence: innovations and statistics; not saved.
     """
 
     verdict: str
@@ -215,13 +214,13 @@ class Diagnosis:
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
-            raise StructureError(f"verdict {self.verdict!r}: one of {', '.join(VERDICTS)} is needed.")
+            raise StructureError(f"verdict {self.verdict!r}: it must be one of {', '.join(VERDICTS)}.")
         if self.best is not None and not self.candidates:
             raise StructureError("A best answer belongs to the set of candidates, which is empty.")
 
     @property
     def unique(self) -> bool:
-        """Whether exactly one answer is left."""
+        """Whether the set has exactly one answer."""
         return self.verdict == "faulty" and len(self.candidates) == 1
 
     @property
@@ -251,13 +250,13 @@ class Diagnosis:
         return printed(self)
 
     def explain(self) -> str:
-        """Say in three sentences what was found, how sure that is, and what it rests on."""
+        """State in three sentences the result, its probability and its evidence."""
         from optid.faults.diagnosis.words import explained
 
         return " ".join(explained(self))
 
     def profile(self, prior: str = "auto", **how: Any) -> "Profile":
-        """Estimate the course over time of the most probable fault, whatever kind of course was searched for.
+        """Estimate the course over time of the most probable fault, whatever its kind in the search.
 
         Args:
             prior: as in `optid.faults.profile`.
@@ -269,7 +268,7 @@ class Diagnosis:
         from optid.faults.search.programmes import profile
 
         if self.best is None or len(set(self.best.labels)) != 1:  # one place may change several times
-            raise StructureError("A course is estimated of one fault; this diagnosis names none, or several at once.")
+            raise StructureError("A course is estimated for one fault; this diagnosis names none, or several at once.")
         if self.evidence is None or self.evidence.search is None:
             raise StructureError("The record is not in a diagnosis that was read from a file: diagnose it again.")
         return profile(self.evidence.search, self.best.faults[0].label, prior, **how)
@@ -285,13 +284,13 @@ class Diagnosis:
         return draw(self)
 
     def to_dict(self) -> dict[str, Any]:
-        """Describe it in JSON types, the record and the evidence left out."""
+        """Return it in JSON types, without the evidence."""
         best = None if self.best is None else self.candidates.index(self.best)
         return _described(replace(self, evidence=None)) | {"best": best}
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> "Diagnosis":
-        """Build what `to_dict` described."""
+        """Build a diagnosis from the result of `to_dict`."""
         found = _built(cls, {**content, "best": None})
         if content["best"] is None:
             return found
@@ -300,7 +299,7 @@ class Diagnosis:
         return replace(found, best=found.candidates[int(content["best"])])
 
     def save(self, path: str | Path) -> Path:
-        """Write it to a JSON file, every digit of it.
+        """Write it to a JSON file without loss of precision.
 
         Args:
             path: the file, replaced when it exists.
@@ -326,7 +325,7 @@ def load_diagnosis(path: str | Path) -> Diagnosis:
 
 
 def _described(value: Any) -> Any:
-    """The fields of a result as JSON types; what is not finite, which JSON does not know, by its word."""
+    """The fields of a result as JSON types, numbers that are not finite as words."""
     if is_dataclass(value):
         if isinstance(value, Candidate):
             return {word: _described(getattr(value, word)) for word in CANDIDATE}

@@ -1,11 +1,10 @@
-"""Signatures of an identified model are uncertain: explanations are counted again with what their own traces may err.
+"""Likelihood of an explanation when the signatures of an identified model are uncertain.
 
-The errors delta of the parameters, of covariance P, change the trace S(theta) nu of a fault of size nu, too: J delta
-with J the sensitivity of the trace. So beside a fault the rest has the covariance I + J P J', and the larger the fault,
-the larger the error. With the singular values w and axes U of J P^(1/2) (whitened like the window) all products are
-those of generalised least squares: energies, magnitudes and their covariances at every onset, and the likelihood gains
-the factor of a rest that may be larger along U. Rivals whose traces differ by less than the error of either are then
-about as probable.
+The errors of the parameters, of covariance P, also change the signature S(theta) nu of a fault of size nu, by J times
+the errors with J its sensitivity. The residual then has the covariance I + J P J', which grows with the fault. With the
+singular values and axes U of J P^(1/2) (whitened like the window), energies, magnitudes and their covariances at every
+onset are those of generalised least squares, and the likelihood includes the determinant along U. Candidates whose
+signatures differ by less than these errors are then about equally probable.
 """
 
 from dataclasses import replace
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.diagnosis.posterior import Explanation, bounded_shares, marginal
+from optid.faults.diagnosis.posterior import Explanation, bounded_shares, least_squares, marginal
 from optid.faults.faults import place_of
 from optid.faults.nuisance import ModelUncertainty, Nuisance
 from optid.faults.signatures import Candidate
@@ -23,13 +22,13 @@ if TYPE_CHECKING:
     from optid.faults.search.scanning import Scan
 
 SMALL = 1e-3
-"""Singular values below which an error of a trace counts for nothing."""
+"""Singular values below which an error of a signature is neglected."""
 
 
 def recounted(found: Explanation, uncertainty: ModelUncertainty | None) -> Explanation:
-    """Return an explanation by one candidate with the errors of its trace counted.
+    """Return an explanation by one candidate with the errors of its signature.
 
-    Without uncertain parameters, or without a signature of its own, it is returned as it is.
+    Without uncertain parameters, or without a signature, it is returned unchanged.
     """
     scan = found.search
     if uncertainty is None or not uncertainty.root.shape[1] or len(found.candidates) != 1 or scan is None:
@@ -50,9 +49,7 @@ def recounted(found: Explanation, uncertainty: ModelUncertainty | None) -> Expla
     gram = np.einsum("knd,kne->kde", traces, traces, optimize=True)
     gram -= np.einsum("kqd,q,kqe->kde", shared, drop, shared, optimize=True)
     along_traces = np.einsum("knd,n->kd", traces, r) - shared.transpose(0, 2, 1) @ (drop * along)
-    spread = np.linalg.pinv(gram, rcond=1e-9, hermitian=True)
-    nu = np.einsum("kde,ke->kd", spread, along_traces)
-    energy = np.einsum("kd,kd->k", nu, along_traces)
+    spread, nu, energy, _ = least_squares(gram, along_traces, 1e-9)
     logs = marginal(energy, candidate.dimension) - np.log(tested) + changed
     logs = logs + bounded_shares((candidate,), nu, spread)
     return found._replace(
@@ -61,7 +58,7 @@ def recounted(found: Explanation, uncertainty: ModelUncertainty | None) -> Expla
 
 
 def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidate, onset: int, size: Array) -> Nuisance:
-    """Return what the errors of the parameters leave of the trace of a fault of size (d,), as a covariance."""
+    """Return the covariance of the signature of a fault of size (d,) due to the errors of the parameters."""
     white = scan.whitened
 
     def trace(changed: Any) -> Array:
@@ -81,7 +78,7 @@ def trace_error(scan: "Scan", uncertainty: ModelUncertainty, candidate: Candidat
 
 
 def moved(candidate: Candidate, model: Any) -> Candidate:
-    """Return a candidate of another model: an actuator enters where that model says; directions stay."""
+    """Return a candidate of another model: the columns of an actuator change, directions stay."""
     if not candidate.name.startswith("actuator"):
         return candidate
     into_state, into_output = place_of(model, candidate.name)

@@ -1,17 +1,15 @@
-"""Explanations without a signature: a sensor that stands still, noise that has grown.
+"""Explanations without a signature: frozen sensors and increased noise.
 
-A frozen sensor adds to its reading whatever makes it constant. Impulses of that sensor at all samples from the onset
-on span what that can be, so that one orthogonal factorisation, from the last sample backwards, has the energy explained
-for every onset. As many magnitudes are paid for by the marginal likelihood. The readings themselves must stand still
-within the noise of the sensor.
+The additions of a frozen sensor are spanned by impulses of that sensor at all samples from the onset on, so that one
+orthogonal factorisation, from the last sample backwards, gives the energy explained for every onset. The marginal
+likelihood penalises as many magnitudes. The readings must be constant within the noise of the sensor.
 
-More noise of variance rho at a place adds rho H H' to the covariance of the innovations. Its likelihood is averaged
-over rho on a logarithmic scale.
+Additional noise of variance rho at a place adds rho H H' to the covariance of the innovations. Its likelihood is
+averaged over rho on a logarithmic scale.
 """
 
 import numpy as np
 
-from optid.arrays import Array
 from optid.data.record import Experiment
 from optid.faults.consistency.noise_changes import noise_search
 from optid.faults.consistency.waveforms import waveform_matrix
@@ -20,19 +18,19 @@ from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened
 
 LONGEST = 3000
-"""Readings of a record above which these candidates are not tested."""
+"""Number of readings above which these candidates are not tested."""
 
 STILL = 1.5
-"""Standard deviations of the sensor noise within which a frozen reading stays."""
+"""Largest deviation of a frozen reading, in standard deviations of the sensor noise."""
 
 SHORTEST = 5
-"""Samples that must stand still."""
+"""Least number of constant samples."""
 
 VARIANCES = np.geomspace(1e-2, 1e4, 61)
-"""Variances of an added noise, over the inverse mean eigenvalue of H H'."""
+"""Variances of an added noise, relative to the inverse mean eigenvalue of H H'."""
 
 ONSETS = 12
-"""Onsets of an added noise that are tried over the record, and again around the best of them."""
+"""Onsets of an added noise tried over the record, and again around the best of them."""
 
 
 def without_signature(found: Dictionary) -> tuple[list[Candidate], list[Candidate]]:
@@ -42,7 +40,7 @@ def without_signature(found: Dictionary) -> tuple[list[Candidate], list[Candidat
 
 
 def courses(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
-    """Return the frozen sensors and the noises of a dictionary that may explain a window, and the record behind it."""
+    """Return the explanations of a window by frozen sensors and by noise."""
     if white.r.size > LONGEST:
         return []
     frozen, noises = without_signature(found)
@@ -58,7 +56,10 @@ def _frozen(found: Dictionary, candidate: Candidate, white: Whitened, part: Expe
     readings, there = part.y[:, o], white.present[:, o].astype(bool)
     noise = found.model.noise
     assert noise is not None
-    still = _still(readings, there, STILL * float(np.sqrt(max(noise.R[o, o], 1e-300))))
+    values = np.where(there, readings - np.nanmean(readings), 0.0)
+    counts, sums, squares = (np.cumsum(part[::-1])[::-1] for part in (there, values, values**2))
+    spread = squares / np.maximum(counts, 1) - (sums / np.maximum(counts, 1)) ** 2  # of the readings from a sample on
+    still = (counts >= SHORTEST) & (spread <= STILL**2 * max(noise.R[o, o], 1e-300))
     if not still.any():
         return None
     shown = np.flatnonzero(there)[::-1]  # the latest first
@@ -70,9 +71,9 @@ def _frozen(found: Dictionary, candidate: Candidate, white: Whitened, part: Expe
     dimensions = np.concatenate([[0], np.cumsum(seen_there)])[order]
     logs = np.where(still, marginal(energies, dimensions), -np.inf) - np.log(count)
     kept = np.flatnonzero(logs > logs.max() - NEGLIGIBLE)
-    values = [readings[int(k) :][there[int(k) :]] for k in kept]
-    sizes = np.array([[float(np.mean(v))] for v in values])
-    covariances = np.array([[[float(np.var(v, ddof=1)) / v.size]] for v in values])
+    tails = [readings[int(k) :][there[int(k) :]] for k in kept]
+    sizes = np.array([[float(np.mean(v))] for v in tails])
+    covariances = np.array([[[float(np.var(v, ddof=1)) / v.size]] for v in tails])
 
     def rest(onset: int) -> Explained:
         columns = order[onset]
@@ -82,21 +83,12 @@ def _frozen(found: Dictionary, candidate: Candidate, white: Whitened, part: Expe
     return Explanation((candidate,), kept[:, None], logs[kept], sizes, covariances, energies[kept], course=rest)
 
 
-def _still(readings: Array, there: np.ndarray, limit: float) -> np.ndarray:
-    """Whether (N,) the readings from a sample on stay within so many units of their mean (standard deviation)."""
-    values = np.where(there, readings - np.nanmean(readings), 0.0)
-    counts = np.cumsum(there[::-1])[::-1]
-    sums, squares = (np.cumsum(part[::-1])[::-1] for part in (values, values**2))
-    spread = squares / np.maximum(counts, 1) - (sums / np.maximum(counts, 1)) ** 2
-    return (counts >= SHORTEST) & (np.sqrt(np.maximum(spread, 0.0)) <= limit)
-
-
 def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list[Explanation]:
     """Added noise at every place, over a grid of onsets."""
     from scipy.special import logsumexp
 
     count = len(white.r)
-    last = int(np.flatnonzero(white.present.any(axis=1))[-1])  # later readings are taken out or missing
+    last = int(np.flatnonzero(white.present.any(axis=1))[-1])  # later readings are missing
     onsets = np.unique(np.linspace(0, max(last + 1 - 2 * SHORTEST, 0), ONSETS).astype(int))
     rows: dict[str, list[tuple[float, ...]]] = {}
     prepared = {}
@@ -134,7 +126,7 @@ def _noises(found: Dictionary, noises: list[Candidate], white: Whitened) -> list
         every = np.arange(count)  # an onset that was not tried counts as the nearest that was
         near = np.argmin(np.abs(every[:, None] - k), axis=1)
         logs = logs[near] - np.log(count)
-        logs[k.astype(int)] += 1e-9  # of equals the one that was tried is reported
+        logs[k.astype(int)] += 1e-9  # so that an onset that was tried is reported
 
         def rest(onset: int, label: str = candidate.label, tried: np.ndarray = k, of: np.ndarray = near) -> Explained:
             place, rho = prepared[label, int(tried[of[onset]])]

@@ -1,4 +1,4 @@
-"""Diagnosis of a record: is something wrong, what is it, since when, how large, and how sure is all that?"""
+"""Diagnosis of a record: healthy or faulty, which fault, its onset and size, with probabilities."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,8 +14,14 @@ from optid.faults.diagnosis.courses import LONGEST
 from optid.faults.diagnosis.posterior import estimates
 from optid.faults.diagnosis.ranking import NOTHING, Fit, find
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
-from optid.faults.diagnosis.records import plant_of, record_of, steady_predictor, uncertainty_of
-from optid.faults.diagnosis.standstill import frozen, without_flat_lines
+from optid.faults.diagnosis.records import (
+    frozen,
+    plant_of,
+    record_of,
+    steady_predictor,
+    uncertainty_of,
+    without_flat_lines,
+)
 from optid.faults.nuisance import uncertain_start
 from optid.faults.ranges import outside
 from optid.faults.screening import check_channels
@@ -26,7 +32,7 @@ if TYPE_CHECKING:
     from optid.models import HammersteinSS
 
 KINDS = "bias", "loss", "spike"
-"""Kinds of faults that are thought possible where no dictionary is given."""
+"""Kinds of faults of the default dictionary."""
 
 
 def diagnose(
@@ -35,27 +41,27 @@ def diagnose(
     healthy: Any = None, rescale: bool = False, thresholds: Thresholds | None = None, seed: int | None = 0,
     solver: Any = "auto",
 ) -> Any:
-    """Find out what a record says about the health of a plant.
+    """Diagnose a record: healthy or faulty, which fault, its onset and size.
 
-    Every candidate of the dictionary is tried at every onset; the answer is a set of candidates that holds the true one
-    with the probability `coverage`, with intervals of onset and size that account for the search.
+    Every candidate of the dictionary is tried at every onset; the answer is a set of candidates that contains the true
+    one with probability `coverage`, with intervals of onset and size that account for the search.
 
     Args:
         model: the healthy state-space model with noise covariances, or the fit it comes from.
         data: the record: Data, a pair (u, y) of arrays, or a frame or file with the channels of the model as columns.
-        faults: what may have happened; offsets of every channel, losses of every actuator, outliers of every sensor and
-            a jump of the state by default.
+        faults: the possible faults; offsets of every channel, losses of every actuator, outliers of every sensor and a
+            jump of the state by default.
         false_alarm: probability of an alarm of a healthy plant, over all candidates and onsets.
-        max_faults: faults that may be in one record. Where no single fault fits, outliers and two faults are tried in
-            any case.
+        max_faults: largest number of faults in the record. Where no single fault fits, outliers and two faults are
+            tried in any case.
         method: "exact" (exhaustive search, one or two faults), "sparse" (group-sparse programme), "sparse+polish" (the
             same as a screen before an exact search; three faults and more), or "set" (proof by bounds of the noise).
-        model_uncertainty: "use" (of an identified model: give the fit in place of the model), "ignore", or what
-            `optid.faults.model_uncertainty` returned; by default it is used where a fit is given.
+        model_uncertainty: "use" (of an identified model: pass the fit in place of the model), "ignore", or the result
+            of `optid.faults.model_uncertainty`; by default it is used where a fit is given.
         coverage: nominal probability of the set and of the intervals.
-        robust: bound the influence of outliers (Huber), and take single wild readings out.
-        healthy: a healthy record; the answer is refused where its innovations are not white or not of the size that the
-            model says.
+        robust: bound the influence of outliers (Huber), and remove single outliers.
+        healthy: a healthy record; a model is refused whose innovations there are not white or not of the predicted
+            size.
         rescale: take the scale of the noise from the healthy record.
         thresholds: from `optid.faults.thresholds` for this dictionary and length; simulated by default.
         seed: of the simulation.
@@ -65,8 +71,8 @@ def diagnose(
         A `Diagnosis`; a tuple for several experiments.
 
     Raises:
-        DataError: a record that does not fit the model, a missing input, outputs that look swapped or change their
-            unit, a healthy record with other noise, too few samples.
+        DataError: a record that does not fit the model, a missing input, swapped outputs, a change of unit, a healthy
+            record with other noise, too few samples.
         StructureError: no noise covariances, impossible arguments, "use" without the covariance of the model.
     """
     asked = Question(false_alarm, max_faults, method, coverage, robust, thresholds, seed, solver)
@@ -76,7 +82,7 @@ def diagnose(
     if found.predictor.silent:
         plant, decoupled = found.model, found.predictor
     uncertainty, remark = uncertainty_of(plant, origin, model_uncertainty, decoupled)
-    if steady is None or decoupled is not None:  # the covariance of the former counts what the fit took
+    if steady is None or decoupled is not None:  # an uncertain model has its own scale
         steady = found.predictor if uncertainty is None else uncertainty.predictor
     if steady is not found.predictor:
         found = replace(found, predictor=steady)
@@ -104,7 +110,7 @@ def _dictionary(model: "HammersteinSS", faults: Dictionary | None) -> Dictionary
 
 def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise: Mapping[str, Any], remark: str
           ) -> Diagnosis:
-    """The diagnosis of experiment `number`; `noise` are arguments of `whiten`, and a remark is reported in any case."""
+    """Return the diagnosis of an experiment; `noise` are arguments of `whiten`, and the remark is reported."""
     model = found.model
     part, lines = without_flat_lines(record, number)
     stuck = frozen(lines, found, 2 * model.nx)
@@ -116,7 +122,7 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     if alarm and not fits:
         check_channels(model, record)
     if alarm and fits and model.l == 1:
-        notes.append("With one output only faults of a known course can be told apart.")
+        notes.append("With one output only faults with a known course are isolable.")
     answers = _answers(seen, fits, stuck)
     certificate = ranking.certificate if fits or ranking.certificate.kind == "infeasible healthy" else NOTHING
     if stuck and not fits:
@@ -124,10 +130,13 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     remaining = None
     if alarm:
         remaining = ranking.fits[0].remaining if ranking.fits else seen.healthy
+    verdict = "untestable" if seen.lost and not seen.tested else "unknown" if alarm else "healthy"
+    if alarm and model.l == 1 and any(c.kind == "frozen" for c in seen.dictionary.candidates):
+        verdict = "not isolable"
     white, search = seen.whitened, seen.search
     fitted = fits[0].fitted if fits else np.zeros_like(white.r)
     return Diagnosis(
-        verdict="faulty" if stuck or fits else _without_answer(seen, alarm),
+        verdict="faulty" if stuck or fits else verdict,
         detected=bool(alarm or stuck),
         best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
         p_value=0.0 if stuck else first.p_value, certificate=certificate,
@@ -138,30 +147,22 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     )
 
 
-def _without_answer(seen: RecordSearch, alarm: bool) -> str:
-    """The verdict where there is no answer."""
-    found, nothing = seen.dictionary, bool(seen.lost) and not seen.tested
-    if alarm and found.model.l == 1 and any(c.kind == "frozen" for c in found.candidates):
-        return "not isolable"
-    return "untestable" if nothing else "unknown" if alarm else "healthy"
-
-
 def _not_searched(seen: RecordSearch) -> dict[str, str]:
-    """The candidates that no search covers, and why."""
+    """Return the candidates that are not tested, and why."""
     found, model = seen.dictionary, seen.dictionary.model
     lost: dict[str, str] = {}
     if model.feedback or np.any(model.L):
-        why = "the model feeds readings back into its state, so that a wrong one changes the plant"
+        why = "the model feeds readings back into its state, so that a faulty one changes the plant"
         lost = {c.label: why for c in found.candidates if c.kind == "loss" and not c.columns}
     if seen.whitened.r.size > LONGEST:
         why = f"the record has more than {LONGEST} readings, too many for this kind: cut it"
         return lost | {c.label: why for c in found.candidates if c.kind in ("frozen", "noise")}
-    why = "with one output a fault of any course explains every record"
+    why = "with one output a fault of arbitrary course explains every record"
     return lost | {c.label: why for c in found.candidates if c.kind == "frozen" and model.l == 1}
 
 
 def _answers(seen: RecordSearch, fits: tuple[Fit, ...], stuck: tuple[Estimate, ...]) -> tuple[Answer, ...]:
-    """The set of answers, sensors that stand still in each of them."""
+    """Return the set of answers, each with the sensors that repeat one reading."""
     model, result = seen.dictionary.model, []
     if not fits and stuck:
         return (Answer(stuck, 1.0, float("inf")),)
@@ -178,4 +179,4 @@ def _outliers(seen: RecordSearch) -> str:
         return ""
     listed = ", ".join(f"{seen.record.outputs[o]} at sample {k}" for k, o in seen.outliers[:5])
     more = f" and {len(seen.outliers) - 5} more" if len(seen.outliers) > 5 else ""
-    return f"Taken out as outliers: {listed}{more}."
+    return f"Removed as outliers: {listed}{more}."

@@ -1,9 +1,9 @@
-"""Searches that wild readings do not lead astray.
+"""Robust search in the presence of outliers.
 
-Two things are done. A single reading that a spike explains better than any other candidate is taken out, and the
-predictor run without it, so that it leaves no trace in later innovations. What remains is bounded: with the best answer
-so far, what it leaves of an innovation beyond `BOUND` is cut to it, and the search is repeated on the sum. That is the
-algorithm of pseudo-values for the M-estimate of Huber (Huber, Robust Statistics, 1981, section 7.8).
+A single reading that a spike explains better than any other candidate is removed, and the predictor is run without it,
+so that later innovations are not affected. The residuals of the best candidates are then clipped at `BOUND`, and the
+search is repeated on fit plus clipped residuals: the algorithm of pseudo-values for the M-estimate of Huber (Robust
+Statistics, 1981, section 7.8).
 """
 
 from collections.abc import Callable
@@ -19,37 +19,33 @@ from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Whitened
 
 BOUND = 2.5
-"""Standard deviations beyond which an innovation counts no more than that."""
+"""Standard deviations at which residuals are clipped."""
 
 WILD = 4.5
-"""Standard deviations that a spike must have to be taken out."""
+"""Standard deviations from which on a spike is removed."""
 
 MOST = 0.05
-"""Share of the readings that may be taken out."""
+"""Largest share of the readings removed."""
 
 ROUNDS = 20
-"""Repetitions of the search on bounded innovations at most."""
+"""Largest number of searches on clipped innovations."""
 
 AT_ONCE = 4
-"""Faults whose signatures are kept from being bounded."""
+"""Largest number of faults whose signatures are not clipped."""
 
 LIKELY = 5.0
-"""Logarithm of the likelihood beside health that such a fault has at least."""
+"""Least log-likelihood ratio of such a fault against the healthy plant."""
 
 
 def cleaned(
     found: Dictionary, part: Experiment, whitened_of: Callable[[Experiment], Whitened]
 ) -> tuple[Scan, Experiment, tuple[tuple[int, int], ...]]:
-    """Search a record without the influence of wild readings.
-
-    Returned are the search of the bounded innovations, the record without the readings that were taken out, and these
-    (sample, output).
-    """
+    """Return the search of the clipped innovations, the record without outliers, and these as (sample, output)."""
     wide, taken, whitened = with_spikes(found), [], whitened_of(part)
     while len(taken) < MOST * whitened.present.sum():
         search = scan(wide, whitened, part.u)
         reading = _wildest(search)
-        if reading is None:  # behind a fault, perhaps
+        if reading is None:  # perhaps hidden by a fault
             reading = _wildest(scan(wide, replace(whitened, r=whitened.r - _fitted(search)), part.u))
         if reading is None:
             break
@@ -62,7 +58,7 @@ def cleaned(
 
 
 def _likeliest(search: Scan) -> tuple[int, int, float]:
-    """The likeliest candidate, its onset, and the logarithm of its likelihood beside health."""
+    """The likeliest candidate, its onset, and its log-likelihood ratio against the healthy plant."""
     statistic = np.nan_to_num(search.statistic, nan=-np.inf)
     logs = [float(marginal(row.max(), c.dimension)) for row, c in zip(statistic, search.dictionary.candidates)]
     c = int(np.argmax(logs))
@@ -70,7 +66,7 @@ def _likeliest(search: Scan) -> tuple[int, int, float]:
 
 
 def _wildest(search: Scan) -> tuple[int, int] | None:
-    """The reading that a spike explains better than any candidate of another kind explains anything."""
+    """The reading whose spike is likelier than any candidate of another kind."""
     c, onset, _ = _likeliest(search)
     candidate = search.dictionary.candidates[c]
     if candidate.kind != "spike" or not search.statistic[c, onset] >= WILD**2:
@@ -79,14 +75,14 @@ def _wildest(search: Scan) -> tuple[int, int] | None:
 
 
 def _fitted(search: Scan) -> Array:
-    """What the likeliest candidate leaves in the innovations."""
+    """Fit of the likeliest candidate to the innovations."""
     c, onset, _ = _likeliest(search)
     candidate = search.dictionary.candidates[c]
     return np.asarray(search.signature(candidate, onset) @ search.estimate(candidate, onset).nu)
 
 
 def with_spikes(found: Dictionary) -> Dictionary:
-    """Return a dictionary that has the outliers of all sensors, behind its own candidates."""
+    """Return the dictionary with the outliers of all sensors appended."""
     known = {c.name for c in found.candidates if c.kind == "spike"}
     more = [replace(candidate_of(found.model, f"sensor:{name}", "spike"), bounded_deflection=True)
             for name in found.model.outputs if f"sensor:{name}" not in known]
@@ -96,7 +92,7 @@ def with_spikes(found: Dictionary) -> Dictionary:
 def _bounded(found: Dictionary, whitened: Whitened, u: Array) -> Scan:
     search, before = scan(found, whitened, u), None
     for _ in range(ROUNDS):
-        fitted = np.zeros_like(whitened.r)  # the likeliest candidates, one after the other, are not bounded
+        fitted = np.zeros_like(whitened.r)  # of the likeliest candidates, which is not clipped
         rest = search
         for _ in range(AT_ONCE):
             if _likeliest(rest)[2] < LIKELY:

@@ -1,4 +1,4 @@
-"""A diagnosis as one HTML page that carries its figure with it."""
+"""Self-contained HTML page of a diagnosis."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from optid.faults.page import write_page
 from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "faulty": "bad"}
-"""How a verdict looks; the others are neither good nor bad."""
+"""Colour of a verdict; the others are neutral."""
 
 
 def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str = "") -> Path:
@@ -18,39 +18,26 @@ def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str 
         StructureError: a diagnosis read from a file: the record is not in it.
         OSError: the file cannot be written.
     """
-    best = ", what the best answer leaves in them, and its onset with the interval" if found.best is not None else ""
-    several = "; the probability of every answer in the set" if len(found.candidates) > 1 else ""
-    caption = (
-        f"Whitened innovations of every output{best}; the energy that every candidate explains by its onset, beyond "
-        f"the threshold at which a healthy plant alarms{several}."
-    )
-    return write_page(
-        path, f"Diagnosis: {found.verdict}", (record, found.model, f"{found.window} samples"),
-        headings=("Answers", "What the record shows", "What the answer rests on"), draw=found.plot, caption=caption,
-        cards=_cards(found), tables=[_answers(found)] * bool(found.candidates), facts=_evidence(found),
-        tone=TONES.get(found.verdict, "fair"), word=words.headline(found),
-        sentences=words.explained(found, notes=False),
-        notes=[*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())],
-        call=command or "optid.faults.diagnose(model, data)", text=str(found),
-    )
-
-
-def _cards(found: Diagnosis) -> list[tuple[str, str]]:
-    cards = [("p-value of health", words.probability_words(found.p_value))]
-    if found.best is not None:
-        fault = found.best.faults[0]
+    percent, best = f"{100 * found.coverage:g} %", found.best
+    p_value = "p-value of health", words.probability_words(found.p_value)
+    cards: list[tuple[str, str]] = [p_value]
+    rows: list[tuple[str, ...]] = []
+    caption = "Whitened innovations of every output"
+    facts = [("Method", found.method), ("False alarms", f"{found.false_alarm:g} of healthy records"), p_value]
+    if best is not None:
+        caption += ", the fit of the best answer, and its onset with the interval"
         cards += [
-            ("probability of the best answer", f"{found.best.posterior:.3f}"),
-            (f"answers in the set of {100 * found.coverage:g} %", str(len(found.candidates))),
-            ("deflection", number(fault.deflection, 3)),
+            ("probability of the best answer", f"{best.posterior:.3f}"),
+            (f"answers in the set of {percent}", str(len(found.candidates))),
+            ("deflection", number(best.faults[0].deflection, 3)),
         ]
+    caption += "; the energy that every candidate explains, by its onset, beyond its threshold"
+    caption += "; the probability of every answer in the set." if len(found.candidates) > 1 else "."
+    if found.certificate.kind != "none":
+        facts.append(("Proof", words.certificate_words(found).removeprefix("proof: ")))
     if found.remaining is not None:
-        cards.append(("p-value of what is left", words.probability_words(found.remaining.p_value)))
-    return cards
-
-
-def _answers(found: Diagnosis) -> Table:
-    rows = []
+        cards.append(("p-value of the residual", words.probability_words(found.remaining.p_value)))
+        facts.append(("Left unexplained", words.remaining_words(found).removeprefix("left unexplained: ")))
     for place, answer in enumerate(found.candidates, start=1):
         for i, fault in enumerate(answer.faults):
             first, *more = words.size_words(fault)
@@ -60,22 +47,17 @@ def _answers(found: Diagnosis) -> Table:
                 number(fault.deflection, 3), first,
             ))
             rows += [("", "", "", "", magnitude) for magnitude in more]
-    note = (
-        f"The smallest set that holds {100 * found.coverage:g} % of the probability. Intervals in brackets hold "
-        f"{100 * found.coverage:g} %, the search for the onset included."
+    table = Table(
+        "Answers", ("fault", "probability", "onset", "deflection", "magnitude"), rows,
+        f"The smallest set with {percent} of the probability. Intervals in brackets have a coverage of {percent}, the "
+        "search for the onset included.",
     )
-    return Table("Answers", ("fault", "probability", "onset", "deflection", "magnitude"), rows, note)
-
-
-def _evidence(found: Diagnosis) -> list[tuple[str, str]]:
-    facts = [
-        ("Method", found.method),
-        ("False alarms", f"{found.false_alarm:g} of healthy records"),
-        ("p-value of health", words.probability_words(found.p_value)),
-    ]
-    if found.certificate.kind != "none":
-        facts.append(("Proof", words.certificate_words(found).removeprefix("proof: ")))
-    if found.remaining is not None:
-        facts.append(("Left unexplained", words.remaining_words(found).removeprefix("left unexplained: ")))
-    return facts
-
+    return write_page(
+        path, f"Diagnosis: {found.verdict}", (record, found.model, f"{found.window} samples"),
+        headings=("Answers", "Innovations and statistics", "Evidence"), draw=found.plot, caption=caption,
+        cards=cards, tables=[table] * bool(found.candidates), facts=facts,
+        tone=TONES.get(found.verdict, "fair"), word=words.headline(found),
+        sentences=words.explained(found, notes=False),
+        notes=[*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())],
+        call=command or "optid.faults.diagnose(model, data)", text=str(found),
+    )

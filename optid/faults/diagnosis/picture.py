@@ -1,4 +1,4 @@
-"""The evidence of a diagnosis as a picture."""
+"""Figure of a diagnosis."""
 
 from typing import Any, cast
 
@@ -13,10 +13,10 @@ from optid.faults.diagnosis.words import headline
 from optid.show.panels import BLUE, GREEN, GRID, INK, MUTED, ORANGE, plain, shorten, styled, thinned
 
 WIDE = 26
-"""Characters of a name beside a panel."""
+"""Characters of a label beside a panel."""
 
 ROWS = 12
-"""Answers drawn at most."""
+"""Largest number of answers drawn."""
 
 
 @styled
@@ -47,7 +47,7 @@ def draw(found: Diagnosis) -> Figure:
 
 
 def _innovations(ax: Axes, found: Diagnosis, seen: Evidence, o: int, name: str) -> None:
-    """One output: innovations in units of their standard deviation, and what the answer leaves in them."""
+    """Draw the whitened innovations of one output and the fit of the best answer."""
     k = np.arange(len(seen.r), dtype=float)
     there = seen.present[:, o]
     r = np.where(there, seen.r[:, o], np.nan)
@@ -56,7 +56,7 @@ def _innovations(ax: Axes, found: Diagnosis, seen: Evidence, o: int, name: str) 
         ax.plot(*thinned(k, seen.fitted[:, o]), color=ORANGE, label="signature of the best answer")
     ax.axhspan(-2, 2, color=GRID, alpha=0.55, linewidth=0)
     _onsets(ax, found)
-    title = "whitened innovations, mostly within 2 when healthy" if o == 0 else ""
+    title = "whitened innovations, mostly within 2 for a healthy plant" if o == 0 else ""
     ax.set(ylabel=plain(shorten(name)), xlim=(0, len(r) - 1), title=title)
     if o == 0 and seen.fitted.any():
         ax.legend(loc="upper left", ncols=3)
@@ -72,7 +72,7 @@ def _onsets(ax: Axes, found: Diagnosis) -> None:
 
 
 def _heat(figure: Figure, ax: Axes, found: Diagnosis, seen: Evidence) -> None:
-    """Energies explained beyond the thresholds, over onset and candidate."""
+    """Draw the energies explained beyond the thresholds, over onset and candidate."""
     gains: Array = seen.gains if seen.labels else np.full((1, len(seen.r)), np.nan)
     labels = [plain(shorten(label, WIDE)) for label in seen.labels] or ["no candidate is tested"]
     extent = (-0.5, gains.shape[1] - 0.5, len(labels) - 0.5, -0.5)

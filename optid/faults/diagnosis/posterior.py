@@ -1,14 +1,13 @@
-"""How probable every explanation is, with its magnitudes and its onsets summed out.
+"""Posterior probabilities of explanations, marginalised over magnitudes and onsets.
 
-The prior of the magnitudes nu of an explanation with Gram matrix G is N(0, g G^-1), in words: its deflection in every
-direction is of the size sqrt(g). Then the marginal likelihood has the closed form (1 + g)^(-d/2) exp(g / (1 + g) l / 2)
-beside that of health, with l the energy explained (marginalised likelihood ratio, Gustafsson 1995). No size is known
-beforehand, so that it is averaged over several g. More magnitudes are paid for by themselves: a loss is preferred to a
-stuck actuator that explains as much.
+The prior of the magnitudes nu of an explanation with Gram matrix G is N(0, g G^-1), a deflection of about sqrt(g) in
+every direction. The marginal likelihood ratio to the healthy plant is (1 + g)^(-d/2) exp(g / (1 + g) l / 2) with the
+energy l explained (Gustafsson 1995), averaged over several g, since no size is known beforehand. It penalises the
+number of magnitudes: a loss is preferred to a stuck actuator that explains as much.
 
-Least squares at the best onset gives intervals that are too short, because the best onset is the one at which noise
-helped. So the size is a mixture of the estimates at all onsets, each with the posterior probability of the onset; its
-interval is cut from the tails of the mixture. Measured in `benchmarks/faults/intervals.py`.
+Least squares at the best onset gives intervals that are too short, because that onset is selected by the noise. The
+size therefore has as its distribution the mixture of the estimates at all onsets, weighted by the posterior of the
+onset; the interval cuts its tails. Measured in `benchmarks/faults/intervals.py`.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,23 +27,22 @@ SPREADS = 2.0, 4.0, 9.0, 25.0, 100.0, 400.0
 """Squared deflections of the prior."""
 
 NEGLIGIBLE = 18.0
-"""Onsets whose probability is e to this power below the largest are left out."""
+"""Logarithm of the ratio to the largest probability below which onsets are left out."""
 
 MODEL_ERROR = 0.02
-"""Probability that a share lost outside [0, 1] is an error of the model, and not a reason against the loss."""
-
+"""Probability that a share lost outside [0, 1] is due to an error of the model."""
 
 HALVINGS = 60
-"""Steps of the search for a quantile of a mixture."""
+"""Bisections for a quantile of a mixture."""
 
 
 class Explained(NamedTuple):
-    """What an explanation makes of a window.
+    """Fit of an explanation to a window.
 
     Attributes:
-        fitted: (N, l) what it leaves in the innovations.
-        rest: (N, l) what is then left: white noise, where it is right.
-        magnitudes: numbers that were estimated for it.
+        fitted: (N, l) of the innovations.
+        rest: (N, l) residual, white noise where the explanation is right.
+        magnitudes: number of estimated magnitudes.
     """
 
     fitted: Array
@@ -53,7 +51,7 @@ class Explained(NamedTuple):
 
 
 class Explanation(NamedTuple):
-    """One set of candidates over the onsets that may be.
+    """One set of candidates over its possible onsets.
 
     Attributes:
         candidates: one or several.
@@ -62,10 +60,10 @@ class Explanation(NamedTuple):
         sizes: (K, d) magnitudes of all candidates by least squares, one after the other.
         covariances: (K, d, d) for the onsets of the row.
         energies: (K,) energy explained, or twice the gain in log-likelihood.
-        search: that the signatures are from; None for candidates without one.
-        course: in place of signatures, what the candidates make of the window for an onset.
-        error: of the trace, which an identified model knows only so well.
-        entry: the candidate of the search behind candidates that are special cases of it.
+        search: with the signatures; None for candidates without one.
+        course: in place of signatures, the fit to the window for an onset.
+        error: of the signature, due to the uncertainty of an identified model.
+        entry: the candidate of the search of which the candidate is a special case.
     """
 
     candidates: tuple[Candidate, ...]
@@ -80,7 +78,7 @@ class Explanation(NamedTuple):
     entry: Candidate | None = None
 
     def likely(self) -> "Explanation":
-        """Return it without onsets of negligible probability."""
+        """Return the explanation without onsets of negligible probability."""
         kept = self.logs > self.logs.max() - NEGLIGIBLE
         return self._replace(
             onsets=self.onsets[kept], logs=self.logs[kept], sizes=self.sizes[kept],
@@ -88,7 +86,7 @@ class Explanation(NamedTuple):
         )
 
     def made(self) -> Explained:
-        """Return what the most probable row makes of the window."""
+        """Return the fit of the most probable onsets to the window."""
         onsets, sizes = self.onsets[self.best], self.sizes[self.best]
         if self.course is not None:
             return self.course(int(onsets[0]))
@@ -117,7 +115,7 @@ class Explanation(NamedTuple):
 
 
 def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
-    """Return the logarithm of the likelihood beside that of health, so many magnitudes integrated out.
+    """Return the marginal log-likelihood ratio to the healthy plant.
 
     Args:
         energies: energy explained, any shape.
@@ -131,7 +129,7 @@ def marginal(energies: Array, dimension: int | np.ndarray) -> Array:
 
 
 def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
-    """Return one candidate of a search at all its onsets; None where it is tested at none."""
+    """Return the explanation by one candidate of a search; None where it is not tested."""
     c = scan.index(candidate)
     row = scan.statistic[c]
     onsets = np.flatnonzero(~np.isnan(row))
@@ -146,7 +144,7 @@ def single(scan: "Scan", candidate: Candidate) -> Explanation | None:
 
 
 def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int], reach: int) -> Explanation:
-    """Return several candidates of a search over the onsets within reach of those at which they explain most."""
+    """Return the explanation by several candidates, over the onsets within reach of the given ones."""
     ranges = []
     for candidate, onset in zip(candidates, onsets):
         row = scan.statistic[scan.index(candidate)]
@@ -170,7 +168,7 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
             b = slice(edges[j], edges[j + 1])
             cross = np.tensordot(first, second, ([1], [1]))[rows[i], :, rows[j], :]
             gram[:, a, b], gram[:, b, a] = cross, np.swapaxes(cross, 1, 2)
-    covariances, sizes, energies, ranks = _solved(gram, correlation)
+    covariances, sizes, energies, ranks = least_squares(gram, correlation)
     prior = sum(np.log(max(np.sum(~np.isnan(scan.statistic[scan.index(c)])), 1)) for c in candidates)
     logs = marginal(energies, total) - prior
     apart = ranks == total  # elsewhere one of them explains as much
@@ -184,11 +182,11 @@ def several(scan: "Scan", candidates: Sequence[Candidate], onsets: Sequence[int]
     return Explanation(tuple(candidates), where, logs, sizes, covariances, energies, scan).likely()
 
 
-def _solved(gram: Array, correlation: Array) -> tuple[Array, Array, Array, np.ndarray]:
-    """Covariances, least-squares magnitudes, energies and ranks of many small systems."""
+def least_squares(gram: Array, correlation: Array, floor: float = 1e-6) -> tuple[Array, Array, Array, np.ndarray]:
+    """Return covariances, magnitudes, energies and ranks of systems (K, d, d), (K, d) by least squares."""
     scale = np.sqrt(np.maximum(np.einsum("kii->ki", gram), 1e-300))
     values, axes = np.linalg.eigh(gram / (scale[:, :, None] * scale[:, None, :]))
-    there = values > 1e-6
+    there = values > floor
     inverse = np.where(there, 1 / np.where(there, values, 1.0), 0.0)
     covariances = np.einsum("kij,kj,klj->kil", axes, inverse, axes) / (scale[:, :, None] * scale[:, None, :])
     sizes = np.einsum("kij,kj->ki", covariances, correlation)
@@ -196,7 +194,7 @@ def _solved(gram: Array, correlation: Array) -> tuple[Array, Array, Array, np.nd
 
 
 def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: Array) -> Array:
-    """Return the logarithm (K,) of what it changes that a share lost lies between 0 and 1."""
+    """Return the change (K,) of the log-likelihood because a share lost lies between 0 and 1."""
     change = np.zeros(len(sizes))
     first = 0
     for candidate in candidates:
@@ -207,7 +205,7 @@ def bounded_shares(candidates: Sequence[Candidate], sizes: Array, covariances: A
 
 
 def share_bound(share: Array, variance: Array) -> Array:
-    """Return the factor (K,) of the likelihood because a share lost, estimated with a variance, is in [0, 1]."""
+    """Return the factor (K,) of the likelihood because a share lost, estimated with a variance, lies in [0, 1]."""
     from scipy.special import ndtr
 
     std = np.sqrt(np.maximum(variance, 1e-300))
@@ -216,14 +214,14 @@ def share_bound(share: Array, variance: Array) -> Array:
 
 
 def share_prior(std: Array) -> Array:
-    """Return the probability (K,) that the prior gives to shares from 0 to 1."""
+    """Return the prior probability (K,) of shares from 0 to 1."""
     from scipy.special import ndtr
 
     return ndtr(1 / (std * np.sqrt(np.mean(SPREADS)))) - 0.5
 
 
 def smallest_set(posterior: Array, coverage: float) -> np.ndarray:
-    """Return the fewest entries that hold the probability asked for, the most probable first."""
+    """Return the smallest set of entries with the given probability, the most probable first."""
     order = np.argsort(-posterior, kind="stable")
     enough = int(np.searchsorted(np.cumsum(posterior[order]), coverage * (1 - 1e-12))) + 1
     return order[:enough]
@@ -232,7 +230,7 @@ def smallest_set(posterior: Array, coverage: float) -> np.ndarray:
 def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tuple[Estimate, ...]:
     """Return the faults of an explanation with intervals of this coverage, in the order of their onsets.
 
-    Onsets nearer than `edge` to the start or the end of the window, of N samples, leave the size to its interval.
+    For onsets within `edge` samples of the start or end of the window, of N samples, the size is NaN.
     """
     weights, best, first = found.weights, found.best, 0
     result = []
@@ -258,7 +256,7 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
 
 
 def onset_range(onsets: np.ndarray, weights: Array, coverage: float, best: int) -> tuple[int, int]:
-    """Return the hull of the most probable onsets (K,) of these weights that hold the coverage, with the best one.
+    """Return the hull of the most probable onsets (K,) with this coverage and of the best one.
 
     Onsets may be repeated, where other faults have several.
     """

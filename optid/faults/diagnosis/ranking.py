@@ -1,4 +1,4 @@
-"""What may have happened: explanations by one or several candidates, ranked by probability, and what they leave."""
+"""Explanations of a record by one or several candidates, ranked by probability, with their residuals."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,35 +22,35 @@ if TYPE_CHECKING:
     from optid.faults.search.sparse import SparseResult
 
 REACH = {1: 40, 2: 10, 3: 5, 4: 3}
-"""Onsets on both sides of the best ones over which so many faults are summed; two for more faults."""
+"""Onsets on both sides of the best ones that are summed, by the number of faults; two for more faults."""
 
 FAR = 30.0
-"""Choices of candidates whose gain is smaller than the best by this are left out."""
+"""Difference to the best gain beyond which choices of candidates are left out."""
 
 ATOMS = 8_000
 """Candidates times onsets beyond which two faults are searched on a grid of onsets."""
 
 NEAR, NEAR_OF_MANY = 10, 4
-"""Onsets on both sides of those of the programme that are searched exactly, for up to two faults and for more."""
+"""Onsets searched exactly on both sides of those of the programme, for up to two faults and for more."""
 
 STRETCH = 100
-"""Samples of the stretch for which the noise is bounded: the proof for a part is one for the record."""
+"""Samples of the section with bounded noise, whose proof holds for the record."""
 
 BEFORE = 25
-"""Samples of it before the onset that explains most."""
+"""Samples of this section before the best onset."""
 
 NOTHING = Certificate("none", float("nan"))
 
 
 class Fit(NamedTuple):
-    """An explanation and how well it fits.
+    """An explanation with its fit.
 
     Attributes:
         explanation: candidates over their onsets.
         probability: posterior.
         gain: energy explained at the best onsets, less the thresholds.
-        fitted: (N, l) what it leaves in the innovations.
-        remaining: what it does not explain.
+        fitted: (N, l) fit to the innovations.
+        remaining: residual.
     """
 
     explanation: Explanation
@@ -61,12 +61,12 @@ class Fit(NamedTuple):
 
 
 class Ranking(NamedTuple):
-    """What may have happened.
+    """The set of explanations.
 
     Attributes:
-        fits: the smallest set with the probability asked for, the most probable first.
-        odds: twice the logarithm of the odds of the first against the next explanation, in the set or not.
-        certificate: its proof.
+        fits: the smallest set with the required probability, the most probable first.
+        odds: twice the log-odds of the first against the next explanation, in the set or not.
+        certificate: of the first.
         note: a remark for the report.
     """
 
@@ -77,16 +77,16 @@ class Ranking(NamedTuple):
 
     @property
     def explains(self) -> bool:
-        """Whether what one of them leaves may be the noise of a healthy plant."""
+        """Whether one of the residuals agrees with the noise of a healthy plant."""
         return any(fit.remaining.p_value > UNFIT for fit in self.fits)
 
 
 def find(seen: RecordSearch) -> tuple[RecordSearch, Ranking, bool]:
-    """Return what the method asked for finds, with the search it rests on, and whether the record is not healthy."""
+    """Return the search, its ranking by the chosen method, and whether there is an alarm."""
     alarm, unproved = seen.p_value <= seen.asked.false_alarm, ""
     if seen.asked.method == "set":
         ranking, proved = _by_bounds(seen)
-        if proved and not ranking.explains:  # no single fault: what is proved is that something is wrong
+        if proved and not ranking.explains:  # a fault is proved, but no single one fits
             seen, other = _explained(seen)
             return seen, ranking._replace(fits=other.fits, note=f"{ranking.note} {other.note}".strip()), True
         if proved or not alarm:
@@ -101,7 +101,7 @@ def find(seen: RecordSearch) -> tuple[RecordSearch, Ranking, bool]:
 
 
 def _explained(seen: RecordSearch) -> tuple[RecordSearch, Ranking]:
-    """What may have happened: by the candidates, with outliers beside them, by two faults."""
+    """Explain a record by the candidates, with outliers beside them, by two faults."""
     most = seen.asked.max_faults
     ranking = _exact(seen, most)
     if ranking.explains or seen.search is None or not seen.dictionary.unknown:
@@ -135,7 +135,7 @@ def _exact(seen: RecordSearch, count: int) -> Ranking:
 
 
 def singles(seen: RecordSearch) -> list[Explanation]:
-    """Return every candidate that is tested, and what is thought possible beside them, over their onsets."""
+    """Return the explanations by every tested candidate and by those beside the dictionary."""
     lost = {label.removesuffix(" loss") for label in seen.lost}
     able = [(seen.search, c, 0.0) for c in seen.tested]
     if seen.beside is not None:
@@ -151,7 +151,7 @@ def singles(seen: RecordSearch) -> list[Explanation]:
 
 
 def _several(seen: RecordSearch, found: SubsetSearch, reach: int = 1) -> list[Explanation]:
-    """Choices of several candidates whose gain comes near that of the best, over the onsets around them."""
+    """Explanations by several candidates with a gain near the best, over the onsets around them."""
     near = [s for s in found.ranked if len(s.labels) > 1 and not set(seen.lost) & set(s.labels)]
     return [_around(seen, s.labels, s.onsets, reach) for s in near if s.gain > near[0].gain - FAR]
 
@@ -164,7 +164,7 @@ def _around(seen: RecordSearch, labels: Sequence[str], onsets: Sequence[int], re
 
 
 def ranked(seen: RecordSearch, explanations: Sequence[Explanation]) -> Ranking:
-    """Return the smallest set of explanations that holds the probability asked for."""
+    """Return the smallest set of explanations with the required probability."""
     if not explanations:
         return Ranking()
     named: dict[tuple[str, ...], list[Explanation]] = {}
@@ -199,7 +199,7 @@ def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Fi
 
 
 def _by_programme(seen: RecordSearch) -> Ranking:
-    """Let the group-sparse programme choose onsets, and candidates too where nothing is polished.
+    """Choose onsets by the group-sparse programme, and without polishing candidates, too.
 
     Raises:
         StructureError: no candidate with a signature, too many subsets.
@@ -207,7 +207,7 @@ def _by_programme(seen: RecordSearch) -> Ranking:
     asked, search, limits = seen.asked, seen.search, seen.limits
     if search is None or limits is None:
         raise StructureError(
-            f"method={asked.method!r} needs a candidate with a signature: add the kind 'bias', or use method='exact'."
+            f"method={asked.method!r} requires a candidate with a signature: add kind 'bias', or use method='exact'."
         )
     try:
         result: SparseResult = solved("fault.signature", search, limits, solver=asked.solver)
@@ -231,7 +231,7 @@ def _by_programme(seen: RecordSearch) -> Ranking:
 
 
 def _by_bounds(seen: RecordSearch) -> tuple[Ranking, bool]:
-    """Name what bounds of the noise do not exclude, and say whether they prove that the plant is not healthy."""
+    """Rank the candidates that bounds of the noise do not exclude; return whether they prove a fault, too."""
     count = len(seen.whitened.r)
     gains = np.nan_to_num(seen.gains, nan=-np.inf)
     peak = int(np.argmax(gains.max(axis=0))) if gains.size else 0

@@ -1,4 +1,4 @@
-"""The search of one experiment: innovations, statistics, thresholds, and what the record cannot tell."""
+"""Search of one experiment: innovations, statistics, thresholds, and untestable candidates."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -27,24 +27,24 @@ if TYPE_CHECKING:
 METHODS = "exact", "sparse", "sparse+polish", "set"
 
 UNKNOWN_SHARE = 0.1
-"""Share of the false alarms that goes to departures from health that no candidate describes."""
+"""Share of the false-alarm probability for deviations outside the dictionary."""
 
 COURSE_SHARE = 0.1
-"""Share that goes to candidates without a signature, where there are some."""
+"""Share for candidates without a signature, where there are some."""
 
 SIMULATED = 2_000_000
-"""Samples of all simulated windows together, above which fewer windows are simulated."""
+"""Total of samples above which fewer windows are simulated."""
 
 LEAST = 4.0
-"""Deflection that a complete loss must have beside a constant offset, for its record to say anything."""
+"""Least deflection of a complete loss beside a constant offset that is testable."""
 
 DRAWS, MOST_DRAWS = 20_000, 500_000
-"""Simulated windows behind the thresholds of a short record, and the most that are simulated."""
+"""Simulated windows for the thresholds of a short record, and the largest number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """What is asked of a record; the attributes are arguments of `optid.faults.diagnose`."""
+    """Options of a diagnosis; the attributes are arguments of `optid.faults.diagnose`."""
 
     false_alarm: float
     max_faults: int
@@ -63,8 +63,7 @@ class Question:
         check_integer(self.max_faults, "max_faults")
         if self.method == "exact" and self.max_faults > 2:
             raise StructureError(
-                f"max_faults={self.max_faults}: the exact search covers one or two faults; the number of triples is "
-                "out of reach. Use method='sparse+polish'."
+                f"max_faults={self.max_faults}: the exact search is limited to two faults. Use method='sparse+polish'."
             )
 
 
@@ -73,19 +72,19 @@ class RecordSearch:
     """One experiment, searched; `search_record` makes it.
 
     Attributes:
-        record: that the experiment belongs to.
-        given: the experiment, without readings that stand still.
+        record: of the experiment.
+        given: the experiment, without flat lines.
         dictionary: the candidates.
-        asked: what is asked.
+        asked: options.
         noise: arguments of `whiten`: uncertainty and scale.
-        part: the experiment without readings that were taken out.
-        whitened: its innovations, bounded where outliers are.
+        part: the experiment without outliers.
+        whitened: its innovations, clipped at outliers.
         search: of the innovations; None where no candidate has a signature.
         limits: thresholds of the search; None without a search.
         gains: (C, N) statistics less thresholds; NaN where a candidate is not tested or not testable.
         lost: {label: why} of candidates that are not testable.
-        healthy: what is left of the record if nothing is wrong.
-        outliers: (sample, output) of readings that were taken out.
+        healthy: residual of the healthy plant.
+        outliers: (sample, output) of the removed readings.
     """
 
     record: Data
@@ -104,12 +103,12 @@ class RecordSearch:
 
     @property
     def tested(self) -> list[Candidate]:
-        """The candidates that may be the answer."""
+        """The tested candidates."""
         return [c for c, gains in zip(self.dictionary.candidates, self.gains) if not np.isnan(gains).all()]
 
     @cached_property
     def p_value(self) -> float:
-        """Probability of so strong a departure from health; an alarm is at or below the false-alarm rate."""
+        """p-value of the healthy plant; there is an alarm at or below the false-alarm probability."""
         values = [1.0]
         if self.limits is not None and not np.isnan(self.gains).all():
             rate = self.limits.false_alarm
@@ -117,25 +116,25 @@ class RecordSearch:
         if self.dictionary.unknown:
             values.append(self.healthy.p_value / UNKNOWN_SHARE)
         if self.courses:
-            # a likelihood averaged over what may be exceeds 1 / p in healthy records with probability p at most
+            # by Markov's inequality an averaged likelihood ratio exceeds 1 / p with probability p at most
             log = np.logaddexp.reduce([c.log_evidence for c in self.courses]) - np.log(len(self.courses))
             values.append(float(np.exp(-log)) / COURSE_SHARE)
         return min(values)
 
     @cached_property
     def beside(self) -> Scan | None:
-        """The search for what is thought possible beside the dictionary; None where that is nothing."""
+        """The search for candidates beside the dictionary; None without any."""
         more = extended(self.dictionary)
         return None if more is None else scan(more, self.whitened, self.part.u)
 
     @cached_property
     def courses(self) -> list[Explanation]:
-        """Sensors that may be frozen and noises that may have grown."""
+        """Explanations by frozen sensors and increased noise."""
         return courses(self.dictionary, self.whitened, self.part)
 
     @cached_property
     def gains_of_sensors(self) -> list[Explanation]:
-        """Sensors that may have lost a share of their reading."""
+        """Explanations by sensors that lost a share of their reading."""
         return sensor_gains(self.dictionary, self.whitened, self.part)
 
     def widened(self) -> "RecordSearch":
@@ -160,8 +159,8 @@ def search_record(
         seen = int(white.present.any(axis=1).sum())
         if seen < least:
             raise DataError(
-                f"The record has {seen} samples with a reading (those that stand still to the bit do not count): "
-                f"{least} are needed for {found.model.nx} states."
+                f"The record has {seen} samples with a reading (repeated readings of flat lines do not count): "
+                f"{found.model.nx} states require {least}."
             )
         return white
 
@@ -206,11 +205,10 @@ def _limits(found: Dictionary, white: Whitened, u: Array, asked: Question) -> Th
 
 
 def untestable(found: Scan) -> dict[str, str]:
-    """Return the candidates that a record can say nothing about, and why.
+    """Return the candidates that a record cannot test, and why.
 
-    A loss shows as a lack of movement. Where the input stands still, a loss is an offset of the actuator, and where the
-    function of it is zero, it is nothing. So the whole record is asked how large a complete loss would be beside a
-    constant offset of the same actuator.
+    Where the input is constant, a loss is an offset of the actuator, and where its function is zero, it has no effect.
+    The criterion is the deflection of a complete loss beside a constant offset of the same actuator.
     """
     result = {}
     for c, candidate in enumerate(found.dictionary.candidates):
@@ -226,8 +224,8 @@ def untestable(found: Scan) -> dict[str, str]:
                 value = float(np.linalg.eigvalsh(flat.T @ flat)[0])
                 result[candidate.label] = (
                     f"no excitation: a complete loss would have a deflection of {deflection:.2g} beside a constant "
-                    f"offset, {LEAST:g} is needed (smallest Gram eigenvalue {max(value, 0.0):.2g})"
+                    f"offset, {LEAST:g} is required (smallest Gram eigenvalue {max(value, 0.0):.2g})"
                 )
         elif candidate.kind not in ("frozen", "noise", "loss") and np.isnan(found.statistic[c]).all():
-            result[candidate.label] = "nothing of it is seen in this record"
+            result[candidate.label] = "it has no effect in this record"
     return result

@@ -1,13 +1,17 @@
-"""A diagnosis before any search: the record, the scale of the noise, readings that stand still."""
+"""Preparation of a diagnosis: the record, the scale of the noise, the uncertainty of the model, flat lines."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.data.record import Data
+from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError
+from optid.faults.diagnosis.answers import Estimate
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty
-from optid.faults.screening import check_channels
+from optid.faults.screening import FlatLine, check_channels, flat_lines
+from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Predictor, health, predictor, whiten
 from optid.models.experiments import in_units_of
 
@@ -25,7 +29,7 @@ def plant_of(model: Any) -> "tuple[HammersteinSS, Data | None]":
     if getattr(fitted, "kind", "") != "HammersteinSS":
         kind = getattr(fitted, "title", type(fitted).__name__)
         raise StructureError(
-            f"A diagnosis needs a state-space model with noise covariances; this is a {kind}. Fit one, for example "
+            f"A diagnosis requires a state-space model with noise covariances; this is a {kind}. Fit one, for example "
             "with optid.fit(data, 'hammerstein_ss.asivid', nx=...)."
         )
     return fitted, data if isinstance(data, Data) else None
@@ -35,7 +39,7 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
     """Return a record in raw units with the channels of the model.
 
     Args:
-        model: whose channels they are.
+        model: with the names of the channels.
         data: Data, a pair (u, y) of arrays, a frame or a file with the channels as columns.
 
     Raises:
@@ -58,17 +62,17 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
             k, c = missing[0]
             raise DataError(
                 f"experiment {number}: " * (raw.n_experiments > 1)
-                + f"input {raw.inputs[c]!r} is missing at sample {k}: what the actuators did must be known. Fill it, "
+                + f"input {raw.inputs[c]!r} is missing at sample {k}: a diagnosis requires every input. Fill it, "
                 "or cut the record there."
             )
     return raw
 
 
 def steady_predictor(model: "HammersteinSS", healthy: Any, rescale: bool) -> Predictor | None:
-    """Return the predictor with the scale of the noise that a healthy record shows; None for that of the model.
+    """Return the predictor with the noise scale of a healthy record; None for that of the model.
 
     Raises:
-        DataError: innovations that are not white or of another size, swapped channels, a unit that jumps.
+        DataError: innovations that are not white or of another size, swapped channels, a change of unit.
         StructureError: `rescale` without a healthy record.
     """
     if healthy is None:
@@ -89,8 +93,8 @@ def uncertainty_of(
     Args:
         model: the model.
         data: the record it was identified from, where it is known.
-        wanted: None (counted where the record is known), "use", "ignore", or a `ModelUncertainty`.
-        decoupled: the predictor that does not feel declared disturbances.
+        wanted: None (used where the record is known), "use", "ignore", or a `ModelUncertainty`.
+        decoupled: the predictor decoupled from declared disturbances.
 
     Raises:
         StructureError: "use" without a record or a covariance.
@@ -98,19 +102,47 @@ def uncertainty_of(
     if isinstance(wanted, ModelUncertainty):
         if decoupled is not None and not wanted.predictor.silent:
             raise StructureError(
-                "This uncertainty is of a predictor that feels the declared disturbances: pass the fit in place of the "
-                "model, or model_uncertainty(faults.model, data, decoupled=faults.predictor)."
+                "The predictor of this uncertainty is not decoupled from the declared disturbances: pass the fit in "
+                "place of the model, or model_uncertainty(faults.model, data, decoupled=faults.predictor)."
             )
         return wanted, ""
     if wanted not in (None, "use", "ignore"):
-        raise StructureError(f"model_uncertainty={wanted!r}: 'use', 'ignore' or a ModelUncertainty is needed.")
+        raise StructureError(f"model_uncertainty={wanted!r}: it must be 'use', 'ignore' or a ModelUncertainty.")
     if wanted == "use" and data is None:
         raise StructureError(
-            "model_uncertainty='use' needs the covariance of the model: pass the fit in place of the model, or "
+            "model_uncertainty='use' requires the covariance of the model: pass the fit in place of the model, or "
             "optid.faults.model_uncertainty(model, data) with the record it was identified from. 'ignore' takes the "
             "model as exact."
         )
     if wanted == "ignore" or data is None:
         return None, ""
     found = model_uncertainty(model, data, decoupled=decoupled)
-    return found, "The uncertainty of the identified model counts as noise."
+    return found, "The uncertainty of the identified model is treated as noise."
+
+
+def without_flat_lines(record: Data, number: int) -> tuple[Experiment, tuple[FlatLine, ...]]:
+    """Remove the repeated readings of flat lines of an experiment, but the first, which may be a true one."""
+    part = record.experiments[number]
+    lines, y = tuple(line for line in flat_lines(record) if line.experiment == number), np.array(part.y)
+    for line in lines:
+        y[line.first + 1 : line.first + line.count, record.outputs.index(line.name.partition(":")[2])] = np.nan
+    return replace(part, y=y) if lines else part, lines
+
+
+def frozen(lines: Sequence[FlatLine], found: Dictionary, edge: int) -> tuple[Estimate, ...]:
+    """Return the frozen sensors, each at its longest flat line, whether in the dictionary or not.
+
+    The first of the equal readings may be a true one: the fault begins with the second. A flat line that begins within
+    `edge` samples of the start of the record may have begun before it.
+    """
+    longest = {line.name: line for line in sorted(lines, key=lambda line: line.count)}
+    faults = []
+    for name, line in longest.items():
+        known = [c for c in found.candidates if c.kind == "frozen" and name in c.places]
+        candidate = known[0] if known else candidate_of(found.model, name, "frozen")
+        onset, censored, value = line.first + 1, line.first < edge, np.array([line.value])
+        faults.append(Estimate(
+            candidate.label, name, "frozen", candidate, onset, (0 if censored else onset, onset), censored, value,
+            np.stack([value, value], axis=1), np.zeros((1, 1)), float("inf"),
+        ))
+    return tuple(sorted(faults, key=lambda fault: fault.onset))

@@ -1,13 +1,12 @@
-"""A sensor that lost a share of its reading, (1.11): y = (1 - gamma) times what it would read, its noise as before.
+"""A sensor that lost a share of its reading, (1.11): y = (1 - gamma) times the true output, with the same noise.
 
-A lost share of a sensor is another row of C (of D and of the offset) from the onset on, so that the exact likelihood is
-that of a Kalman filter with this row, started from the state that the healthy one had at the onset. It is computed for
-many shares and onsets at once, over a grid that closes in on the most probable onset and, once that is known to the
-sample, on the share. A dead sensor, gamma = 1, reads its noise and is the end of the range.
+The loss is another row of C (of D and of the offset) from the onset on, so that the exact likelihood is that of a
+Kalman filter with this row, started from the state of the healthy one at the onset. It is computed for many shares and
+onsets at once, over a grid that is refined about the most probable onset and, once this is known to the sample, about
+the share. A dead sensor, gamma = 1, reads its noise and is the end of the range.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,28 +21,20 @@ SHARES, ONSETS = 17, 15
 """Shares and onsets of a grid."""
 
 ROUNDS = 20
-"""Grids at most, each about the best point of the one before."""
+"""Largest number of grids, each about the best point of the one before."""
 
 CLOSER = 0.35
-"""A grid spans this share of the range of the one before."""
+"""Range of a grid, as a share of that of the one before."""
 
 FINE = 0.6
-"""Standard deviations of the share that the last grid may be apart."""
+"""Largest distance of the shares of the last grid, in standard deviations."""
 
 LEAST = 5
 """Samples that must follow the onset."""
 
 
-class _Grid(NamedTuple):
-    """The likelihood `logs` (K, G) beside that of health over `onsets` (K,) and `shares` (G,)."""
-
-    onsets: np.ndarray
-    shares: Array
-    logs: Array
-
-
 def sensor_gains(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
-    """Return the sensors of a dictionary (kind "loss") that may have lost a share of their reading in a window."""
+    """Return the explanations of a window by sensors of a dictionary that lost a share of their reading."""
     if white.states is None or found.model.feedback or np.any(found.model.L):
         return []
     candidates = [c for c in found.candidates if c.kind == "loss" and not c.columns]
@@ -59,64 +50,56 @@ def _judged(found: Dictionary, candidate: Candidate, white: Whitened, part: Expe
         return None
     onsets: np.ndarray = np.unique(np.linspace(0, last, ONSETS).astype(int))
     shares = np.linspace(0.0, 1.0, SHARES + 1)[1:]
-    grid, wide, high = None, float(last), 1.0
+    wide, high = float(last), 1.0
     for _ in range(ROUNDS):
+        tried, gammas = onsets, shares
         try:
-            grid = _likelihood(found, o, white, part, onsets, shares)
-        except StructureError:  # without this sensor some mode is not seen
+            logs = likelihoods(found, o, white, part, tried, gammas)
+        except StructureError:  # without this sensor some mode is not observable
             return None
-        k, g = np.unravel_index(int(np.argmax(grid.logs)), grid.logs.shape)
-        weights = np.exp(grid.logs[k] - grid.logs[k, g])
+        k, g = np.unravel_index(int(np.argmax(logs)), logs.shape)
+        weights = np.exp(logs[k] - logs[k, g])
         weights /= weights.sum()
-        std = float(np.sqrt(max(weights @ grid.shares**2 - (weights @ grid.shares) ** 2, 0.0)))
-        step, apart = int(np.max(np.diff(onsets), initial=1)), float(shares[1] - shares[0])
-        if step > 1:  # beside a wrong onset another share is the best one
+        std = float(np.sqrt(max(weights @ shares**2 - (weights @ shares) ** 2, 0.0)))
+        if np.max(np.diff(onsets), initial=1) > 1:  # at a wrong onset another share is the best one
             wide *= CLOSER
             reach = max(int(wide / 2), ONSETS // 2)
-            near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, last), ONSETS).astype(int)
-            onsets = np.unique(near)
-        elif apart < FINE * std:
+            near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, last), ONSETS)
+            onsets = np.unique(near.astype(int))
+        elif shares[1] - shares[0] < FINE * std:
             break
         else:
             high *= CLOSER
             middle = float(np.clip(shares[g], high / 2, 1 - high / 2))
             shares = np.linspace(max(middle - high / 2, 1e-6), middle + high / 2, SHARES)
-    assert grid is not None
-    return _explanation(found, candidate, white, part, o, grid)
-
-
-def _explanation(found: Dictionary, candidate: Candidate, white: Whitened, part: Experiment, o: int, grid: _Grid
-                 ) -> Explanation:
-    count = len(white.r)
-    most = grid.logs.max(axis=1)
-    weights = np.exp(grid.logs - most[:, None])
+    most = logs.max(axis=1)
+    weights = np.exp(logs - most[:, None])
     total = weights.sum(axis=1)
-    mean = weights @ grid.shares / total
-    variance = np.maximum(weights @ grid.shares**2 / total - mean**2, 1e-12)
-    logs = most + np.log(total * (grid.shares[1] - grid.shares[0])) - np.log(count)  # uniform over shares and onsets
+    mean = weights @ gammas / total
+    variance = np.maximum(weights @ gammas**2 / total - mean**2, 1e-12)
+    evidence = most + np.log(total * (gammas[1] - gammas[0])) - np.log(len(white.r))  # uniform over shares and onsets
 
     def rest(onset: int) -> Explained:
-        row = int(np.flatnonzero(grid.onsets == onset)[0])
-        left = _rests(found, o, white, part, np.array([onset]), mean[[row]])[0][0]
+        left = _rests(found, o, white, part, np.array([onset]), mean[tried == onset])[0][0]
         return Explained(white.r - left, left, 1)
 
     return Explanation(
-        (candidate,), grid.onsets[:, None], logs, mean[:, None], variance[:, None, None], 2 * most, course=rest
+        (candidate,), tried[:, None], evidence, mean[:, None], variance[:, None, None], 2 * most, course=rest
     ).likely()
 
 
-def _likelihood(found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
-                ) -> _Grid:
-    both = np.repeat(onsets, len(shares)), np.tile(shares, len(onsets))
-    rests, sizes = _rests(found, o, white, part, *both)
-    energies = np.einsum("jno,jno->j", rests, rests)
-    logs = 0.5 * float(np.sum(white.r**2)) - 0.5 * energies - sizes
-    return _Grid(onsets, shares, logs.reshape(len(onsets), len(shares)))
+def likelihoods(
+    found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
+) -> Array:
+    """Return the log-likelihood ratios (K, G) to the healthy plant of onsets (K,) and shares (G,) of output `o`."""
+    rests, sizes = _rests(found, o, white, part, np.repeat(onsets, len(shares)), np.tile(shares, len(onsets)))
+    logs = 0.5 * float(np.sum(white.r**2)) - 0.5 * np.einsum("jno,jno->j", rests, rests) - sizes
+    return logs.reshape(len(onsets), len(shares))
 
 
 def _rests(found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
            ) -> tuple[Array, Array]:
-    """Whitened innovations (J, N, l) with a share lost from an onset on, and what their scale costs (J,)."""
+    """Whitened innovations (J, N, l) with a share lost from an onset on, and the logarithms (J,) of their scale."""
     model, steady, present = found.model, white.predictor, white.present
     different, which = np.unique(shares, return_inverse=True)
     scale = float(np.trace(steady.covariance) / np.trace(predictor(model).covariance))

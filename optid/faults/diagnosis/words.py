@@ -1,4 +1,4 @@
-"""A diagnosis in words."""
+"""Texts of a diagnosis."""
 
 import textwrap
 from typing import TYPE_CHECKING
@@ -14,29 +14,28 @@ WORDS = {
     "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading",
     "schedule": "share of the change",
 }
-"""What the magnitude of a kind is called."""
-
+"""Name of the magnitude of a kind."""
 
 HEADLINES = {
     "healthy": "no alarm",
-    "untestable": "the input excites nothing that is suspected",
-    "not isolable": "something is wrong, and one output cannot tell what",
-    "unknown": "something is wrong, and it is none of the candidates",
+    "untestable": "the input excites none of the candidates",
+    "not isolable": "a fault, which one output does not isolate",
+    "unknown": "a fault that is none of the candidates",
 }
-"""The outcome of a verdict without an answer in one clause."""
+"""Headline of a verdict without an answer."""
 
 
 def estimate_line(fault: "Estimate") -> str:
-    """Say in one or more lines what a fault is, since when and how large."""
+    """State the label of a fault, its onset and size."""
     lines = [onset_words(fault), *size_words(fault)]
     if fault.effect:  # of a disturbance of estimated direction on the outputs
         moved = ", ".join(f"{name} by {change:.3g}" for name, change in fault.effect.items())
-        lines.append(f"moves {moved} in the end")
+        lines.append(f"changes {moved} in steady state")
     return "\n".join([fault.label, *("  " + line for line in lines)])
 
 
 def onset_words(fault: "Estimate") -> str:
-    """Say when it began."""
+    """State the onset."""
     low, high = fault.onset_interval
     if fault.onset_censored:
         return f"onset at or before sample {high}" if low == 0 else f"onset at or after sample {low}"
@@ -44,7 +43,7 @@ def onset_words(fault: "Estimate") -> str:
 
 
 def size_words(fault: "Estimate") -> list[str]:
-    """Say how large each magnitude is, with its interval."""
+    """State each magnitude with its interval."""
     lines = []
     for word, value, (low, high) in zip(magnitude_names(fault), fault.size, fault.size_interval):
         if word == "share lost":
@@ -63,7 +62,7 @@ def size_words(fault: "Estimate") -> list[str]:
 
 
 def magnitude_names(fault: "Estimate") -> list[str]:
-    """Return what the entries of the size are."""
+    """Return the names of the entries of the size."""
     d = len(fault.size)
     if fault.kind in ("loss", "stuck"):
         constants = ["constant added"] if d == 2 else [f"constant added to function {i}" for i in range(1, d)]
@@ -100,7 +99,7 @@ def printed(found: "Diagnosis") -> str:
 
 
 def headline(found: "Diagnosis") -> str:
-    """Say the outcome in one clause."""
+    """State the result in one clause."""
     if found.verdict in HEADLINES:
         return HEADLINES[found.verdict]
     if found.best is None:
@@ -111,7 +110,7 @@ def headline(found: "Diagnosis") -> str:
 
 
 def certificate_words(found: "Diagnosis") -> str:
-    """Say what the answer rests on."""
+    """State the certificate."""
     proof = found.certificate
     if proof.kind in ("exhaustive", "grid"):
         tried = "every candidate and onset was tried" if proof.kind == "exhaustive" else "a grid of onsets was tried"
@@ -120,7 +119,7 @@ def certificate_words(found: "Diagnosis") -> str:
             words += f", twice the log of the odds against the next {proof.runner_up_margin:.1f}"
         return words
     if proof.kind == "flat line":
-        return f"proof: {proof.value:.0f} readings in a row are identical to the bit"
+        return f"proof: {proof.value:.0f} readings in a row are identical"
     if proof.kind == "duality gap":
         return f"proof: duality gap {proof.value:.1e}"
     if proof.kind == "infeasible healthy":
@@ -132,7 +131,7 @@ def certificate_words(found: "Diagnosis") -> str:
 
 
 def remaining_words(found: "Diagnosis") -> str:
-    """Say what is left unexplained."""
+    """State the residual."""
     rest = found.remaining
     assert rest is not None
     words = (
@@ -143,7 +142,7 @@ def remaining_words(found: "Diagnosis") -> str:
 
 
 def course_words(found: "Diagnosis") -> str:
-    """Say in which direction the rest lies and how fast it changes."""
+    """State direction and frequency of the residual."""
     rest = found.remaining
     assert rest is not None
     names = found.outputs or tuple(f"y{i + 1}" for i in range(len(rest.direction)))
@@ -156,26 +155,26 @@ def course_words(found: "Diagnosis") -> str:
 
 
 def explained(found: "Diagnosis", *, notes: bool = True) -> list[str]:
-    """Say in three sentences what was found, how sure that is, and what it rests on; notes say what was not judged."""
+    """State in sentences the result, its probability and its evidence; notes add what was not judged."""
     name = found.model if found.model.startswith("Hammerstein") else found.model[:1].lower() + found.model[1:]
     departs = f"The record departs from the healthy {name} (p-value {probability_words(found.p_value)}), but "
     silent = _list(list(found.untestable)) if found.untestable else ""
     if found.verdict == "healthy":
         sentences = [
-            f"The record of {found.window} samples is what the healthy {name} predicts.",
+            f"The record of {found.window} samples agrees with the healthy {name}.",
             f"Healthy records depart as far from it with probability {probability_words(found.p_value)}; below "
             f"{found.false_alarm:g} that would be an alarm.",
         ]
     elif found.verdict == "untestable" and found.detected:
-        sentences = [f"{departs}the input does not excite what is suspected: {silent}."]
+        sentences = [f"{departs}the input does not excite the candidates: {silent}."]
     elif found.verdict == "untestable":
         sentences = [f"Nothing can be said about {silent}: the input does not excite it."]
     elif found.verdict in ("unknown", "not isolable"):
         why = "no fault of the dictionary fits it." if found.verdict == "unknown" else \
-            "with one output a fault of any course explains it, in any place."
+            "with one output a fault of arbitrary course at any place explains it."
         sentences = [departs + why]
         if found.remaining is not None:
-            sentences.append(f"What is left of it: {course_words(found)}.")
+            sentences.append(f"Its residual: {course_words(found)}.")
     else:
         sentences = _faulty(found)
     if notes:
@@ -195,10 +194,10 @@ def _faulty(found: "Diagnosis") -> list[str]:
     if others:
         shares = _list([f"{answer.label} ({answer.posterior:.2f})" for answer in others])
         second = (
-            f"The record cannot tell it (probability {best.posterior:.2f}) from {shares} at {100 * found.coverage:g} %."
+            f"At {100 * found.coverage:g} % it (probability {best.posterior:.2f}) is not isolable from {shares}."
         )
     else:
-        sure = f"No other candidate is left at {100 * found.coverage:g} %"
+        sure = f"No other candidate remains at {100 * found.coverage:g} %"
         second = f"{sure} (probability {best.posterior:.3f})."
     proof = certificate_words(found)
     return [first, second, proof[0].upper() + proof[1:] + "."]
@@ -209,7 +208,7 @@ def _list(words: list[str]) -> str:
 
 
 def probability_words(value: float) -> str:
-    """Write a probability, however small."""
+    """Write a probability."""
     if value < 1e-300:
         return "< 1e-300"
     return "unknown" if np.isnan(value) else f"{value:.2g}" if value >= 1e-3 else f"{value:.0e}"

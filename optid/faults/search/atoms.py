@@ -1,8 +1,7 @@
-"""The atoms of a window: an orthonormal set for every candidate at every onset that is tested.
+"""Atoms of a window: orthonormal axes of the signature of every candidate at every tested onset.
 
-The exact search needs none of them; programmes that choose several faults at once do, and so does the exchange of one
-fault at a time for the best of all candidates and onsets beside the others. Every exchange raises the gain, and the end
-is a subset that no single exchange improves.
+They serve programmes that choose several faults at once, and the exchange of one fault at a time for the best of all
+candidates and onsets beside the others, which ends at a subset that no single exchange improves.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,13 +19,13 @@ if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
 
 ROUNDS = 20
-"""Rounds of exchanges at most."""
+"""Largest number of rounds of exchanges."""
 
 Member = tuple[str, int]
 """Label of a candidate and its onset."""
 
 MOST = 40_000_000
-"""Numbers that the atoms of a window may have."""
+"""Largest number of values of the atoms of a window."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,9 +35,9 @@ class Atoms:
     Attributes:
         label: of the candidate.
         onsets: (T,) those that are tested.
-        axes: (T, N l, d) orthonormal columns; zero ones for directions of which nothing is seen.
+        axes: (T, N l, d) orthonormal columns; zero ones for directions without effect.
         back: (T, d, d) magnitudes = back @ coefficients of the axes.
-        threshold: energy q above which the search accuses the candidate.
+        threshold: energy q above which the search raises an alarm for the candidate.
     """
 
     label: str
@@ -54,17 +53,17 @@ class Atoms:
 
 
 def atoms_of(found: Scan, limits: "Thresholds", onsets: np.ndarray | None = None) -> tuple[Atoms, ...]:
-    """Return the atoms of every candidate that is tested somewhere.
+    """Return the atoms of every tested candidate.
 
     Args:
         found: the search of the window.
         limits: its thresholds.
-        onsets: a mask (N,) of the onsets that are wanted; all by default.
+        onsets: a mask (N,) of the onsets; all by default.
 
     Raises:
         StructureError: thresholds of other candidates or missing for one that is tested; a window that is too long.
     """
-    q = limits.of(found.labels)
+    q = limits.for_scan(found)
     wanted = np.ones(found.statistic.shape[1], dtype=bool) if onsets is None else onsets
     places = [np.flatnonzero(~np.isnan(row) & wanted) for row in found.statistic]
     columns = sum(where.size * c.dimension for where, c in zip(places, found.dictionary.candidates))
@@ -76,9 +75,6 @@ def atoms_of(found: Scan, limits: "Thresholds", onsets: np.ndarray | None = None
     for candidate, where, threshold in zip(found.dictionary.candidates, places, q):
         if not where.size:
             continue
-        if not threshold > 0:
-            raise StructureError(
-                f"{candidate.label} has no threshold: calibrate with the input u of the window, too.")
         traces = np.stack([found.signature(candidate, int(onset)) for onset in where])
         flat = traces.reshape(where.size, found.whitened.r.size, -1)
         products = np.einsum("tkp,tkq->tpq", flat, flat)
@@ -103,7 +99,7 @@ def exchanged(atoms: Sequence[Atoms], r: Array, members: Iterable[Member], gain:
 
 
 def _best_beside(atoms: Sequence[Atoms], r: Array, others: Sequence[Member]) -> tuple[float, Member]:
-    """Gain of the others with the best atom beside them, and which it is."""
+    """Gain of the others with the best atom added, and this atom."""
     named = {own.label: own for own in atoms}
     parts = [named[label].axes[int(np.searchsorted(named[label].onsets, onset))] for label, onset in others]
     left, sizes, _ = np.linalg.svd(np.hstack([np.zeros((r.size, 0)), *parts]), full_matrices=False)

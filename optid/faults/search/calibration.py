@@ -1,6 +1,7 @@
-"""Thresholds of the search for a fault, such that a healthy window alarms with the probability asked for."""
+"""Thresholds of the search for a fault for a given false-alarm probability of a healthy window."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,16 +13,19 @@ from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
 
+if TYPE_CHECKING:
+    from optid.faults.search.scanning import Scan
+
 EXCEEDING = 50
-"""Simulated windows that must exceed the thresholds for these to be trusted."""
+"""Least number of simulated windows that exceed the thresholds."""
 
 STRETCHES = 100
-"""Stretches of a longer input that are drawn."""
+"""Number of sections drawn from a longer input."""
 
 
 @dataclass(frozen=True, eq=False)
 class Thresholds:
-    """What the energy that a candidate explains must exceed; `thresholds` makes them.
+    """Thresholds of the energy that a candidate explains; `thresholds` makes them.
 
     Attributes:
         labels: the C candidates.
@@ -51,6 +55,15 @@ class Thresholds:
             )
         return self.q
 
+    def for_scan(self, found: "Scan") -> Array:
+        """Return the thresholds (C,) of a search; StructureError where one is missing for a tested candidate."""
+        q, tested = self.of(found.labels), [bool(np.isfinite(row).any()) for row in found.statistic]
+        missing = [label for label, value, used in zip(self.labels, q, tested) if used and not value > 0]
+        if missing:
+            raise StructureError(
+                f"There is no threshold for {', '.join(missing)}: calibrate with the inputs, thresholds(..., u=u).")
+        return q
+
     def __str__(self) -> str:
         """Print the thresholds."""
         head = f"false alarm {self.false_alarm:g} in a window of {self.window} samples ({self.draws} simulated)"
@@ -66,14 +79,14 @@ def thresholds(
     """Calibrate the search on simulated healthy windows.
 
     The thresholds are quantiles of the largest energy over the onsets, at one level for all candidates, such that the
-    family of all candidates and onsets alarms with the probability asked for.
+    family of all candidates and onsets has the given false-alarm probability.
 
     Args:
         found: the candidates.
         window: number of samples N; or a window, whose missing readings and uncertain model are simulated, too.
         false_alarm: probability that a healthy window exceeds any threshold.
         u: inputs for losses and stuck actuators: those of the window (N, m), or a longer typical record of them, of
-            which stretches are drawn. Without it these candidates are not tested.
+            which sections are drawn. Without it these candidates are not tested.
         draws: simulated windows.
         seed: of the simulation.
 
@@ -92,7 +105,7 @@ def check_draws(false_alarm: float, draws: int) -> None:
     check_probability(false_alarm, "false_alarm")
     if false_alarm * draws < EXCEEDING:
         raise DataError(
-            f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "
+            f"{draws} simulated windows are too few for a false alarm in {1 / false_alarm:.3g}: use at least "
             f"{int(np.ceil(EXCEEDING / false_alarm))} draws, or a higher probability."
         )
 
@@ -122,7 +135,7 @@ def simulated(
     if inputs is None or len(inputs) == count:
         starts: np.ndarray = np.zeros(1, dtype=int)
     elif len(inputs) < count:
-        raise DataError(f"u has {len(inputs)} samples; the window has {count}, as many are needed at least.")
+        raise DataError(f"u has {len(inputs)} samples; it must have at least those of the window, {count}.")
     else:
         starts = rng.integers(0, len(inputs) - count + 1, min(STRETCHES, draws))
     shares = np.diff(draws * np.arange(starts.size + 1) // starts.size)

@@ -1,10 +1,9 @@
-"""Thresholds from healthy records, for plants whose innovations are not white: the search is run along them.
+"""Thresholds from healthy records, for plants whose innovations are not white.
 
-What a model does not know of its plant (a wrong order, slow disturbances, weak nonlinearities) makes the energies that
-the candidates explain of a healthy record larger than those of white noise. Their thresholds are the simulated ones of
-white noise times one factor, the smallest with which the record keeps the rate of false alarms. One number is learned
-from the record, whatever the number of candidates: a threshold of its own for each would be the largest energy of a
-few independent windows each, and with many candidates one of them is soon exceeded on the next record.
+Model errors (a wrong order, slow disturbances, weak nonlinearities) increase the energies that the candidates explain
+of a healthy record beyond those of white noise. The thresholds are those simulated for white noise times one factor, as
+small as the required false-alarm rate of the record allows. A separate threshold for each candidate would rest on
+the largest energy of few independent windows, and with many candidates one of them is soon exceeded on the next record.
 """
 
 import warnings
@@ -24,13 +23,13 @@ from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
 
 LEAST = 1.0
-"""Windows without a sample in common that must exceed the threshold of a record, on average."""
+"""Least expected number of disjoint windows of a record above the threshold."""
 
 SURE = 5
-"""With fewer alarms than this the rate of false alarms of the next record may be twice that of this one."""
+"""Number of alarms below which the false-alarm rate of the next record may be twice that of this one."""
 
 COMMON = 0.25
-"""Largest share of windows from whose energies rarer ones are extrapolated."""
+"""Largest alarm rate from which a rarer one is extrapolated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +40,7 @@ class SlidingScan:
         labels: the C candidates.
         window: samples of a window.
         samples: samples of the record.
-        stops: (M,) sample after the last of every window: when its answer is known.
+        stops: (M,) sample after the last of every window.
         statistic: (M, C) largest energy over the onsets; NaN for a candidate that is not tested.
     """
 
@@ -58,11 +57,11 @@ class SlidingScan:
         return np.nanmax(self.statistic / limits.of(self.labels), axis=1)
 
     def alarms(self, limits: Thresholds) -> np.ndarray:
-        """Return which windows alarm, (M,)."""
+        """Return the windows with an alarm, (M,)."""
         return self.excess(limits) > 1
 
     def accused(self, limits: Thresholds) -> np.ndarray:
-        """Return the index of the candidate with the largest energy less its threshold, (M,): the likeliest fault."""
+        """Return the index (M,) of the candidate with the largest energy less its threshold."""
         return np.nanargmax(self.statistic - limits.of(self.labels), axis=1)
 
 
@@ -116,15 +115,15 @@ def _part(whitened: Whitened, start: int, window: int) -> Whitened:
 
 @dataclass(frozen=True, eq=False)
 class EmpiricalThresholds(Thresholds):
-    """Thresholds that a healthy record keeps; `empirical_thresholds` makes them.
+    """Thresholds from a healthy record; `empirical_thresholds` makes them.
 
     Attributes:
         factor: by which those of white innovations were multiplied.
         share: share of the windows of the healthy record that exceed them.
-        excursions: how many alarms that makes, those within one window counted once.
+        excursions: number of alarms, those within one window counted once.
         windows: number of windows.
-        independent: number of windows without a sample in common.
-        extrapolated: whether the record is too short for so rare an alarm, and the factor that of a more frequent one.
+        independent: number of disjoint windows.
+        extrapolated: whether the factor is that of a more frequent alarm, because the record is too short.
     """
 
     factor: float = 1.0
@@ -135,7 +134,7 @@ class EmpiricalThresholds(Thresholds):
     extrapolated: bool = False
 
     def __str__(self) -> str:
-        """Print the thresholds and what they rest on."""
+        """Print the thresholds and the healthy record behind them."""
         tail = ", factor of more frequent alarms" if self.extrapolated else ""
         return (
             f"healthy record of {self.independent:.0f} windows: {self.factor:.3g} times those of white innovations"
@@ -180,8 +179,8 @@ def empirical_thresholds(
     rare = false_alarm * independent < LEAST
     if rare and not extrapolate:
         raise DataError(
-            f"{independent:.0f} windows of a healthy record cannot support a false alarm in {1 / false_alarm:.3g}: "
-            f"{int(np.ceil(LEAST / false_alarm * window))} samples are needed. Take a longer record, a shorter window "
+            f"{independent:.0f} windows of a healthy record are too few for a false alarm in {1 / false_alarm:.3g}: "
+            f"{int(np.ceil(LEAST / false_alarm * window))} samples are required. Take a longer record, shorter windows "
             "or a higher probability, or let the factor be that of a more frequent alarm (extrapolate=True)."
         )
     longest = None if u is None else max((np.asarray(one) for one in inputs), key=len)

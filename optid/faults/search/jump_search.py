@@ -1,8 +1,8 @@
-"""Several jumps of the whole state, exactly: a jump in any direction starts the state anew, so that segments decouple.
+"""Exact search for several jumps of the whole state.
 
-After a jump of unknown size in all n states nothing before it matters: the best fit of a segment depends on its ends
-alone, and the best segmentation follows by dynamic programming, V_K(j) = min over i of V_(K-1)(i) + cost(i, j), in
-O(K N^2) (exact for K jumps, where sums of norms and mixed-integer programmes are relaxations or do not end).
+A jump of unknown size in all n states decouples the segments before and after it: the best fit of a segment depends on
+its ends alone, and the best segmentation follows by dynamic programming, V_K(j) = min over i V_(K-1)(i) + cost(i, j),
+in O(K N^2).
 """
 
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
 
 LONGEST = 3000
-"""Samples of a window at most: the costs of all segments are kept."""
+"""Largest number of samples of a window, for which the costs of all segments are stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +30,9 @@ class StateJumps:
     Attributes:
         onsets: samples of the jumps.
         sizes: (K, n) jumps of the state.
-        energies: (most + 1,) energy that is left with the best 0, 1, ..., most jumps.
+        energies: (most + 1,) residual energy with the best 0, 1, ..., most jumps.
         best: for each number of jumps, the onsets.
-        penalty: energy that a jump must explain.
+        penalty: least energy explained by a jump.
     """
 
     onsets: tuple[int, ...]
@@ -48,13 +48,13 @@ class StateJumps:
 
     @property
     def margin(self) -> float:
-        """By how much the best other number of jumps is worse."""
+        """Difference to the best other number of jumps."""
         values = self.energies + self.penalty * np.arange(self.energies.size)
         others = np.delete(values, len(self.onsets))
         return float(others.min() - values[len(self.onsets)]) if others.size else np.inf
 
     def __str__(self) -> str:
-        """Print the jumps and what every number of them leaves."""
+        """Print the jumps and the residual energy of every number of jumps."""
         left = ", ".join(f"{k}: {energy:.1f}" for k, energy in enumerate(self.energies))
         lines = [f"{len(self.onsets)} jumps of the state (energy left by number {left})"[:80],
                  f"  each must explain {self.penalty:.1f}; margin {self.margin:.2f}; exhaustive"]
@@ -71,13 +71,13 @@ def state_jumps(
     Args:
         found: the dictionary.
         whitened: the window; one experiment. Missing readings are left out.
-        most: jumps at most.
-        penalty: energy that a jump must explain: a number, or thresholds whose candidate "state" says it; by default
-            that of the Bayesian information criterion, n log(N l) + 2 log N.
+        most: largest number of jumps.
+        penalty: least energy explained by a jump: a number, or thresholds with a candidate "state"; by default that of
+            the Bayesian information criterion, n log(N l) + 2 log N.
 
     Raises:
         DataError: other outputs than the model's, innovations that are not finite.
-        StructureError: an uncertain model (its nuisance ties all segments together), several experiments, a window
+        StructureError: an uncertain model (its nuisance couples all segments), several experiments, a window
             that is too long, impossible numbers.
     """
     check_window(found.model, whitened, "state_jumps")
@@ -98,7 +98,7 @@ def state_jumps(
 
 
 def segment_costs(whitened: Whitened) -> Array:
-    """Return the energy (N, N + 1) left of the samples i to j - 1 after a jump at i; inf for empty segments."""
+    """Return the residual energy (N, N + 1) of the samples i to j - 1 after a jump at i; inf for empty segments."""
     count = len(whitened.r)
     costs = np.full((count, count + 1), np.inf)
     energy = np.concatenate([[0.0], np.cumsum(np.sum(whitened.r**2, axis=1))])
@@ -116,12 +116,12 @@ def segment_costs(whitened: Whitened) -> Array:
 
 
 def _response(whitened: Whitened, onset: int) -> Array:
-    """What unit jumps of the state leave, (N, l, n)."""
+    """Signature (N, l, n) of unit jumps of the state."""
     return whitened.seen(whitened.predictor.jumps(onset, whitened.present))
 
 
 def _segmented(costs: Array, squares: Array, most: int) -> tuple[Array, tuple[tuple[int, ...], ...]]:
-    """Energies left by up to `most` jumps, and the best onsets of each number, by dynamic programming."""
+    """Residual energies of up to `most` jumps, and the best onsets of each number, by dynamic programming."""
     count = len(costs)
     value = np.concatenate([[0.0], np.cumsum(squares)])  # up to j without a jump
     before: list[np.ndarray] = []
@@ -145,10 +145,9 @@ def _price(found: Dictionary, whitened: Whitened, penalty: "float | Thresholds |
         return float(found.model.nx * np.log(whitened.present.sum()) + 2 * np.log(len(whitened.r)))
     if isinstance(penalty, int | float | np.floating | np.integer):
         if not (np.isfinite(penalty) and penalty >= 0):
-            raise StructureError(f"penalty={penalty!r}; a number from 0 is needed.")
+            raise StructureError(f"penalty={penalty!r}; it must be nonnegative.")
         return float(penalty)
-    q = penalty.of(found.labels)
-    for label, value in zip(found.labels, q):
+    for label, value in zip(found.labels, penalty.of(found.labels)):
         if label.startswith("state") and np.isfinite(value):
             return float(value)
     raise StructureError("These thresholds have none for a jump of the state: give the penalty as a number.")

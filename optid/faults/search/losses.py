@@ -1,12 +1,11 @@
-"""How much of an actuator is lost: shares between none and all, stops within its reach, at every onset (F5).
+"""Severity of an actuator fault: shares lost between 0 and 1, stop positions within the range, at every onset (F5).
 
-What a broken actuator contributes is v = (1 - gamma) f(u) + c. A share gamma lies between 0 and 1, and the constant
-c of a stuck one in the image of f, since the actuator stands somewhere. Both enter the innovations linearly, so that
-the best ones at a given onset are a quadratic programme with a box, solved exactly, and all onsets are tried.
+The contribution of a broken actuator is v = (1 - gamma) f(u) + c. The share gamma lies between 0 and 1, and the
+constant c of a stuck actuator in the image of f. Both enter the innovations linearly, so that the best ones at a given
+onset solve a least-squares problem with bounds; all onsets are tried.
 """
 
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,21 +16,15 @@ from optid.errors import StructureError
 from optid.faults.search.scanning import Scan
 from optid.faults.signatures import Candidate
 
-FACES = 6
-"""Magnitudes for which all faces of the box are tried."""
-
-ROUNDING = 1e-10
-"""Share of a product that is rounding."""
-
 
 @dataclass(frozen=True, eq=False)
 class Bounded:
-    """The best possible magnitudes of a candidate at every onset; `bounded` makes it.
+    """The best magnitudes of a candidate within their bounds at every onset; `bounded` makes it.
 
     Attributes:
         label: the candidate.
         statistic: (N,) energy that they explain, NaN where the candidate is not tested. Below that of the scan where a
-            bound holds them.
+            bound is active.
         sizes: (N, d) magnitudes within the bounds.
         low: (d,) bounds; -inf where there is none.
         high: (d,) bounds; inf where there is none.
@@ -54,7 +47,7 @@ class Bounded:
 
 @dataclass(frozen=True)
 class Severity:
-    """How much is lost; `severity` makes it.
+    """Share lost of an actuator; `severity` makes it.
 
     Attributes:
         label: the candidate.
@@ -77,11 +70,11 @@ class Severity:
     energy: float
 
     def __str__(self) -> str:
-        """Say how much."""
+        """State the share lost with its interval and whether the loss may be complete."""
         low, high = self.share_interval
         stop = f", adds {', '.join(f'{c:.4g}' for c in self.stop)} instead" if self.stop else ""
         verdict = "hard-over: a complete loss is possible" if self.hard_over else \
-            "not a complete loss" if high < 1 else "not told from no loss at all"
+            "not a complete loss" if high < 1 else "not distinguishable from no loss"
         return (
             f"{self.label} from sample {self.onset}\n{100 * self.share:.1f} % lost [{100 * low:.1f}, {100 * high:.1f}] "
             f"({100 * self.coverage:g} %){stop}\n{verdict}"
@@ -98,32 +91,32 @@ def bounded(scan: Scan, candidate: Candidate | str, *, reach: ArrayLike | None =
             f has none.
 
     Raises:
-        StructureError: another kind of fault, one that is tested nowhere (no input, or one that does not move), more
-            than six magnitudes, a reach that is not one.
+        StructureError: another kind of fault, one that is tested nowhere (no input, or one that does not move), a
+            reach that is not an interval.
     """
+    from scipy.optimize import lsq_linear
+
     c = scan.index(candidate)
     low, high = _bounds(scan.dictionary.model, scan.dictionary.candidates[c], reach)
-    tested, d = ~np.isnan(scan.statistic[c]), int(scan.sweep.tables.sizes[c])
+    tested = ~np.isnan(scan.statistic[c])
     if not tested.any():
         raise StructureError(
             f"{scan.labels[c]} is not tested in this window: "
             + ("pass the inputs, scan(..., u)." if scan.u is None else "untestable, the input does not excite it.")
         )
-    if d > FACES:
-        raise StructureError(f"{scan.labels[c]}: {d} magnitudes; bounds are kept for {FACES} at most.")
-    roots = scan.sweep.roots_of(c)  # rows are orthogonal: axes over the roots of the eigenvalues
-    squares = np.sum(roots**2, axis=2)
-    weights = np.where(squares > 0, 1 / np.where(squares > 0, squares, 1.0) ** 2, 0.0)
-    products = np.einsum("kq,kqi,kqj->kij", weights, roots, roots)
-    correlations = scan.correlations[:, scan.sweep.columns(c)]
-    sizes, values = boxed(products, correlations, low, high)
+    roots, correlations = scan.sweep.roots_of(c), scan.correlations[:, scan.sweep.columns(c)]
+    sizes = np.einsum("kqi,kqj,kj->ki", roots, roots, correlations)  # without bounds
+    designs = np.swapaxes(np.linalg.pinv(roots), 1, 2)
+    for k in np.flatnonzero(tested & np.any((sizes < low) | (sizes > high), axis=1)):
+        sizes[k] = lsq_linear(designs[k], roots[k] @ correlations[k], (low, high), "bvls", tol=1e-14).x
+    multipliers = correlations - np.einsum("kqi,kqj,kj->ki", designs, designs, sizes)
+    values = np.sum(sizes * (correlations + multipliers), axis=1)
     values[~tested], sizes[~tested] = np.nan, np.nan
-    multipliers = correlations - np.einsum("kij,kj->ki", products, sizes)
     return Bounded(scan.labels[c], values, sizes, low, high, multipliers)
 
 
 def _bounds(model: Any, c: Candidate, reach: ArrayLike | None) -> tuple[Array, Array]:
-    """What the magnitudes of a loss or of a stuck actuator can be at least and at most."""
+    """Lower and upper bounds of the magnitudes of a loss or of a stuck actuator."""
     if not c.columns:
         raise StructureError(f"{c.label}: only a loss and a stuck actuator have a share lost.")
     ends = [(0.0, 1.0)]
@@ -134,46 +127,17 @@ def _bounds(model: Any, c: Candidate, reach: ArrayLike | None) -> tuple[Array, A
             ends.append((-np.inf, np.inf))
             continue
         if len(within) != 2 or not np.all(np.isfinite(within)) or not within[0] < within[1]:
-            raise StructureError(f"reach={reach!r}: the lowest and the highest input are needed.")
+            raise StructureError(f"reach={reach!r}: it must be the lowest and the highest input.")
         image = function(np.linspace(within[0], within[1], 513))
         ends.append((float(np.min(image)), float(np.max(image))))
     low, high = np.array(ends).T
     return low, high
 
 
-def boxed(products: Array, correlations: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Maximise 2 b'nu - nu'G nu over low <= nu <= high (d,) for many G (T, d, d) and b (T, d).
-
-    Every face of the box is tried: on the right one its stationary point is the maximum, on the others it is no more.
-    The maximisers (T, d) and maxima (T,) are NaN where no face has a finite stationary point.
-    """
-    count, d = correlations.shape
-    best, values = np.full((count, d), np.nan), np.full(count, np.nan)
-    scale = np.sqrt(np.maximum(np.einsum("tii->ti", products), 1e-300))
-    for face in product((None, low, high), repeat=d):
-        if any(end is not None and not np.isfinite(end[j]) for j, end in enumerate(face)):
-            continue
-        free = np.array([end is None for end in face])
-        nu = np.tile([0.0 if end is None else end[j] for j, end in enumerate(face)], (count, 1))
-        possible = np.ones(count, dtype=bool)
-        if free.any():
-            left = (correlations - np.einsum("tij,tj->ti", products, nu))[:, free] / scale[:, free]
-            scaled = products[:, free][:, :, free] / scale[:, free, None] / scale[:, None, free]
-            eigenvalues, axes = np.linalg.eigh(scaled)
-            possible = eigenvalues[:, 0] > ROUNDING
-            inverse = 1 / np.where(possible[:, None], eigenvalues, 1.0)
-            nu[:, free] = np.einsum("tij,tj,tkj,tk->ti", axes, inverse, axes, left) / scale[:, free]
-            possible &= np.all((low <= nu) & (nu <= high), axis=1)
-        value = 2 * np.sum(correlations * nu, axis=1) - np.einsum("ti,tij,tj->t", nu, products, nu)
-        better = possible & ~(value <= values)
-        best[better], values[better] = nu[better], value[better]
-    return best, values
-
-
 def severity(
     scan: Scan, candidate: Candidate | str, *, coverage: float = 0.95, reach: ArrayLike | None = None
 ) -> Severity:
-    """Return the share lost, with an interval that counts the search of the onset.
+    """Return the share lost, with an interval that accounts for the search for the onset.
 
     The interval holds the shares at which twice the logarithm of the likelihood, profiled over the onset and over the
     constants added, is within the quantile of chi square of its maximum. `coverage` is its nominal probability; the

@@ -1,9 +1,9 @@
 """The compiled search for two faults over all candidates and onsets.
 
-The product of the signature of a fault that began earlier with one of onset k depends on what the earlier one has left
-in the state of the predictor error at k and on how it goes on: a bilinear form in the quantities that
-`optid.faults.search.sweep_kernels.grams` keeps for every onset. So no signature is written out, and all products of N
-onsets and D columns cost O(N^2 D^2 n).
+The product of the signature of an earlier fault with one of onset k is a bilinear form in the state of the prediction
+error that the earlier one causes at k, in its later course, and in the quantities that
+`optid.faults.search.sweep_kernels.grams` stores for every onset. So no signature is computed explicitly, and all
+products of N onsets and D columns cost O(N^2 D^2 n).
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def joint_energy(first, second, cosines, floor, work):
-    """Return the energy that two subspaces explain together; -1 where nothing of the smaller one is left beside it.
+    """Return the energy that two subspaces explain together; -1 where the larger one contains the smaller one.
 
     Coordinates (a,) and (b,) of the window are along the axes of the larger and of the smaller one, with products
     `cosines` (a, b); below `floor` a direction beside the other subspace is part of it; `work` (b, b + 1) is scratch.
@@ -21,7 +21,7 @@ def joint_energy(first, second, cosines, floor, work):
     energy = 0.0
     for i in range(a):
         energy += first[i] * first[i]
-    for j in range(b):  # what is left of the smaller one beside the larger one, and of the window along it
+    for j in range(b):  # the smaller one, and the window along it, orthogonal to the larger one
         left = second[j]
         for i in range(a):
             left -= cosines[i, j] * first[i]
@@ -57,13 +57,13 @@ def joint_energy(first, second, cosines, floor, work):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(tables, products, states, along, roots, tested, z, q, same, floor, best, onsets, alike):
-    """Find the best pair of onsets for every pair of candidates; return how many pairs cannot be told apart.
+    """Find the best pair of onsets for every pair of candidates; return the number of indistinguishable pairs.
 
     Args:
         tables: `optid.faults.search.sweeps.Tables`.
         products: (N, D, D) of columns with the same onset.
         states: (N, n, D) of a unit state with the columns.
-        along: (N, Q, D) what an uncertain model takes off the products.
+        along: (N, Q, D) the reduction of the products by an uncertain model.
         roots: (N, R) inverse roots of the products.
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.

@@ -1,8 +1,8 @@
-"""Programmes about faults, posed by registered formulations and solved by any back end.
+"""Fault formulations, solved by any back end.
 
-Every function passes further keyword arguments to its formulation, where they are documented, but for `solver` (the
-back end's word, "auto" by default, or a back end of your own) and `settings` (of `optid.solve`, such as accuracy and
-time_limit). All raise SolverFailed where the solver gives no point, and the errors of the formulation.
+Every function passes further keyword arguments to its formulation (`formulations/faults`), where they are documented,
+but for `solver` (name of a back end, "auto" by default, or a back end) and `settings` (of `optid.solve`, such as
+accuracy and time_limit). All raise SolverFailed where the solver returns no point, and the errors of the formulation.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 
 def solved(name: str, *arguments: Any, solver: Any = "auto", settings: dict[str, Any] | None = None,
            **structure: Any) -> Any:
-    """Return the result of a fault formulation by its registered name.
-
-    Raises:
-        SolverFailed: the solver gives no point.
-    """
+    """Return the result of a fault formulation by its registered name."""
     from optid.solving.solve import run
 
     outcome = run(fault_formulation(name)(*arguments, **structure), solver, **(settings or {}))
@@ -41,13 +37,8 @@ def solved(name: str, *arguments: Any, solver: Any = "auto", settings: dict[str,
 def signature_estimate(found: "Scan", limits: "Thresholds", **how: Any) -> "SparseResult":
     """Choose few faults at few onsets that explain a window, by the group-sparse programme (`fault.signature`).
 
-    Args:
-        found: the search of the window.
-        limits: its thresholds.
-        how: penalty (at one something is active exactly when the search raises an alarm) and constraints.
-
-    Returns:
-        The result with its gap; where the solver fails it is not `certified` and says why.
+    Further arguments are penalty (at one a group is active exactly when the search raises an alarm) and constraints.
+    Where the solver fails, the result is not `certified` and its status gives the reason.
     """
     return solved("fault.signature", found, limits, **how)
 
@@ -57,35 +48,26 @@ def membership(
 ) -> "Membership":
     """Prove by linear programming that no healthy plant within bounds of its noise made a window (`fault.membership`).
 
-    Args:
-        model: the healthy model.
-        data: the window; one experiment, some ten to a hundred samples.
-        bounds: of the noise: a number of standard deviations (three by default), or {"process": (n,), "output": (l,)}.
-        faults: candidates that are tried, too.
-        how: onsets, candidates and constraints.
+    Bounds are a number of standard deviations (three by default) or {"process": (n,), "output": (l,)}; candidates of
+    `faults` are tested, too. Further arguments are onsets, candidates and constraints.
     """
     how |= {} if bounds is None else {"bounds": bounds}
     return solved("fault.membership", model, data, faults=faults, **how)
 
 
 def profile(found: "Scan", label: str, prior: str = "auto", **how: Any) -> "Profile":
-    """Estimate the course of one fault over time (`fault.profile`).
+    """Estimate the course of one fault, of a candidate with one magnitude, over time (`fault.profile`).
 
-    Args:
-        found: the search of the window.
-        label: of a candidate with one magnitude.
-        prior: "tv" (steps), "trend" (ramps), "smooth" (random walk), or "auto": the better of the first two by BIC.
-        how: sign, limit, slew, penalties and constraints.
+    The prior is "tv" (steps), "trend" (ramps), "smooth" (random walk), or "auto": the better of the first two by BIC.
+    Further arguments are sign, limit, slew, penalties and constraints.
     """
     return solved("fault.profile", found, label, prior=prior, **how)
 
 
 def noise_covariance(found: "Dictionary", whitened: "Whitened", **how: Any) -> "CovarianceMatch":
-    """Match the covariances of a window by more noise in several places, or any (`fault.noise_covariance`).
+    """Match the covariances of a window by additional noise in several places (`fault.noise_covariance`).
 
-    Args:
-        found: the candidates: those of kind "noise", or, where there are none, every place of the others.
-        whitened: the window; one experiment.
-        how: form, lags, onset and constraints.
+    The candidates are those of kind "noise", or, where there are none, every place of the others. Further arguments
+    are form, lags, onset and constraints.
     """
     return solved("fault.noise_covariance", found, whitened, **how)

@@ -12,21 +12,22 @@ from optid.errors import LookupFailed, StructureError, nearest
 from optid.faults.search.sweeps import Sweep, sweep
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
+from optid.show.wording import short
 
 if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
 
 
 ALIKE = 2e-6
-"""One less the squared cosine of two signatures below which no window can tell them apart."""
+"""One less the squared cosine of two signatures below which they are indistinguishable."""
 
 
 class Magnitude(NamedTuple):
     """The magnitudes of a fault by least squares.
 
     Attributes:
-        nu: (d,) magnitudes; zero along directions that the window does not see.
-        covariance: (d, d) for this candidate and onset; the search of the onset is not counted.
+        nu: (d,) magnitudes; zero along directions without effect.
+        covariance: (d, d) for this candidate and onset, without the search for the onset.
     """
 
     nu: Array
@@ -42,7 +43,7 @@ class Scan:
         whitened: the window.
         u: (N, m) inputs, None where they were not given.
         statistic: (C, N) energy explained, NaN where a candidate is not tested: it has no signature (frozen sensor,
-            noise, a loss without u), nothing is seen of it, or too few readings follow the onset.
+            noise, a loss without u), it has no effect, or too few readings follow the onset.
         sweep: the prepared search.
         correlations: (N, D) of the window with the columns of the signatures.
     """
@@ -56,12 +57,12 @@ class Scan:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What the candidates are called."""
+        """Labels of the candidates."""
         return self.dictionary.labels
 
     @property
     def energy(self) -> float:
-        """Energy of the window, what is expected of a healthy one being its number of readings."""
+        """Energy of the window; its expected value for a healthy plant is the number of readings."""
         return float(np.sum(self.whitened.r**2))
 
     def index(self, candidate: Candidate | str) -> int:
@@ -101,14 +102,14 @@ class Scan:
         return Magnitude(inverse @ self.correlations[onset, self.sweep.columns(c)], inverse)
 
     def signature(self, candidate: Candidate | str, onset: int) -> Array:
-        """Return what one unit of each magnitude leaves in the window, (N, l, d).
+        """Return the signature (N, l, d) of one unit of each magnitude in the window.
 
         Raises:
             StructureError: a candidate without a signature.
         """
         c, count = self.index(candidate), len(self.whitened.r)
         if not self.sweep.tables.sizes[c]:
-            self.dictionary.additions(self.dictionary.candidates[c], count, 0, self.u)  # which says why there is none
+            self.dictionary.additions(self.dictionary.candidates[c], count, 0, self.u)  # refuses with the reason
             raise StructureError(f"{self.labels[c]} has no signature in this window.")
         if not 0 <= onset < count:
             raise StructureError(f"onset={onset} lies outside the window of {count} samples.")
@@ -137,13 +138,13 @@ class Scan:
         lines = [f"window of {len(self.whitened.r)} samples, energy {self.energy:.1f}",
                  f"  {'candidate':<40}{'energy':>9}{'onset':>7}  magnitude"]
         for candidate, row in zip(self.dictionary.candidates, self.statistic):
-            label = shorten(candidate.label, 39)
+            label = short(candidate.label, 39)
             if np.isnan(row).all():
                 lines.append(f"  {label:<40}{'not tested':>16}")
                 continue
             onset = self.peak(candidate)
             sizes = " ".join(f"{v:.3g}" for v in self.estimate(candidate, onset).nu)
-            lines.append(f"  {label:<40}{row[onset]:>9.1f}{onset:>7}  {shorten(sizes, 20)}")
+            lines.append(f"  {label:<40}{row[onset]:>9.1f}{onset:>7}  {short(sizes, 20)}")
         return "\n".join(lines)
 
 
@@ -156,7 +157,7 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         found: the candidates.
         whitened: the window; one experiment.
         u: (N, m) inputs of the window in raw units, for losses, stuck actuators and scheduled changes.
-        onsets: the onsets that are searched, whole numbers from 0; all by default.
+        onsets: the onsets that are searched, nonnegative integers; all by default.
 
     Raises:
         DataError: inputs of another length or with a missing sample, innovations that are not finite.
@@ -171,12 +172,7 @@ def scan(found: Dictionary, whitened: Whitened, u: ArrayLike | None = None, *, o
         count = len(whitened.r)
         chosen = np.atleast_1d(np.arange(count)[onsets] if isinstance(onsets, slice) else np.asarray(onsets))
         if not (np.issubdtype(chosen.dtype, np.integer) and chosen.size and 0 <= chosen.min() <= chosen.max() < count):
-            raise StructureError(f"onsets: whole numbers from 0 to {count - 1} are needed, one at least.")
+            raise StructureError(f"onsets: they must be integers from 0 to {count - 1}, at least one.")
         statistic[:, np.setdiff1d(np.arange(count), chosen)] = np.nan
     inputs = None if u is None else np.asarray(u, dtype=float).reshape(len(whitened.r), -1)
     return Scan(found, whitened, inputs, statistic, prepared, correlations)
-
-
-def shorten(text: str, most: int) -> str:
-    """Cut a long text for a table."""
-    return text if len(text) <= most else text[: most - 1] + "…"

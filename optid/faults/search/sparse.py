@@ -1,7 +1,7 @@
-"""What the group-sparse programme says of a window: which faults may be there, which are certainly not.
+"""Result of the group-sparse programme: active candidates, and those that are certainly zero.
 
-Its magnitudes are shrunk and neighbouring onsets stand in for one another: it chooses where to look, the exact search
-over what it chose (`optid.faults.search.subsets`) answers.
+Its magnitudes are shrunk, and neighbouring onsets share one fault: it selects onsets for the exact search
+(`optid.faults.search.subsets`).
 """
 
 from collections.abc import Mapping
@@ -12,18 +12,18 @@ import numpy as np
 from optid.arrays import Array
 
 REACH = 10
-"""Onsets on either side of an active one at which the exact search looks, for every candidate."""
+"""Onsets on either side of an active one that are searched exactly, for every candidate."""
 
 
 @dataclass(frozen=True, eq=False)
 class ActiveGroup:
-    """One candidate at one onset that the programme makes use of.
+    """One active candidate at one onset.
 
     Attributes:
         label: of the candidate.
         onset: first sample that it changes.
         size: (d,) magnitudes, shrunk by the penalty: not an estimate.
-        deflection: sigma per sample times root of samples, shrunk too.
+        deflection: norm of the whitened signature, shrunk, too.
     """
 
     label: str
@@ -37,12 +37,12 @@ class SparseResult:
     """The optimum of the group-sparse programme.
 
     Attributes:
-        active: what is not zero, largest deflection first.
+        active: groups that are not zero, largest deflection first.
         count: samples of the window.
         objective: value reached.
         bound: lower bound on it, recomputed from a feasible dual point.
         gap: their relative distance.
-        certified: whether the gap is below 1e-6; without it nothing is to be concluded.
+        certified: whether the gap is below 1e-6; otherwise the result is not conclusive.
         largest: smallest penalty at which nothing is active; above one exactly when the search raises an alarm.
         penalty: the one used; one by default, at which "something is active" is the alarm.
         provably_zero: {label: (N,) whether the candidate at that onset is zero in every optimum}; False where it is
@@ -103,7 +103,7 @@ class SparseResult:
         return mask
 
     def __str__(self) -> str:
-        """Print what is active, the gap and what is ruled out."""
+        """Print the active groups, the gap and the number of zero groups."""
         zero = sum(int(mask.sum()) for mask in self.provably_zero.values())
         tested = "certified" if self.certified else "not certified"
         lines = [f"group-sparse programme, penalty {self.penalty:g}: "
@@ -115,4 +115,4 @@ class SparseResult:
             lines.append(f"  and {len(self.active) - 12} more")
         if not self.certified:
             lines.append(f"  {self.status}"[:80])
-        return "\n".join([*lines, "Magnitudes are shrunk: the exact search over these onsets answers."])
+        return "\n".join([*lines, "Magnitudes are shrunk: search these onsets exactly (polish)."])

@@ -1,12 +1,12 @@
-"""The exact search for a few faults among the candidates and onsets that are left of a window.
+"""Exact search for several faults at once.
 
-Maximised is the energy that all faults of a subset explain together less their thresholds, over every subset up to a
-size. The products of the atoms carry all that is needed: once a fault is chosen, the others lose what they share with
-it (a Schur complement), down to the last two, for which all pairs stand in one table. All pairs of all onsets have a
-closed form of their own (`optid.faults.search.pair_kernels`).
+The energy that all faults of a subset explain together, less their thresholds, is maximised over all subsets up to a
+size. It follows from the products of the atoms: once a fault is chosen, it is projected out of the others (a Schur
+complement), down to the last two, whose pairs are evaluated in one table. All pairs over all onsets are searched by a
+compiled recursion (`optid.faults.search.pair_kernels`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import comb
 from typing import TYPE_CHECKING, NamedTuple
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
     from optid.faults.search.calibration import Thresholds
 
 MOST = 400_000_000
-"""Subsets that are searched at most."""
+"""Largest number of subsets searched."""
 
 MOST_PAIRED = 50_000
-"""Atoms (candidates times onsets) beyond which all pairs take too long."""
+"""Largest number of atoms (candidates times onsets) whose pairs are searched."""
 
 LISTED = 1000
-"""Pairs that cannot be told apart and are listed."""
+"""Largest number of indistinguishable pairs listed."""
 
 TABLE = 4_000_000
 """Numbers in a table of pairs."""
 
 EXCHANGED = 3
-"""Subsets that are improved by exchanges."""
+"""Number of subsets improved by exchanges."""
 
 COLUMNS = 6000
-"""Columns that the atoms of a search may have."""
+"""Largest number of columns of the atoms of a search."""
 
 
 class Subset(NamedTuple):
@@ -58,7 +58,7 @@ class Subset(NamedTuple):
     energy: float
 
     def __str__(self) -> str:
-        """Say what and where."""
+        """State candidates and onsets."""
         return " and ".join(f"{label} from sample {onset}" for label, onset in zip(self.labels, self.onsets))
 
 
@@ -74,7 +74,7 @@ class SubsetSearch:
         subsets: number of subsets compared.
         max_faults: faults in a subset at most.
         sparse: the programme that chose the onsets; None where all were searched.
-        alike: number of pairs that the window cannot tell apart, where all pairs were searched.
+        alike: number of pairs that the window does not distinguish, where all pairs were searched.
         indistinguishable: the first of them.
     """
 
@@ -134,14 +134,12 @@ class SubsetSearch:
         share = f"{int(self.searched.sum())} of {self.searched.size} onsets"
         how = "" if self.sparse is None else f", chosen by a programme (gap {self.sparse.gap:.1e})"
         lines.append(f"{self.subsets} subsets at {share}{how}")
-        lines += [f"{self.alike} pairs of onsets cannot be told apart in this window"] * bool(self.alike)
+        lines += [f"{self.alike} pairs of onsets are indistinguishable in this window"] * bool(self.alike)
         return "\n".join(lines)
 
 
 def pairs(scan: Scan, thresholds: "Thresholds", *, same: bool = True) -> SubsetSearch:
     """Search a window for two faults, exactly: all pairs of candidates and onsets, magnitudes by least squares (F4).
-
-    Maximised is the energy that both explain together less both thresholds.
 
     Args:
         scan: the search for one fault.
@@ -154,12 +152,7 @@ def pairs(scan: Scan, thresholds: "Thresholds", *, same: bool = True) -> SubsetS
     from optid.faults.search.pair_kernels import search
     from optid.faults.search.sweep_kernels import grams
 
-    q, prepared, tested = thresholds.of(scan.labels), scan.sweep, ~np.isnan(scan.statistic)
-    without = [label for label, value, row in zip(scan.labels, q, tested) if row.any() and np.isnan(value)]
-    if without:
-        raise StructureError(
-            f"There is no threshold for {', '.join(without)}: calibrate with the inputs, thresholds(..., u=u)."
-        )
+    q, prepared, tested = thresholds.for_scan(scan), scan.sweep, ~np.isnan(scan.statistic)
     number = int(tested.sum())
     if number > MOST_PAIRED:
         raise StructureError(
@@ -195,10 +188,9 @@ def polish(
     found: Scan, limits: "Thresholds", sparse: SparseResult | None = None, *, max_faults: int = 2, reach: int = REACH,
     exchange: bool = True,
 ) -> SubsetSearch:
-    """Search exactly for up to `max_faults` faults at the onsets near those a programme made use of (F3).
+    """Search exactly for up to `max_faults` faults at the onsets near the active ones of a programme (F3).
 
-    All candidates are tried at all these onsets: which of them the programme had there does not matter, because it
-    confuses those that look alike.
+    All candidates are tried at all these onsets, because the programme confuses those with similar signatures.
 
     Args:
         found: the search for one fault.
@@ -214,7 +206,7 @@ def polish(
     check_integer(max_faults, "max_faults")
     count = found.statistic.shape[1]
     mask = np.ones(count, dtype=bool) if sparse is None else sparse.near(reach)
-    atoms = atoms_of(found, limits, mask) if mask.any() else ()
+    atoms = atoms_of(found, limits, mask) if mask.any() else tuple[Atoms, ...]()
     number = sum(a.onsets.size for a in atoms)
     subsets = sum(comb(number, k) for k in range(1, max_faults + 1))
     if subsets > MOST or sum(a.onsets.size * a.dimension for a in atoms) > COLUMNS:
@@ -222,18 +214,23 @@ def polish(
             f"{number} candidates and onsets make {subsets:.2g} subsets of up to {max_faults} faults: too many for an "
             "exact search. Use fewer faults, a smaller reach, or scan fewer onsets."
         )
-    pool = _pool(atoms, found.whitened.r.ravel())
+    r = found.whitened.r.ravel()
+    columns = np.hstack([np.zeros((r.size, 0)), *(np.moveaxis(a.axes, 1, 0).reshape(r.size, -1) for a in atoms)])
+    kinds = np.repeat(np.arange(len(atoms)), [a.onsets.size for a in atoms]).astype(int)
+    edges = np.cumsum([0, *(atoms[kind].dimension for kind in kinds)])
+    q = np.array([atoms[kind].threshold for kind in kinds])
+    pool = _Pool(columns.T @ columns, columns.T @ r, edges, q, kinds, np.arange(kinds.size))
     names = [(a.label, int(onset)) for a in atoms for onset in a.onsets]
     best: dict[tuple[int, ...], tuple[float, tuple[int, ...]]] = {}
     for size in range(1, min(max_faults, number) + 1):
         for gain, members in _search(pool, size):
-            kinds = tuple(sorted(pool.kinds[list(members)]))
-            if kinds not in best or gain > best[kinds][0]:
-                best[kinds] = gain, tuple(sorted(members))
+            chosen = tuple(sorted(kinds[list(members)]))
+            if chosen not in best or gain > best[chosen][0]:
+                best[chosen] = gain, tuple(sorted(members))
     ranked = []
     for gain, members in best.values():
         labels, onsets = zip(*(names[i] for i in members))
-        ranked.append(Subset(labels, onsets, gain, gain + float(np.sum(pool.q[list(members)]))))
+        ranked.append(Subset(labels, onsets, gain, gain + float(np.sum(q[list(members)]))))
     ranked.sort(key=lambda s: -s.gain)
     if exchange and sparse is not None and ranked and not mask.all():
         ranked = _improved(found, limits, ranked)
@@ -256,15 +253,10 @@ def _improved(found: Scan, limits: "Thresholds", ranked: list[Subset]) -> list[S
 
 
 class _Pool(NamedTuple):
-    """Atoms by their products; the axes of every atom are orthonormal in what is left.
+    """Atoms by their products (P, P) and the coordinates `along` (P,) of the window; the axes of each are orthonormal.
 
-    Attributes:
-        products: (P, P).
-        along: (P,) coordinates of the window.
-        edges: (G + 1,) columns of every atom.
-        q: (G,) thresholds.
-        kinds: (G,) candidate of every atom.
-        places: (G,) numbers of the atoms before some were taken away.
+    For each of the G atoms: edges (G + 1,) of its columns, threshold q, candidate, and its number `places` in the
+    whole pool.
     """
 
     products: Array
@@ -273,14 +265,6 @@ class _Pool(NamedTuple):
     q: Array
     kinds: np.ndarray
     places: np.ndarray
-
-
-def _pool(atoms: Sequence[Atoms], r: Array) -> _Pool:
-    columns = np.hstack([np.zeros((r.size, 0)), *(np.moveaxis(a.axes, 1, 0).reshape(r.size, -1) for a in atoms)])
-    kinds = np.repeat(np.arange(len(atoms)), [a.onsets.size for a in atoms]).astype(int)
-    sizes, q = (np.array(values)[kinds] for values in ([a.dimension for a in atoms], [a.threshold for a in atoms]))
-    return _Pool(columns.T @ columns, columns.T @ r, np.concatenate([[0], np.cumsum(sizes)]), q, kinds,
-                 np.arange(kinds.size))
 
 
 def _search(pool: _Pool, size: int) -> Iterator[tuple[float, tuple[int, ...]]]:
@@ -302,7 +286,7 @@ def _search(pool: _Pool, size: int) -> Iterator[tuple[float, tuple[int, ...]]]:
 
 
 def _without(pool: _Pool, i: int) -> _Pool:
-    """Take an atom out of those after it, orthonormalise what is left of them, and drop those of which nothing is."""
+    """Project an atom out of those after it, orthonormalise these, and drop those that vanish."""
     own, after = slice(pool.edges[i], pool.edges[i + 1]), slice(pool.edges[i + 1], None)
     shared = pool.products[own, after]
     products = pool.products[after, after] - shared.T @ shared
@@ -343,7 +327,7 @@ def _pair_gains(pool: _Pool, first: np.ndarray, second: np.ndarray, large: int, 
     shared = pool.products[np.ix_(rows, columns)].reshape(first.size, large, second.size, small)
     b, c = pool.along[rows].reshape(-1, large), pool.along[columns].reshape(-1, small)
     rest = c[None] - np.einsum("iajc,ia->ijc", shared, b)
-    own = np.diag(pool.products)[columns].reshape(-1, small)  # one, or zero for a direction of which nothing is seen
+    own = np.diag(pool.products)[columns].reshape(-1, small)  # one, or zero for a direction without effect
     left = own[:, :, None] * np.eye(small) - np.einsum("iajc,iajd->ijcd", shared, shared)
     roots = inverse_roots(left.reshape(-1, small, small), np.ones(left.shape[0] * left.shape[1]), ALIKE)
     roots = roots.reshape(left.shape)

@@ -2,7 +2,7 @@
 
 A column j of a fault adds h_j(k) to the innovation of sample k and e_j(k) to the state of the predictor error at k + 1,
 from its onset on. Columns are ordered by their course: those that last, drifts, jumps of one sample. Every drift has a
-helper among those that last: what a drift of earlier onset is from k on, is a drift of onset k on top of a constant.
+helper among those that last: an earlier drift is, from k on, a drift of onset k plus a constant.
 """
 
 import numpy as np
@@ -74,10 +74,9 @@ def grams(tables, slots, products, states):
     Args:
         tables: `optid.faults.search.sweeps.Tables`.
         slots: (D, D) where in a row of products that of two columns is written, -1 for nowhere; those of columns of
-            different candidates are computed only where states are wanted.
+            different candidates are computed only with states.
         products: (N, R) written.
-        states: (N, n, D) product of a column with what a unit state at its onset leaves, written; (0, n, D) where it is
-            not wanted.
+        states: (N, n, D) product of a column with the response to a unit state at its onset, written; or (0, n, D).
     """
     whole = states.shape[0] > 0
     of, F, C, W, h, e, group = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e, tables.group
@@ -90,7 +89,7 @@ def grams(tables, slots, products, states):
     for step in range(count):
         k = count - 1 - step
         t = of[k]
-        # what goes on after this sample: a lasting column as it is, a drift on top of its helper, a jump not at all
+        # after this sample a lasting column continues, a drift continues on top of its helper, a jump has ended
         for j in range(columns):
             for i in range(n):
                 carried[i, j] = P[i, j] if j < lasting + drifts else 0.0
@@ -155,33 +154,3 @@ def explained(tables, correlations, roots, statistic):
                     z += roots[k, place + q * d + p] * correlations[k, begin + p]
                 total += z * z
             statistic[c, k] = total
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def course(tables, first, order, onset, signature):
-    """Write the whitened signature (N, l, d) of the columns from `first`; order 0: they last, 1: drifts, 2: jumps."""
-    count, l, d = signature.shape  # noqa: E741
-    n = tables.F.shape[1]
-    x, later, now = np.zeros((n, d)), np.zeros((n, d)), np.zeros(l)
-    for k in range(onset, count):
-        t = tables.of[k]
-        age = k - onset
-        share = 1.0 if order == 0 else age + 1.0 if order == 1 else 1.0 if age == 0 else 0.0
-        for j in range(d):
-            for o in range(l):
-                now[o] = share * tables.h[t, o, first + j]
-                for i in range(n):
-                    now[o] += tables.C[o, i] * x[i, j]
-            for o in range(l):
-                total = 0.0
-                for a in range(o + 1):
-                    total += tables.W[t, o, a] * now[a]
-                signature[k, o, j] = total
-            for i in range(n):
-                total = share * tables.e[t, i, first + j]
-                for a in range(n):
-                    total += tables.F[t, i, a] * x[a, j]
-                later[i, j] = total
-        for i in range(n):
-            for j in range(d):
-                x[i, j] = later[i, j]

@@ -12,21 +12,17 @@ so that correlations are those of the plain signatures with S r, and products lo
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from optid.arrays import Array, compact
 from optid.errors import DataError, StructureError
-from optid.faults.scheduled import change
+from optid.faults.faults import matrices_of
 from optid.faults.signatures import Candidate, Dictionary
-from optid.faults.whitening import Predictor, Whitened
+from optid.faults.whitening import Whitened
 from optid.models.experiments import samples_of
-from optid.models.recursions import SHORT, propagated
-
-if TYPE_CHECKING:
-    from optid.faults.nuisance import Nuisance
 
 SHARE = 1e-9
 """Directions of a signature with less than this share of the energy of the largest one explain nothing."""
@@ -42,15 +38,15 @@ ORDERS = {"drift": 1, "jump": 2, "spike": 2}
 
 
 class Tables(NamedTuple):
-    """What the kernels of `optid.faults.search.sweep_kernels` read.
+    """Input of the kernels of `optid.faults.search.sweep_kernels`.
 
     Attributes:
         of: (N,) which of the T tables governs a sample.
         F: (T, n, n) transition of the error of the predictor.
         C: (l, n).
         W: (T, l, l) whitening, lower triangular; zero rows and columns where a reading is missing.
-        h: (T, l, D) what the columns add to the innovation.
-        e: (T, n, D) what they add to the state of the next sample.
+        h: (T, l, D) additions of the columns to the innovation.
+        e: (T, n, D) their additions to the state of the next sample.
         lasting: number of columns that last, which come first.
         drifts: number of drifts, which follow; the others are jumps.
         helpers: index of the helper of the first drift.
@@ -81,24 +77,27 @@ class Sweep:
 
     Attributes:
         found: the dictionary.
-        window: samples N.
-        present: (N, l) whether a reading is there; None where all are.
-        nuisance: what uncertain parameters leave in the windows.
+        white: a window like those to be searched: its predictor, missing readings, uncertain model and states.
+        u: (N, m) inputs; None where they were not given.
         tables: of the recursions and of the columns.
         roots: (N, R) inverse roots of the products, row by row and candidate after candidate; zero rows for directions
-            that nothing is seen of.
-        tested: (C, N) whether the candidate is looked for at the onset.
+            that have no effect.
+        tested: (C, N) whether the candidate is tested at the onset.
         along: V (N, q, D): an uncertain model takes V' V off the products of the columns; q is zero without one.
     """
 
     found: Dictionary
-    window: int
-    present: Array | None
-    nuisance: "Nuisance | None"
+    white: Whitened
+    u: Array | None
     tables: Tables
     roots: Array
     tested: np.ndarray
     along: Array
+
+    @property
+    def window(self) -> int:
+        """Samples N of a window."""
+        return len(self.white.r)
 
     def roots_of(self, c: int) -> Array:
         """Return R (N, d, d) of a candidate: R' R is the inverse of the products of its columns."""
@@ -111,25 +110,20 @@ class Sweep:
 
     def signature(self, c: int, onset: int) -> Array:
         """Return the whitened signature (N, l, d) of a candidate that has one."""
-        tables, order, since = self.tables, ORDERS.get(self.found.candidates[c].kind, 0), self.window - int(onset)
-        result = np.zeros((self.window, self.found.model.l, int(tables.sizes[c])))
-        if len(tables.F) == 1 and since <= SHORT:
-            share = (np.ones(since), np.arange(1.0, since + 1), np.eye(1, since)[0])[order][:, None, None]
-            drive = np.zeros((since, *tables.e.shape[1:]))[..., self.columns(c)]
-            drive[1:] = share[:-1] * tables.e[0][:, self.columns(c)]
-            seen = share * tables.h[0][:, self.columns(c)] + tables.C @ propagated(tables.F[0], drive)
-            result[int(onset) :] = tables.W[0] @ seen
+        candidate, white, A = self.found.candidates[c], self.white, None
+        if candidate.schedule is None:
+            into_state, into_output = self.found.additions(candidate, self.window, onset, self.u)
         else:
-            from optid.faults.search.sweep_kernels import course
-
-            course(tables, int(tables.first[c]), order, int(onset), result)
-        return result if self.nuisance is None else self.nuisance(result)
+            into_state, A = _change(self.found, candidate, white.states, self.u)
+            into_state[:onset] = 0.0
+            into_output = np.zeros((*white.r.shape, 1))
+        return white.seen(white.predictor.respond(into_state, into_output, white.present, A))
 
     def correlations(self, r: Array) -> Array:
         """Return the correlations (N, D) of a window (N, l) with the signatures."""
         from optid.faults.search.sweep_kernels import correlate
 
-        seen = r if self.nuisance is None else self.nuisance(r)
+        seen = r if self.white.nuisance is None else self.white.nuisance(r)
         result = np.empty((self.window, self.tables.group.size))
         correlate(self.tables, compact(seen), result)
         return result
@@ -148,12 +142,12 @@ class Sweep:
         return result
 
     def largest(self, windows: Array) -> Array:
-        """Return the largest energy over the onsets for windows (M, N, l), (M, C); NaN for what is not tested."""
+        """Return the largest energy over the onsets for windows (M, N, l), (M, C); NaN where not tested."""
         from optid.faults.search.sweep_kernels import correlate, explained
 
-        shown = windows if self.present is None else np.where(self.present, windows, 0.0)
-        if self.nuisance is not None:
-            shown = np.moveaxis(self.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
+        shown = np.where(self.white.present, windows, 0.0)
+        if self.white.nuisance is not None:
+            shown = np.moveaxis(self.white.nuisance(np.moveaxis(shown, 0, 2)), 2, 0)
         correlations = np.empty((self.window, self.tables.group.size))
         statistic, result = np.full(self.tested.shape, np.nan), np.empty((len(windows), len(self.tested)))
         for window, row in zip(compact(shown), result):
@@ -177,7 +171,7 @@ _MOST = 4
 def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
     """Prepare the search for one fault.
 
-    What depends on the model alone is kept with the dictionary for the next window of the same length.
+    Tables that depend on the model alone are cached with the dictionary for the next window of the same length.
 
     Args:
         found: the dictionary.
@@ -189,14 +183,16 @@ def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
         DataError: inputs of another length, or missing.
         StructureError: a window that is too short, or no candidate with a signature.
     """
-    white = window if isinstance(window, Whitened) else None
-    count = int(window) if white is None else len(white.r)  # type: ignore[arg-type]
-    steady = found.predictor if white is None else white.predictor
-    least = 2 * found.model.nx + 2
+    if isinstance(window, Whitened):
+        white = window
+    else:
+        empty = np.zeros((int(window), found.model.l))
+        white = Whitened(empty, empty, np.ones(empty.shape, dtype=bool), found.predictor, found.model.outputs)
+    count, least = len(white.r), 2 * found.model.nx + 2
     if count < least:
-        raise StructureError(f"window={count}: at least {least} samples are needed for {found.model.nx} states.")
+        raise StructureError(f"window={count}: {found.model.nx} states require at least {least} samples.")
     inputs = None if u is None else _inputs(found, u, count)
-    states = None if white is None or inputs is None else white.states
+    states = None if inputs is None else white.states
     able = tuple(
         c.additive or bool(c.columns) and inputs is not None or c.schedule is not None and states is not None
         for c in found.candidates
@@ -205,19 +201,19 @@ def sweep(found: Dictionary, window: int | Whitened, u: Any = None) -> Sweep:
         raise DataError(f"The states have {len(states)} samples; the window has {count}: cut them like the rest.")
     if not any(able):
         raise StructureError(
-            "No candidate has a signature to look for: add the kind 'bias', 'drift' or a state jump, or pass the input "
-            "u for losses and stuck actuators."
+            "No candidate has a signature: add the kind 'bias', 'drift' or a state jump, or pass the input u for "
+            "losses and stuck actuators."
         )
-    present = None if white is None or white.present.all() else white.present
-    nuisance = None if white is None else white.nuisance
-    if present is not None or nuisance is not None or any(a and not c.additive for c, a in zip(found.candidates, able)):
-        return _prepared(found, count, steady, present, inputs, nuisance, states, able)
+    driven = any(a and not c.additive for c, a in zip(found.candidates, able))
+    if driven or white.nuisance is not None or not white.present.all():
+        return _prepared(found, white, inputs, able)
+    steady = white.predictor
     key = (count, able, *(part.tobytes() for part in (steady.A, steady.C, steady.K, steady.L, steady.root)))
     kept = _KEPT.setdefault(found, {})
     if key not in kept:
         if len(kept) >= _MOST:
             kept.pop(next(iter(kept)))
-        kept[key] = _prepared(found, count, steady, None, None, None, None, able, once=True)
+        kept[key] = _prepared(found, white, None, able, once=True)
     return kept[key]
 
 
@@ -229,20 +225,19 @@ def _inputs(found: Dictionary, u: Any, window: int) -> Array:
     if bad.any():
         k, c = np.argwhere(bad)[0]
         raise DataError(
-            f"Input {found.model.inputs[c]!r} is missing at sample {k}: the signature of a loss needs every input."
+            f"Input {found.model.inputs[c]!r} is missing at sample {k}: the signature of a loss requires every input."
         )
     return inputs
 
 
 def _prepared(
-    found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None,
-    nuisance: "Nuisance | None", states: Array | None, able: tuple[bool, ...], once: bool = False,
+    found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...], once: bool = False
 ) -> Sweep:
     from optid.faults.search.sweep_kernels import correlate, grams
 
-    tables = _tables(found, window, steady, present, u, able)
+    tables, window, nuisance = _tables(found, white, u, able), len(white.r), white.nuisance
     if any(a and c.schedule for a, c in zip(able, found.candidates)):
-        tables = _with_schedules(found, steady, tables, states, u)
+        tables = _with_schedules(found, white, tables, u)
     columns, size = tables.group.size, int(np.sum(tables.sizes**2))
     slots = np.full((columns, columns), -1, dtype=np.int64)
     for d, place, begin in zip(tables.sizes, tables.places, tables.first):
@@ -266,7 +261,7 @@ def _prepared(
             roots[:, place : place + d * d] = root.reshape(window, -1)
             tested[c] = np.any(root, axis=(1, 2))
             tested[c, window - (-(-int(d) // found.model.l)) + 1 :] = False
-    return Sweep(found, window, present, nuisance, tables, roots, tested, along)
+    return Sweep(found, white, u, tables, roots, tested, along)
 
 
 def inverse_roots(products: Array, largest: Array, share: float = SHARE) -> Array:
@@ -281,26 +276,22 @@ def inverse_roots(products: Array, largest: Array, share: float = SHARE) -> Arra
     return np.asarray(inverse[:, :, None] * np.swapaxes(axes, 1, 2))
 
 
-def _tables(
-    found: Dictionary, window: int, steady: Predictor, present: Array | None, u: Array | None, able: tuple[bool, ...]
-) -> Tables:
-    l = found.model.l  # noqa: E741
-    if present is None:
-        patterns, of = np.ones((1, l), dtype=bool), np.zeros(window, dtype=np.int64)
-    else:
-        patterns, which = np.unique(present, axis=0, return_inverse=True)
-        of = np.asarray(which, dtype=np.int64).ravel()
+def _tables(found: Dictionary, white: Whitened, u: Array | None, able: tuple[bool, ...]) -> Tables:
+    steady, window, l = white.predictor, len(white.r), found.model.l  # noqa: E741
+    patterns, which = np.unique(white.present, axis=0, return_inverse=True)
+    of = np.asarray(which, dtype=np.int64).ravel()
     gains = np.where(patterns[:, None, :], -steady.K, steady.L)
     whitening = np.stack([steady.whitened(np.eye(l)[None], pattern[None])[0] for pattern in patterns])
-    order = sorted((i for i, a in enumerate(able) if a), key=lambda i: ORDERS.get(found.candidates[i].kind, 0))
-    chosen = [found.candidates[i] for i in order]
-    drifts = [i for i in order if found.candidates[i].kind == "drift"]
-    # the helpers of the drifts are the last of the columns that last
-    lasting = [i for i in order if found.candidates[i].kind not in ORDERS] + drifts
-    line = lasting + drifts + [i for i in order if ORDERS.get(found.candidates[i].kind) == 2]
-    into = [_into(found, found.candidates[i], window, u) for i in line]
-    driven = any(not found.candidates[i].additive for i in line)
-    if driven:
+    candidates = found.candidates
+    lasting, drifts, jumps = (
+        [i for i, a in enumerate(able) if a and ORDERS.get(candidates[i].kind, 0) == order] for order in range(3)
+    )
+    line = lasting + drifts + drifts + jumps  # the helpers of the drifts are the last of the columns that last
+    into = [
+        found.additions(c, window, 0, u) if c.columns else (c.into_state[None], c.into_output[None])
+        for c in (candidates[i] for i in line)
+    ]
+    if not all(candidates[i].additive for i in line):
         into = [tuple(np.broadcast_to(part, (window, *part.shape[1:])) for part in pair) for pair in into]
         gains, whitening, of = gains[of], whitening[of], np.arange(window)
     x, z = (np.concatenate([pair[i] for pair in into], axis=2) for i in (0, 1))
@@ -308,25 +299,20 @@ def _tables(
     e = steady.A @ x + gains @ h
     h = np.broadcast_to(h, (len(gains), *h.shape[1:]))
     sizes = [pair[0].shape[2] for pair in into]
-    group = np.repeat(line, sizes)
     first, dimensions = np.zeros(len(able), dtype=np.int64), np.zeros(len(able), dtype=np.int64)
     for i, begin, d in zip(line, np.cumsum([0, *sizes]), sizes):  # of a drift, its own columns after its helpers
         first[i], dimensions[i] = begin, d
     places = np.concatenate([[0], np.cumsum(dimensions**2)[:-1]])
-    kinds = np.array([ORDERS.get(c.kind, 0) for c in chosen for _ in range(c.dimension)])
-    count = [int(np.sum(kinds == i)) for i in range(3)]
+    helpers, drifting = (sum(candidates[i].dimension for i in part) for part in (lasting, drifts))
     return Tables(
         of, compact(steady.A + gains @ steady.C), compact(steady.C), compact(whitening), compact(h), compact(e),
-        count[0] + count[1], count[1], count[0], group, first, dimensions, places,
+        helpers + drifting, drifting, helpers, np.repeat(line, sizes), first, dimensions, places,
     )
 
 
-def _with_schedules(
-    found: Dictionary, steady: Predictor, tables: Tables, states: Array | None, u: Array | None
-) -> Tables:
+def _with_schedules(found: Dictionary, white: Whitened, tables: Tables, u: Array | None) -> Tables:
     """Append the states of one more predictor for every scheduled change: it has matrices of its own."""
-    assert states is not None and u is not None
-    n = steady.A.shape[0]
+    steady, n = white.predictor, found.model.nx
     chosen = [(i, c) for i, c in enumerate(found.candidates) if c.schedule is not None and tables.sizes[i]]
     wide = n * (1 + len(chosen))
     count, _, columns = tables.e.shape
@@ -334,15 +320,23 @@ def _with_schedules(
     F[:, :n, :n], e[:, :n] = tables.F, tables.e
     for place, (i, candidate) in enumerate(chosen, 1):
         own, column = slice(n * place, n * (place + 1)), tables.first[i]
-        added, A = change(found.model, candidate, states, u)
+        added, A = _change(found, candidate, white.states, u)
         F[:, own, own] = tables.F + A - steady.A
         h[:, :, column] = added[:, :, 0] @ steady.C.T
         e[:, own, column] = np.einsum("kij,kj->ki", F[:, own, own], added[:, :, 0])
     return tables._replace(F=F, C=np.tile(tables.C, 1 + len(chosen)), h=h, e=e)
 
 
-def _into(found: Dictionary, candidate: Candidate, window: int, u: Array | None) -> tuple[Array, Array]:
-    """What a candidate adds to the state (1 or N, n, d) and the output (1 or N, l, d) at a sample after its onset."""
-    if candidate.additive or candidate.schedule is not None:  # what the latter adds comes with its matrices
-        return candidate.into_state[None], candidate.into_output[None]
-    return found.additions(candidate, window, 0, u)
+def _change(found: Dictionary, candidate: Candidate, states: Any, u: Any) -> tuple[Array, Array]:
+    """Return the additions (N, n, 1) of a scheduled change, (1.8) and (1.10), to the states, and its A(k) (N, n, n).
+
+    Its signature is the difference between the predictions of the healthy predictor, with states x, and of one with
+    the changed matrices: e+ = (A(k) - K C) e + (A(k) - A) x + (B(k) - B) f(u), for all onsets. Its magnitude is one
+    where the plant changes as described, and linear where B alone changes.
+    """
+    fault, count, model = candidate.schedule, len(u), found.model
+    assert fault is not None
+    A, B = (matrices_of(candidate.label, word, given, range(count), healthy, count)
+            for word, given, healthy in (("A", fault.A, model.A), ("B", fault.B, model.B)))
+    step = np.einsum("kij,kj->ki", A - model.A, states) + np.einsum("kij,kj->ki", B - model.B, model.expanded(u))
+    return np.vstack([np.zeros((1, model.nx)), step[:-1]])[:, :, None], A
