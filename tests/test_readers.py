@@ -330,7 +330,7 @@ def test_bad_files(tmp_path):
         (tmp_path / f"r.{kind}").write_bytes(b"")
         refuses(DataError, "is empty", read, tmp_path / f"r.{kind}")
     np.save(tmp_path / "o.npy", np.array([None, 1]))
-    refuses(DataError, "plain numbers", read, tmp_path / "o.npy")
+    refuses(DataError, "real numbers", read, tmp_path / "o.npy")
 
 
 def test_bad_tables():

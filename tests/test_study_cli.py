@@ -254,7 +254,7 @@ def test_compare_says_why_a_solver_was_not_run_and_what_to_do(folder):
     words = ("compare", "rig.csv", "-u", "current", "-y", "thrust", "--na", 2, "--nb", 1, "--repetitions", 1)
     linear = run(*words, "-f", "arx", "--solvers", "mosek", "clarabel")
     assert linear.exit_code == 0 and "mosek: solver 'mosek' is not installed: pip install Mosek" in linear.stdout
-    assert "not for arx" not in linear.stdout
+    assert "not applicable to arx" not in linear.stdout
     nobody = run(*words, "--basis", "triangular:5", "--solvers", "clarabel")
     assert nobody.exit_code == 4 and "Use an NLP back end (gauss_newton, ipopt, uno)" in nobody.stdout
 
@@ -280,7 +280,7 @@ def test_compare_says_which_solver_to_use(folder):
     assert lines[0].startswith("6 cells to run") and Path("page.html").stat().st_size > 20_000
     sentence = next(line for line in lines if line.startswith("Use "))
     assert "reached the accuracy of 1e-08 (verified residuals up to 1e-06 count) in" in sentence
-    assert "proved globally optimal" in sentence and "not for hammerstein_arx.exact: clarabel" in found.stdout
+    assert "proved globally optimal" in sentence and "not applicable to hammerstein_arx.exact: clarabel" in found.stdout
     assert read_rows("kept.sqlite")["warm_s"].size == 6
     again = run(*words, "--db", "kept.sqlite")
     assert again.stdout.startswith("6 of 6 cells are in kept.sqlite already; nothing is left to run")

@@ -1,4 +1,4 @@
-"""Options that a formulation brings along: one for each of its arguments, from its signature and its docstring."""
+"""Options for the arguments of a formulation, made from its signature and docstring."""
 
 import inspect
 import json
@@ -39,7 +39,7 @@ class FittingCommand(Command):
                 raise
             raise _refused(LookupFailed(unknown(name, option))) from None
         values = {p.name: ctx.params.pop(p.name) for p in self.params if getattr(p, "derived", False) and p.name}
-        words = [f"{key}={_json(value)}" for key, value in values.items() if value not in (None, (), [])]
+        words = [f"{key}={_json(key, value)}" for key, value in values.items() if value not in (None, (), [])]
         ctx.params["settings"] = [*words, *(ctx.params.get("settings") or ())] or None
         return rest
 
@@ -99,9 +99,10 @@ def options_of_others(taken: set[str]) -> list[Any]:
 
 def _parameter(key: str, text: str, more: str, panel: str, flag: bool = False) -> inspect.Parameter:
     word = option_of(key)
+    text = text if text.startswith("optid.") else text[:1].upper() + text[1:]
     option = typer.Option(
         f"{word}/--no-{word[2:]}" if flag else word, metavar=None if flag else "VALUE...", show_default=False,
-        help=escape(f"{text[:1].upper()}{text[1:]}.{more}"), rich_help_panel=panel)
+        help=escape(f"{text}.{more}"), rich_help_panel=panel)
     kind: Any = bool | None if flag else list[str] | None
     return inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option])
 
@@ -122,7 +123,7 @@ def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
 
 
 def unknown(name: str, option: str) -> str:
-    """Say that a formulation has no such option, what it has, and which formulations have it."""
+    """Return a message: the formulation has no such option; its options, and the formulations that have it."""
     key = option.removeprefix("--").partition("=")[0].replace("-", "_")
     having = [other for other, found in descriptions() if key in found.options]
     takes = " ".join(option_of(k) for k in describe(entry_point(FORMULATIONS, name)).options if k != "constraints")
@@ -130,10 +131,13 @@ def unknown(name: str, option: str) -> str:
     return f"formulation {name} takes no {option}; its own options are {takes}.{others}"
 
 
-def _json(words: Any) -> str:
-    """Write the words of one option as the value of ``--set``: numbers and true as such, several as a list."""
+def _json(key: str, words: Any) -> str:
+    """Write the words of the option of an argument as the value of ``--set``: JSON, several as a list."""
     from optid.cli.arguments import listed, one_or_all, value
 
     if isinstance(words, bool):
         return json.dumps(words)
-    return json.dumps(one_or_all([value(word) for word in listed(words) or []]))
+    found = listed(words)
+    if not found:
+        raise typer.BadParameter(f"{option_of(key)} needs a value")
+    return json.dumps(one_or_all([value(word) for word in found]))

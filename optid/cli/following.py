@@ -68,7 +68,8 @@ class Followed:
             if found is None:
                 remark = f"{self._path} is not the file that was read before: it is read from its beginning"
             else:
-                self._go_on(found, self._old)
+                self._tail = _before(found, int(self._old["offset"]))
+                self.place |= {key: self._old[key] for key in ("offset", "inode", "mark")}
                 yield from self._of(found, until_end or not _same(found, self._path))
                 if not _same(found, self._path):
                     remark = f"{self._path} was rotated: the rest of {found.name} was read"
@@ -77,22 +78,14 @@ class Followed:
                 else:
                     remark = self._remark
         while True:
-            self._begin()
-            first = True
+            self.place |= {"offset": 0, "inode": os.stat(self._path).st_ino, "mark": ""}
+            self._tail, first = b"", True
             for raw in self._of(self._path, until_end):
                 yield raw[0], remark if first else ""
                 first = False
             if until_end:
                 return
             remark = self._remark
-
-    def _begin(self) -> None:
-        self.place |= {"offset": 0, "inode": os.stat(self._path).st_ino, "mark": ""}
-        self._tail = b""
-
-    def _go_on(self, found: Path, old: Mapping[str, Any]) -> None:
-        self._tail = _before(found, int(old["offset"]))
-        self.place |= {"offset": int(old["offset"]), "inode": int(old["inode"]), "mark": old["mark"]}
 
     def _found(self, old: Mapping[str, Any]) -> Path | None:
         """The file that an earlier run read: under its name, or the name that a rotation gave it."""

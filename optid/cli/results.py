@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -94,12 +94,8 @@ def working(**written: Path | None) -> Iterator[Work]:
         work.heard = heard
         work.step("reading")
         yield work
-    _conclude(work.text, heard, written)
-
-
-def _conclude(text: str, heard: Sequence[str], written: dict[str, Path | None]) -> None:
-    say(coloured(text))
-    said = " ".join(text.split())
+    say(coloured(work.text))
+    said = " ".join(work.text.split())
     for sentence in heard:
         if " ".join(sentence.split()) not in said:
             note(sentence)
@@ -109,5 +105,5 @@ def _conclude(text: str, heard: Sequence[str], written: dict[str, Path | None]) 
 
 
 def command_line() -> str:
-    """Return the words of this run, as a page says them."""
+    """Return the command line of this run, for a report."""
     return shlex.join(["optid", *sys.argv[1:]])

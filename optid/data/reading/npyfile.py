@@ -87,15 +87,6 @@ def side_by_side(files: Mapping[str, NpyFile], rows: int, wanted: Sequence[str],
         yield {name: column for name, part in zip(wanted, parts) for column in part.values()}
 
 
-def load_npy(path: Path, label: str) -> np.ndarray:
-    """Return the array of an npy file of plain numbers; `DataError` with the label otherwise."""
-    with _named(label, "a NumPy file of plain numbers"), open(path, "rb") as file:
-        array = np.load(file, allow_pickle=False)
-        if not isinstance(array, np.ndarray):
-            raise ValueError("it is an archive; name it .npz")
-        return array
-
-
 def npz_arrays(path: Path, names: Sequence[str] | None = None) -> dict[str, Any]:
     """Return the arrays of these names of an npz file, or only all names; `DataError` where one is damaged."""
     with _named(path.name, "a NumPy file of plain numbers"), open(path, "rb") as file:

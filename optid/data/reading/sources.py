@@ -13,7 +13,7 @@ import numpy as np
 from optid.data.reading.columns import position_names
 from optid.data.reading.csvfile import open_csv
 from optid.data.reading.frames import frame_names, index_name, load_frame, only_clock, partition_blocks
-from optid.data.reading.npyfile import load_npy, npz_arrays, open_npy, side_by_side
+from optid.data.reading.npyfile import npz_arrays, open_npy, side_by_side
 from optid.data.reading.parts import Part, file_parts
 from optid.errors import DataError
 
@@ -102,7 +102,8 @@ def _file_table(path: Path, kind: str, columns: Sequence[str] | None, delimiter:
     if kind == ".npz":
         return Table(path.name, list(npz_arrays(path)), lambda wanted, *_: npz_arrays(path, wanted))
     if kind == ".npy":
-        return _of_array(path.name, load_npy(path, path.name), columns)
+        opened = open_npy(path, columns)
+        return Table(path.name, list(opened.names), lambda wanted, *_: next(opened.blocks(opened.rows, wanted)))
     from optid.data.reading.matlab import mat_names, mat_variables
 
     names = mat_names(path)

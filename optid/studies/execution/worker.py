@@ -33,16 +33,17 @@ _fresh_mb = 0.0
 
 
 def start(folder: str, packed: bytes, parent: int) -> None:
-    """Prepare a new process of a parent; its words and notes go to the folder.
+    """Prepare a new process of a parent; `packed` are the pickled function of a cell and its preparation, or None.
 
-    Packed is what makes a row of a cell, and what prepares for it (or None), pickled.
+    The folder takes the standard error as PROCESS.words, by the token of a cell a file with the process id, as old as
+    the run of the cell, and as TOKEN.row the row that `keep` was given.
     """
     global _function, _folder, _fresh_mb
     _folder = Path(folder)
     os.setsid()  # a kill of its group takes its children along, and Ctrl-C in the terminal does not reach it
     _die_with(parent)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # ends a solver that never returns from its own code, too
-    with open(words(_folder, os.getpid()), "wb") as file, open(os.devnull, "wb") as null:
+    with open(_folder / f"{os.getpid()}.words", "wb") as file, open(os.devnull, "wb") as null:
         os.dup2(file.fileno(), 2)
         os.dup2(null.fileno(), 1)
     faulthandler.enable()  # a segmentation fault then says where
@@ -54,10 +55,10 @@ def start(folder: str, packed: bytes, parent: int) -> None:
 
 
 def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] | None, str, str]:
-    """Run a pickled cell, which the token names in the notes, within so many MB.
+    """Run the pickled cell of a token within so many MB.
 
     Returns:
-        The row; or None, an outcome and a reason where the function itself raised something.
+        The row; or None, an outcome and a reason if the function raised an exception.
     """
     global _kept
     held = resident_mb()
@@ -66,8 +67,8 @@ def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] 
     if _folder is not None:
         os.ftruncate(2, 0)
         os.lseek(2, 0, os.SEEK_SET)
-        note(_folder, token).write_text(str(os.getpid()))
-        _kept = kept(_folder, token)
+        (_folder / token).write_text(str(os.getpid()))
+        _kept = _folder / f"{token}.row"
     before = resource.getrlimit(resource.RLIMIT_AS)
     try:
         limit_memory(int((memory_limit - held) * MB))  # what is reserved and not used is free
@@ -87,21 +88,6 @@ def keep(row: Mapping[str, Any]) -> None:
     """
     if _kept is not None:
         _kept.write_text(json.dumps(dict(row)))
-
-
-def note(folder: Path, token: str) -> Path:
-    """Return the file that holds the process id of the worker that has a cell; it is as old as the run of the cell."""
-    return folder / token
-
-
-def kept(folder: Path, token: str) -> Path:
-    """Return the file of the row that was kept for a cell."""
-    return folder / f"{token}.row"
-
-
-def words(folder: Path, process: int) -> Path:
-    """Return the file of the standard error of a worker."""
-    return folder / f"{process}.words"
 
 
 def last_words(path: Path) -> str:

@@ -26,7 +26,7 @@ from optid.errors import StudyError
 from optid.processes import death
 from optid.solving.isolated import GRACE
 from optid.studies.execution.cell import lost_row, prepare, run_cell, without_warm
-from optid.studies.execution.worker import RETIRED, kept, last_words, note, run, start, words
+from optid.studies.execution.worker import RETIRED, last_words, run, start
 from optid.studies.grid import Cell
 from optid.studies.storage.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
 
@@ -135,7 +135,7 @@ class Pool:
         """The row of a cell that has ended; None where it is to be given to another worker."""
         begun = None  # process that has, or had, the cell, and when it began
         with suppress(OSError, ValueError):
-            path = note(self._folder, token)
+            path = self._folder / token
             begun = int(path.read_text()), path.stat().st_mtime
         try:
             row, outcome, reason = future.result()
@@ -155,7 +155,7 @@ class Pool:
             elif code == RETIRED or begun is None:
                 return None
             else:
-                said = last_words(words(self._folder, begun[0]))
+                said = last_words(self._folder / f"{begun[0]}.words")
                 how = ", ".join(filter(None, [death(code), said]))
                 fate = CRASHED, f"the worker died: {how}"
                 if "bad_alloc" in said or "memory allocation" in said or "MemoryError" in said:
@@ -163,15 +163,15 @@ class Pool:
                 found = self._lost(cell, token, begun, *fate)
         if begun is not None and future.exception() is not None:
             _kill_group(begun[0])
-            words(self._folder, begun[0]).unlink(missing_ok=True)
-        for path in (note(self._folder, token), kept(self._folder, token)):
-            path.unlink(missing_ok=True)
+            (self._folder / f"{begun[0]}.words").unlink(missing_ok=True)
+        for name in (token, f"{token}.row"):
+            (self._folder / name).unlink(missing_ok=True)
         return found
 
     def _lost(self, cell: Cell, token: str, begun: tuple[int, float] | None, outcome: str, reason: str) -> Row:
         """The row of a cell whose worker did not make one: the one that was kept, where there is one."""
         with suppress(OSError, ValueError):
-            return without_warm(complete(json.loads(kept(self._folder, token).read_text())), reason)
+            return without_warm(complete(json.loads((self._folder / f"{token}.row").read_text())), reason)
         times: dict[str, Any] = {} if begun is None else {"started": datetime.fromtimestamp(begun[1], UTC),
                                                           "total_s": time.time() - begun[1]}
         return lost_row(cell, outcome, reason, **times)

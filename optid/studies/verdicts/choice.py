@@ -78,7 +78,10 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
         return paired(one, other, ratio, groups)
 
     allowed = int(slack * len(costs))
-    reliable = _reliable(known, allowed)
+    best = known[:, [int(np.argmax(counts))]]
+    lost, won = (best & ~known).sum(axis=0), (known & ~best).sum(axis=0)
+    reliable = [int(s) for s in np.flatnonzero(counts)
+                if lost[s] - won[s] <= allowed or sign_test(int(lost[s]), int(won[s]), "greater") >= LEVEL]
     candidates = tuple(names[s] for s in reliable)
     beaten = set()
     for one, other in combinations(reliable, 2):
@@ -108,15 +111,3 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
         missing = (f"needs more than {pair.n} {noun}s to tell {names[lead]} and {vague[0]} apart: the interval of "
                    f"their comparison, {pair.low:.3g} to {pair.high:.3g}, is too wide")
     return Choice(kind, names[lead], tied, candidates, against, solved, missing)
-
-
-def _reliable(known: np.ndarray, allowed: int) -> list[int]:
-    """Who solved something, and no fewer than the most reliable by more than what is allowed and chance explains."""
-    counts = known.sum(axis=0)
-    best = known[:, int(np.argmax(counts))]
-
-    def behind(one: np.ndarray) -> bool:
-        lost, won = int((best & ~one).sum()), int((one & ~best).sum())
-        return lost - won > allowed and sign_test(lost, won, "greater") < LEVEL
-
-    return [int(s) for s in np.flatnonzero(counts) if not behind(known[:, s])]

@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import mode
 
 from optid.errors import DataError
 from optid.program.solution import GRADIENT, Status, tolerance
@@ -105,10 +106,7 @@ class Results:
 def usual_accuracy(table: Table) -> float:
     """Return the accuracy that most runs asked for, of equally frequent ones the strictest."""
     known = table["accuracy"][np.isfinite(table["accuracy"]) & (table["accuracy"] > 0)]
-    if not known.size:
-        return 1e-8
-    values, counts = np.unique(known, return_counts=True)
-    return float(values[np.argmax(counts)])
+    return float(mode(known).mode) if known.size else 1e-8  # of equally frequent values the smallest
 
 
 def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -> Results:
