@@ -238,7 +238,7 @@ def test_a_model_file_names_the_record_that_calibrates_its_monitor(tmp_path):
     assert out == optid(*words, "--identified", "healthy.csv", "--healthy", "healthy.csv")[0]
     (tmp_path / "healthy.csv").rename(tmp_path / "moved.csv")
     told = optid(*words)[1]
-    assert "healthy.csv, from which the model was identified, is no longer there" in told
+    assert "healthy.csv, from which the model was identified, does not exist any more" in told
     assert "take the model as exact" in told
     content = json.loads((tmp_path / "m.json").read_text())
     (tmp_path / "m.json").write_text(json.dumps({**content, "record": {"files": [3]}}))

@@ -21,7 +21,7 @@ class FittingCommand(Command):
     """A command that takes the arguments of the formulation named by ``--formulation`` as options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse, after the options of the formulation have joined those of the command."""
+        """Parse, after adding the options of the formulation to those of the command."""
         self.params = [p for p in self.params if not getattr(p, "derived", False)]
         name = chosen(args)
         try:
@@ -45,13 +45,13 @@ class FittingCommand(Command):
 
 
 def _refused(error: LookupFailed) -> typer.Exit:
-    """Print what is wrong before the command begins, and return what ends it."""
+    """Print the error and return the exit of the command."""
     complain(error)
     return typer.Exit(exit_code(error))
 
 
 def chosen(args: Sequence[str]) -> str:
-    """Return the formulation that words of the command line name; the default where they name none."""
+    """Return the formulation named on the command line, or the default."""
     found = DEFAULT
     for word, following in zip(args, [*args[1:], ""]):
         if word in ("--formulation", "-f"):
@@ -62,12 +62,7 @@ def chosen(args: Sequence[str]) -> str:
 
 
 def derived_options(name: str, taken: set[str]) -> list[Any]:
-    """Return one option for every argument of a formulation that the command has no option for.
-
-    Args:
-        name: of the formulation.
-        taken: option words of the command.
-    """
+    """Return options for the arguments of a formulation for which the command has none (`taken` are its options)."""
     found = describe(entry_point(FORMULATIONS, name))
     about, parameters = found.arguments(), []
     for key, parameter in found.options.items():
@@ -81,7 +76,7 @@ def derived_options(name: str, taken: set[str]) -> list[Any]:
 
 
 def options_of_others(taken: set[str]) -> list[Any]:
-    """Return one option for every argument that only formulations other than the default have, for the help text."""
+    """Return options for the arguments that only other formulations have, for the help text."""
     texts: dict[str, str] = {}
     having: dict[str, list[str]] = {}
     for name, found in descriptions():
@@ -108,7 +103,7 @@ def _parameter(key: str, text: str, more: str, panel: str, flag: bool = False) -
 
 
 def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
-    """Let typer make options of a signature."""
+    """Let typer make options from parameters."""
 
     def shape(**_: Any) -> None: ...
 

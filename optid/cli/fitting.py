@@ -7,6 +7,7 @@ from typing import Any
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
 from optid.cli.results import Work, check_names, working
+from optid.errors import DataError
 from optid.lazy import import_cvxpy
 
 BUDGET = 60.0
@@ -64,7 +65,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         work.step("standard errors")
         work.text = describe(found)
         if found.verdict is not None and found.verdict.word in ("poor", "useless"):
-            work.step("looking for what would help")
+            work.step("searching for advice")
             work.text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
         _finish(work, found, held_out, saved, None if stream or scheduler else data, how)
         work.page(found, report, held_out)
@@ -111,7 +112,7 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
 
 def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
             what: str = "fit") -> None:
-    """Validate on what was held out, and write the model, with the place of a record that it is from as a whole."""
+    """Validate on the held-out record and save the model; a record that was used whole is named in its file."""
     from optid.cli.arguments import listed
 
     if held_out is not None:
@@ -143,8 +144,12 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
         from optid.identify.validation import validate as check
         from optid.models.files import load
 
-        paths, data = words.models_and_data(files)
-        models = dict(zip(words.distinct_names(paths), map(load, paths)))
+        paths = [path for i, path in enumerate(files) if i == 0 or path.suffix.lower() == ".json"]
+        data = [path for path in files if path not in paths]
+        if not data:
+            raise DataError(f"give a data file after the model{'s' if len(paths) > 1 else ''}")
+        distinct = len({path.stem for path in paths}) == len(paths)
+        models = {path.stem if distinct else str(path): load(path) for path in paths}
         first = next(iter(models.values()))
         record: Any = words.read_record(data, words.as_modelled(how, first))
         work.step("validating")

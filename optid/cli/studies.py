@@ -144,11 +144,9 @@ for function in (run, report, export, problems, systems, schema):
 
 @contextmanager
 def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
-    """A bar on the error stream, and a message where a study goes on; Ctrl-C keeps what is done.
+    """Show a progress bar on the error stream and report the cells to run; Ctrl-C keeps the finished rows.
 
-    Args:
-        db: the database, if the user named one.
-        described: the study, to say which of its former rows are set aside.
+    `db` is the database if the user named one, `described` the study whose superseded rows are reported.
     """
     from rich import progress
 
@@ -198,7 +196,7 @@ def _now(row: dict[str, Any] | None) -> str:
 
 
 def _plan(described: Any, db: Path, **settings: Any) -> None:
-    """Print the size of a study and what is left of it."""
+    """Print the size of a study and the cells left to run."""
     from optid.studies.execution import running
 
     every, left, former = running.plan(described, db, **settings)
@@ -211,10 +209,13 @@ def _plan(described: Any, db: Path, **settings: Any) -> None:
 
 
 def _summary(db: Path, name: str) -> bool:
-    """Print how the cells ended, by solver, why, and the verdict in one line; return whether anything was solved."""
+    """Print outcomes by solver, reasons and the headline of the verdict; return whether any cell was solved."""
     import shlex
 
+    import numpy as np
+
     from optid.cli import study_summary as summary
+    from optid.program.solution import Status
     from optid.studies.storage.store import read_rows
     from optid.studies.verdicts.verdict import conclude
 
@@ -229,4 +230,5 @@ def _summary(db: Path, name: str) -> bool:
     words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
     words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []
     say(Text(shlex.join(words), "dim"))
-    return not summary.nothing_solved(rows)
+    answers = rows["reached"] | np.isin(rows["status_verified"], (str(Status.INFEASIBLE), str(Status.UNBOUNDED)))
+    return bool(answers.any())

@@ -37,8 +37,8 @@ def resident_mb() -> float:
 class Peak:
     """Largest resident memory of this process since the object was made.
 
-    Linux keeps the figure and lets a process reset it. Where it does not, it is the largest of the whole life of the
-    process where that grew meanwhile, and the larger of start and end where it did not.
+    Linux lets a process reset the figure. Elsewhere it is the largest of the whole life of the process if that has
+    grown, else the larger of start and end.
     """
 
     def __init__(self) -> None:

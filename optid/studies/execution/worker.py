@@ -1,9 +1,9 @@
-"""What a worker process does beside running cells.
+"""The code of a worker process.
 
-The processes are pebble's: it gives them cells, ends those beyond their time, and replaces those that die. Loky has no
-time limit for a task, and one crash breaks all of an executor. What neither does is here: a limit of memory for each
-cell, the last words of a process that crashed, a row that stands where the rest of its cell comes to no end, and the
-end of a process, its children included, together with its parent.
+pebble manages the processes: it gives them cells, ends those beyond their time limit and replaces those that die (loky
+has no time limit for a task, and one crash breaks its executor). Added here are a memory limit for each cell, the last
+error message of a crashed process, a row kept before the second solve of a cell, and the end of a process and its
+children together with its parent.
 """
 
 import ctypes
@@ -22,9 +22,9 @@ from optid.processes import limit_memory
 from optid.studies.execution.machine import MB, resident_mb
 from optid.studies.storage.rows import ERROR, MEMORY_LIMIT
 
-RETIRED = 77  # exit code of a worker that holds so much memory of earlier cells that another one takes its cell
+RETIRED = 77  # exit code of a worker that holds too much memory of earlier cells; another one takes its cell
 KEPT, KEPT_MB = 0.5, 150.0  # share of the limit, and MB, that a worker may hold of earlier cells
-TOLD, LONGEST = 100_000, 300  # bytes of the words of a worker that are looked at, and characters of them in a reason
+TOLD, LONGEST = 100_000, 300  # bytes of the standard error that are searched, characters of it in a reason
 
 _function: Callable[[Any], Mapping[str, Any]]
 _folder: Path | None = None
@@ -82,16 +82,13 @@ def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] 
 
 
 def keep(row: Mapping[str, Any]) -> None:
-    """Keep the whole row of the cell under way, which stands where the rest of that cell comes to no end.
-
-    Outside of a worker nothing is done.
-    """
+    """Keep the row of the current cell, valid if the rest of the cell fails; does nothing outside a worker."""
     if _kept is not None:
         _kept.write_text(json.dumps(dict(row)))
 
 
 def last_words(path: Path) -> str:
-    """Return where Python says that a process crashed, or the last line that it wrote; empty where there is none."""
+    """Return where Python reports a crash, else the last line written; empty if there is none."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TOLD))
@@ -107,7 +104,7 @@ def last_words(path: Path) -> str:
 
 
 def _die_with(parent: int) -> None:
-    """Let the system kill this process when its parent ends, even in the middle of a solver's loop."""
+    """Let the system kill this process when its parent ends, even inside a solver."""
     if sys.platform == "linux":
         die = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
         ctypes.CDLL(None).prctl(die, signal.SIGKILL)

@@ -29,23 +29,19 @@ class System:
 
 
 def system(name: str) -> System:
-    """Return a system by name.
-
-    Raises:
-        LookupFailed: no such system; the message has the nearest.
-    """
+    """Return a system by name (`LookupFailed` with the nearest name)."""
     if name not in SYSTEMS:
         raise LookupFailed(f"no system is called {name!r}. {nearest(name, SYSTEMS)}")
     return SYSTEMS[name]
 
 
 def simulate(name: str, samples: int | None = None, noise: float | None = None, seed: int = 0) -> tuple[Data, Truth]:
-    """Simulate a system.
+    """Simulate a system: its record and its truth.
 
     Args:
         name: of the system.
-        samples: length of the record; the system's own when not given.
-        noise: standard deviation of the noise relative to that of the noise-free output; likewise.
+        samples: length of the record; by default that of the system.
+        noise: standard deviation relative to that of the noise-free output; by default that of the system.
         seed: of input and noise.
 
     Raises:
@@ -114,7 +110,7 @@ _DING_NOISE = 0.5 * float(np.sqrt(np.sum(_impulse(_DING_D, _DING_A) ** 2) / _DIN
 
 
 def _fed_back(plant: FeedbackSystem, bound: float, samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
-    """White uniform inputs within the bound; the noise relative to the root mean square of the outputs' deviations."""
+    """Simulate with white uniform inputs within the bound, and noise relative to the RMS deviation of the outputs."""
     u = np.random.default_rng([seed, 1]).uniform(-bound, bound, (samples, 2))
     size = float(np.sqrt(np.mean(np.var(plant.record(u).y, axis=0))))
     data = plant.record(u, seed, measurement=noise * size)

@@ -1,4 +1,4 @@
-"""Solvers side by side on one record and one formulation: a line for each, and one sentence that says which to use."""
+"""Comparison of solvers on one record and one formulation, with a recommendation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -116,8 +116,8 @@ def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
 def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
     """Return the verdict on the rows that `compare` takes, headed by what the comparison says; it raises the same."""
     head, verdict = compare(rows).headline, conclude(rows)
-    caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. Which solver to prefer on others is "
-                       "told by a study of at least 6 problems (optid study run).", "data sets")
+    caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. A study of at least 6 problems "
+                       "(optid study run) shows which solver to prefer on others.", "data sets")
     said = [statement for statement in verdict.statements if statement.about != "data sets"]
     head = replace(head, text=head.text[:1].upper() + head.text[1:])  # a sentence of its own on the page
     return replace(verdict, headline=head, statements=(caveat, *said))

@@ -1,4 +1,4 @@
-"""Formulations compared by their models, in words: which to use, on which data, and by how much."""
+"""The comparison of formulations by their models, in words."""
 
 from optid.studies.verdicts.averages import Paired
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, TIE, Choice
@@ -10,7 +10,7 @@ LISTED = 4  # data sets in a sentence
 
 
 def choice_of_formulation(quality: Quality) -> Statement | None:
-    """Say which formulation gives the best models, or why that cannot be told; None for a single formulation."""
+    """Recommend the formulation with the best models, or say why none is recommended; None for a single formulation."""
     choice, sets = quality.choice, len(quality.sets)
     if len(quality.formulations) < 2 or not any(quality.solved.values()):
         return None
@@ -46,7 +46,7 @@ def choice_of_formulation(quality: Quality) -> Statement | None:
 
 
 def model_evidence(quality: Quality, name: str) -> str:
-    """Say in a few words how far the models of a formulation stay behind the best, by data set where there are few."""
+    """State how far the models of a formulation are behind the best, by data set if there are few."""
     if 1 < len(quality.sets) < FEW:
         return "; ".join(f"{one.name}: {_place(quality, one.choice, name, 'record')}" for one in quality.sets)
     return _place(quality, quality.choice, name, quality.unit)

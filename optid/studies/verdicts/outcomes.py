@@ -1,4 +1,4 @@
-"""Which runs count: a table of problems and solvers, every entry with a time or with the reason why it has none."""
+"""A table of problems and solvers: every entry has a time, or the reason why it has none."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
@@ -21,22 +21,22 @@ VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, whatever 
 UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))  # ended before the solver had an answer
 MEANINGS = {
     SOLVED: "the verified accuracy was reached, at the best objective that any solver verified",
-    FALSE_CLAIM: "success or infeasibility was claimed, and our residuals took it back",
-    CONTRADICTED: "infeasible or unbounded, it said; another solver has a verified point",
-    LESS_ACCURATE: "verified to a looser accuracy of its own, not to the one compared at",
+    FALSE_CLAIM: "the solver claimed success or infeasibility, which the verified residuals contradict",
+    CONTRADICTED: "the solver claimed infeasible or unbounded; another solver has a verified point",
+    LESS_ACCURATE: "verified at its own looser accuracy, not at the compared one",
     WORSE_MINIMUM: "a verified minimum above the best one that another solver verified; of a procedure the minimum of "
                    "its last programme, which depends on the steps before it",
-    OTHER_ACCURACY: "asked for another accuracy than the one compared at, and the same solver has runs that suit it",
-    WARM_FAILED: "the cold solve was verified, the warm one, whose time is compared, was not",
-    UNTIMED: "solved, but without the time that is compared: not solved warm, or a procedure, which never is",
+    OTHER_ACCURACY: "asked for another accuracy than the compared one, at which the same solver has runs",
+    WARM_FAILED: "the cold solve was verified, the warm solve, whose time is compared, was not",
+    UNTIMED: "solved, but without the compared time: not solved warm; a procedure never is",
     NOT_RUN: "no run in the database",
-    INFEASIBLE: "the solver says that no point satisfies the constraints; that claim comes without a point to verify",
-    str(Status.UNBOUNDED): "the solver says that the objective has no lower bound",
+    INFEASIBLE: "the solver claims that no point satisfies the constraints; the claim has no point to verify",
+    str(Status.UNBOUNDED): "the solver claims that the objective has no lower bound",
     str(Status.LIMIT): "the solver stopped at a limit of its own, of iterations or time",
-    str(Status.INACCURATE): "the point misses the tolerance of its own accuracy, by too little to call the claim a lie",
-    str(Status.FAILED): "no point that could be judged, or one far from what was claimed",
+    str(Status.INACCURATE): "the point misses the tolerance of its own accuracy, but not by enough for a false claim",
+    str(Status.FAILED): "no point to judge, or a point far from the claim",
 }
-"""What the words of the failure table mean beyond the outcomes of a row."""
+"""The meaning of the states in the failure table, beyond the outcomes of a row."""
 
 Table = Mapping[str, np.ndarray]
 _RECORD = ("study", "data", "samples", "noise", "seed")
@@ -82,12 +82,12 @@ class Results:
 
     @property
     def verified(self) -> np.ndarray:
-        """Which entries are solved, or would be but for the time that is compared, (P, S)."""
+        """Which entries are solved, apart from the compared time, (P, S)."""
         return np.isin(self.state, VERIFIED)
 
     @property
     def ran(self) -> np.ndarray:
-        """Where the solver was run at all: not refused, left out, or without a time, (P, S)."""
+        """Where the solver was run: not refused, not left out, not without a time, (P, S)."""
         return ~np.isin(self.state, (REFUSED, NOT_RUN, UNTIMED))
 
     @property
@@ -113,14 +113,14 @@ def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -
     """Sort rows into problems and solvers, and decide which entries are solved.
 
     Args:
-        table: what `optid.studies.storage.rows.columns` returned.
-        accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
+        table: as returned by `optid.studies.storage.rows.columns`.
+        accuracy: relative accuracy to compare at; by default the one most runs asked for.
         time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
 
     Returns:
-        The table. An entry is solved where every repetition ran to its end, was verified, has residuals within the
-        tolerance of the common accuracy, the time that is compared, and an objective within `VALUE` of the best
-        verified one. Of runs at several requested accuracies those count that suit the common one best.
+        The table. An entry is solved where every repetition was completed and verified, has residuals within the
+        tolerance of the common accuracy, the compared time, and an objective within `VALUE` of the best verified one.
+        Of runs at several requested accuracies those closest to the common one count.
 
     Raises:
         DataError: unknown measure of time.
@@ -181,9 +181,9 @@ def _numbered(table: Table, *names: str) -> np.ndarray:
 
 
 def _other_accuracy(table: Table, accuracy: float) -> np.ndarray:
-    """Which runs asked for an accuracy that another run of the same solver on the same problem suits better, (rows,).
+    """Return which runs asked for a less suitable accuracy than another run of the same solver and problem, (rows,).
 
-    What suits best is the loosest that is not looser than the common one; where all are looser, the strictest.
+    The most suitable is the loosest that is not looser than the common one, else the strictest.
     """
     asked = table["accuracy"]
     steps = np.log(np.where(np.isfinite(asked) & (asked > 0), asked, accuracy) / accuracy)
@@ -201,10 +201,9 @@ def _largest(*choices: np.ndarray) -> float:
 
 
 def worst_residual(table: Table) -> np.ndarray:
-    """Return what is held against the tolerance, (rows,); ``nan`` without a point.
+    """Return the residual that is compared with the tolerance, (rows,); ``nan`` without a point.
 
-    It is the largest of violation, complementarity and stationarity, the last one divided by `GRADIENT`: solving allows
-    gradients that much more.
+    It is the largest of violation, complementarity, and stationarity / `GRADIENT`, the factor that solving allows.
     """
     return np.fmax(np.fmax(table["violation"], table["complementarity"]), table["stationarity"] / GRADIENT)
 
@@ -237,7 +236,7 @@ def _row_states(table: Table, accuracy: float, time: str) -> np.ndarray:
 
 
 def _against_the_best(found: Results) -> Results:
-    """Take out minima above the best one, and claims of infeasibility that a verified point contradicts."""
+    """Mark minima above the best one, and claims of infeasibility that a verified point contradicts."""
     verified = np.isfinite(found.objective)
     best = np.min(np.where(verified, found.objective, np.inf), axis=1, initial=np.inf)
     best = np.where(np.isfinite(best), best, 0.0)
@@ -260,10 +259,9 @@ def states_of_rows(table: Table, found: Results) -> np.ndarray:
 
 
 def agreed_infeasible(found: Results) -> np.ndarray:
-    """Return the problems without a solution by common consent, (P,).
+    """Return the problems that are infeasible by agreement, (P,): all solvers with an answer, and at least two, say so.
 
-    At least two solvers say so, and so does every other one that came to an answer. One claim is not enough: it comes
-    without a point, so nothing about it can be verified.
+    One claim is not enough: it comes without a point, so it cannot be verified.
     """
     says = found.state == INFEASIBLE
     answered = found.ran & ~np.isin(found.state, UNANSWERED)

@@ -58,7 +58,7 @@ class Section:
 
     @property
     def recommended(self) -> tuple[str, ...]:
-        """Who comes first or ties for it; empty where that cannot be told, or where it fails more often than not."""
+        """The first and those that tie; empty where undecided, or where it fails more often than not."""
         good = self.choice.decided and self.standing(self.choice.first).share >= 0.5
         return self.choice.leaders if good else ()
 
