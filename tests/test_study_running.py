@@ -107,7 +107,7 @@ def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
 @pytest.mark.parametrize("settings, words", [
     ({"workers": 0}, "a positive integer"), ({"workers": 2.0}, "a positive integer"),
     ({"workers": True}, "a positive integer"),
-    ({"workers": 2, "scheduler": "tcp://x:1"}, "Leave workers or scheduler out"),
+    ({"workers": 2, "scheduler": "tcp://x:1"}, "leave workers or scheduler out"),
     ({"retry": ["done", "crahsed"]}, "Did you mean 'crashed'"),
 ])
 def test_settings_that_make_no_sense_are_refused_before_the_database_is_made(path, grid, settings, words):
