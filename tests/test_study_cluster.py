@@ -315,5 +315,5 @@ def test_a_row_that_cannot_be_fetched_is_no_fault_of_its_cell(client, monkeypatc
 
     with monkeypatch.context() as severed:
         severed.setattr(distributed.Future, "result", broken)
-        with pytest.raises(ClusterError, match="a row did not come back .*Rows so far are kept"):
+        with pytest.raises(ClusterError, match="a row was not received .*Rows so far are kept"):
             next(cluster.execute([cell(0)], behave, scheduler=client))

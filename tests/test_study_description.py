@@ -312,7 +312,7 @@ def test_what_is_wrong_in_a_grid_is_told_once():
     text = SMALL.replace("na = 2", "na = [1, 2, 0.5]", 1).replace("nb = 1", "nb = [1, 2]", 1)
     assert problems(text) == ["formulation[0].na: must be an integer; 0.5 is not"]
     (told,) = problems(SMALL.replace("na = 2", f"na = {list(range(20000))}", 1))
-    assert "na form a grid of 20,000 formulations; at most 10,000 are taken" in told
+    assert "na form a grid of 20,000 formulations; the limit is 10,000" in told
 
 
 def test_damaged_study_files_are_refused_by_name_or_read(tmp_path):

@@ -119,7 +119,7 @@ def test_settings_that_make_no_sense_are_refused_before_the_database_is_made(pat
 
 def test_cells_that_come_back_without_a_row_are_told(path, grid):
     grid([cell(k) for k in range(3)])
-    with pytest.raises(StudyError, match="2 cells of 3 came back without a row"):
+    with pytest.raises(StudyError, match="2 cells of 3 returned no row"):
         run(STUDY, path, execute=lambda todo: iter([row(todo[0])]))
     assert len(finished(path)) == 1
 

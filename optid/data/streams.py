@@ -31,7 +31,7 @@ class Stream(Ports):
 
     Attributes:
         dt, inputs, outputs, input_units, output_units, name: as of `Data`.
-        n_samples: number of samples, None where only a pass can tell (CSV, Dask data frames).
+        n_samples: number of samples, None if only a pass gives it (CSV, Dask data frames).
         parts: parts that can be read independently, in order; empty if the record is read from its beginning to its
             end.
         scheduler: the Dask cluster that reads the parts; None for this machine.
@@ -111,7 +111,7 @@ class Stream(Ports):
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Samples of each experiment; a pass is made where only that can tell."""
+        """Samples of each experiment, by a pass if necessary."""
         if self.n_samples is None:
             return tuple(self._survey.lengths[i] for i in range(self.n_experiments))
         if not self.parts:

@@ -42,14 +42,14 @@ class Cell:
     formulation_name: str  # registered name
     options: Mapping[str, Any]  # arguments of the formulation
     constraints: tuple[str, ...]  # named constraints as texts
-    solver_name: str  # word of the back end, or "auto"
+    solver_name: str  # name of the back end, or "auto"
     solver_options: Mapping[str, Any]  # its native options
     accuracy: float  # requested relative accuracy
     warm: bool  # whether it is also solved a second time from its own solution
     time_limit: float  # seconds
     memory_limit: float  # MB
     holdout: float  # share of the record that the fit does not see
-    refusal: str = ""  # why the solver cannot take this formulation: nothing is run, the row says so
+    refusal: str = ""  # why the cell is not run; empty if it is
 
     @property
     def identity(self) -> tuple[str, int]:

@@ -239,7 +239,7 @@ class RowReader:
             if np.isfinite(found).all() and found.dtype == (kind or found.dtype):
                 kind = found.dtype
             elif stamp:
-                kept[row] = ""  # the row is there, its time is not known
+                kept[row] = ""  # the row counts, without a time
                 line = int(rows.lines[row])
                 bad.append((line, f"{self._label}, line {line}: {stamp!r} is not a time stamp like those before; the "
                             "row counts as one without a stamp."))

@@ -38,7 +38,7 @@ class Source:
     """A source of one experiment that need not fit into memory."""
 
     names: Sequence[str]  # names of its columns
-    n_samples: int | None  # number of samples, None where only a pass can tell
+    n_samples: int | None  # number of samples, None if only a pass gives it
     whole: Part | None  # all of it; None where it exists in parts only
     # function of the columns to read, returning the independent parts in the order of time
     parts: Callable[[Sequence[str]], Iterable[Part]]

@@ -33,7 +33,7 @@ class FormulationEntry:
     name: str  # its label
     formulation: str  # registered name
     constraints: tuple[str, ...] = ()  # named constraints as texts, such as "monotone:increasing"
-    options: Mapping[str, Any] = field(default_factory=dict)  # arguments in the words of the command line
+    options: Mapping[str, Any] = field(default_factory=dict)  # arguments as on the command line
     data: tuple[str, ...] = ()  # labels of the data entries it is for; empty for all
 
     def is_for(self, entry: DataEntry) -> bool:
@@ -46,7 +46,7 @@ class SolverEntry:
     """One entry of the solver axis."""
 
     name: str  # its label
-    solver: str  # word of the back end, or "auto"
+    solver: str  # name of the back end, or "auto"
     accuracy: tuple[float, ...] = ()  # requested accuracies in place of those of the study
     options: Mapping[str, Any] = field(default_factory=dict)  # native options of the solver
 
@@ -71,13 +71,13 @@ class Study:
         memory_limit: MB a cell may take.
         repetitions: how often a cell is run, for its times.
         warm: whether a cell is also solved a second time from its own solution.
-        seeds: of the simulated records; their number, or a list of them.
-        holdout: share of a record that the fit does not see.
+        seeds: of the simulated records; their number, or a list.
+        holdout: share of a record that is held out.
         folder: where relative file names start.
-        data_checked: whether `check_data` has found nothing wrong.
+        data_checked: whether `check_data` has passed.
 
     Raises:
-        StudyError: lists everything that is wrong. Whether the files can be read is found out by `check_data`.
+        StudyError: lists all problems. `check_data` checks the files.
     """
 
     name: str
@@ -186,7 +186,7 @@ class Study:
             object.__setattr__(self, "data_checked", True)
 
     def run(self, db: str | Path | None = None, **settings: Any) -> Any:
-        """Run what is left of the study and return its rows.
+        """Run the remaining cells of the study and return all rows.
 
         Args:
             db: database file, from which an interrupted study goes on; a temporary one when not given.

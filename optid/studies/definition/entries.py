@@ -71,7 +71,7 @@ def _tables(key: str, top: Place) -> list[Place]:
             top.note(f"there is no [[{key}]]: a study needs at least one")
         return []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
-        how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table of its own, [[{key}]]"
+        how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table, [[{key}]]"
         listed = ", or at the top solvers = \"auto\"" if key == "solver" else ""
         top.note(f"{key} is written as {how}{listed}", key)
         return []
@@ -105,7 +105,7 @@ def _data(entry: Place) -> DataEntry:
 
 
 def _reading(at: Place) -> Any:
-    """Check one key that says how a file is read."""
+    """Check one of the reading options."""
     key, value = at.name, at.value
     if key == "dt":
         return at.number("a positive number", 0.0)
@@ -135,7 +135,7 @@ def _formulations(entry: Place, data: Sequence[DataEntry]) -> list[FormulationEn
                 if key in parameters and isinstance(value, list | tuple) and value
                 and _is_axis(parameters[key].annotation, value, used)}
     if (count := math.prod(map(len, axes.values()))) > MOST_FORMULATIONS:
-        entry.note(f"{', '.join(axes)} form a grid of {count:,} formulations; at most {MOST_FORMULATIONS:,} are taken")
+        entry.note(f"{', '.join(axes)} form a grid of {count:,} formulations; the limit is {MOST_FORMULATIONS:,}")
         return []
     found = []
     for values in product(*axes.values()):
@@ -202,7 +202,7 @@ def _check_constraint(entry: Place, keys: Path, text: str) -> None:
         return
     try:
         named_constraint(text)
-    except Exception as error:  # whatever a builder of a third party raises
+    except Exception as error:  # any error of a third-party builder
         entry.note(f"{error}" if "constraint" in str(error) else f"constraint {text!r}: {error}", *keys)
 
 
@@ -235,7 +235,7 @@ def _misfit(annotation: Any, value: Any) -> str | None:
     if annotation is inspect.Parameter.empty or "Any" in words or not words & {"bool", "int", "float", "str"}:
         return None
     takers = next((takers for kind, takers, _ in _KINDS if isinstance(value, kind)), None)
-    if takers is None or words & set(takers.split()):  # of a table or a date the formulation says
+    if takers is None or words & set(takers.split()):  # tables and dates are checked by the formulation
         return None
     return " or ".join(word for _, takers, word in _KINDS if words & {takers.split()[0]})
 
@@ -303,7 +303,7 @@ def _seeds(at: Place) -> tuple[int, ...]:
     if not isinstance(at.value, list | tuple | range):
         count = at.whole(1)
         if count is not None and count > MOST_SEEDS:
-            at.note(f"{count:,} seeds are too many: at most {MOST_SEEDS:,} are taken")
+            at.note(f"{count:,} seeds are too many: at most {MOST_SEEDS:,} are allowed")
             return ()
         return tuple(range(count or 1))
     if not at.items():

@@ -63,11 +63,8 @@ class _Records:
             longest = max(entry.samples or (system(entry.system).samples,))
             return simulate(entry.system, int(min(samples, longest)))[0]
         whole = self.read(entry)
-        first = whole.experiments[0]
-        if first.n_samples <= samples:
-            return whole
-        kept = int(samples)
-        return Data(first.u[:kept], first.y[:kept], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
+        short = whole.experiments[0].n_samples <= samples
+        return whole if short else whole.select(experiments=0).window(0, int(samples))
 
 
 def _note_unreadable(path: Keys, entry: DataEntry, records: _Records, problems: Problems) -> None:
@@ -111,7 +108,7 @@ def _refused(entry: FormulationEntry, record: Data) -> str:
         _posed(entry, record)
     except (StructureError, LookupFailed) as error:
         return str(error)
-    except Exception:  # a record that is too short, a defect: the run will tell
+    except Exception:  # a short record or a defect: the row of the run has it
         pass
     return ""
 
@@ -157,7 +154,7 @@ def _solved_without(solver: str, data: Sequence[DataEntry], formulations: Sequen
                 programme = _posed(entry, records.beginning(one))
                 if _solve(programme, solver, {}).status in (Status.OPTIMAL, Status.LOCAL):
                     yield programme
-            except Exception:  # not posed, not installed, not for this formulation
+            except Exception:  # not built, not installed, not for this formulation
                 continue
 
 

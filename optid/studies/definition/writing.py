@@ -23,7 +23,7 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _ALONE = ("accuracy", "time_limit", "memory_limit", "repetitions", "warm", "seeds", "holdout")
 
 
-_AXES = {  # key in a file: argument of a Study, keys that tell an entry from labels, what is taken
+_AXES = {  # key in a file: argument of a Study, keys that distinguish an entry from labels, accepted values
     "data": ("data", ("file", "system", "name"), "a record, optid.Data(u, y, dt), the name of a file or of a simulated "
              "system"),
     "formulation": ("formulations", ("formulation",), "the name of a formulation"),
@@ -66,7 +66,7 @@ def _entry(key: str, entry: Any, label: str | None = None) -> Any:
 
 
 def _entry_keys(entry: DataEntry | FormulationEntry | SolverEntry) -> dict[str, Any]:
-    """The keys and values of an entry; what is empty is left out."""
+    """Return the keys and values of an entry that are not empty."""
     found = {f.name: getattr(entry, f.name) for f in fields(entry)}
     options = dict(found.pop("options"))
     if "files" in found:

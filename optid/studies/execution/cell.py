@@ -79,7 +79,7 @@ def _run(cell: Cell, given: float) -> dict[str, Any]:
     except (Exception, SystemExit) as error:
         found = {"outcome": ERROR, "reason": f"{type(error).__name__}: {error}"}
 
-    if held := _too_much(peak, cell):  # unseen by who watches: what is above the limit is no answer
+    if held := _too_much(peak, cell):  # unseen by the parent; above the limit there is no result
         found, fitted = {"outcome": MEMORY_LIMIT, "reason": held}, None
     row = complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": peak.mb(),
                     "base_mb": peak.start, "total_s": time.perf_counter() - clock})
@@ -172,7 +172,7 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
     bound, residuals = solution.bound, solution.residuals
     steps = [step for _, step in fitted.steps]
     counts, times = [step.iterations for step in steps], [step.times for step in steps]
-    told = [t.compile for t in times if np.isfinite(t.compile)]  # apart, in these programmes
+    compiled = [t.compile for t in times if np.isfinite(t.compile)]  # where the back end reports it
     row = {
         "outcome": DONE, "status_claimed": solution.claimed, "status_verified": str(solution.status),
         "reason": solution.reason, "reached": str(solution.status) in SUCCESS, "proved": solution.proof,
@@ -180,8 +180,8 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
         "program_class": program.kind, "unknowns": program.size, "n_programs": len(steps),
         "objective": solution.objective, "scale": solution.scale, "bound": bound.value if bound else None,
         "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
-        "build_s": solution.times.build, "compile_s": sum(told) if told else None,
-        "solve_s": sum(t.solve for t in times) - sum(told), "judge_s": sum(t.judge for t in times),
+        "build_s": solution.times.build, "compile_s": sum(compiled) if compiled else None,
+        "solve_s": sum(t.solve for t in times) - sum(compiled), "judge_s": sum(t.judge for t in times),
         "prove_s": sum(t.prove for t in times), "fit_s": fitted.seconds,
     }
     if residuals is not None:

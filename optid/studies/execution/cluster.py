@@ -150,8 +150,8 @@ class _Flight:
                 raise ClusterError(f"the scheduler went away or gave the study up ({type(error).__name__}).") from error
             if not isinstance(error, Exception):
                 raise
-            if future.status != "error":  # the cell ended; that its row did not come says nothing of it
-                raise ClusterError(f"a row did not come back ({type(error).__name__}: {error}). Rows so far are kept; "
+            if future.status != "error":  # the cell ended, but its row was lost
+                raise ClusterError(f"a row was not received ({type(error).__name__}: {error}). Rows so far are kept; "
                                    "run the study again.") from error
             answer = lost_row(cell, ERROR, f"the Dask worker could not run it: {type(error).__name__}: {error}")
         self._forget(future)

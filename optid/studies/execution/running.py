@@ -18,7 +18,7 @@ from optid.studies.storage.store import LABELS, Store
 
 Row = dict[str, Any]
 Executor = Callable[[Sequence[Cell]], Iterator[Row]]
-"""Takes cells and yields one row for each, in any order; closing the generator ends whatever it started."""
+"""Yields one row for each cell, in any order; closing the generator ends all that it started."""
 Progress = Callable[[int, int, Row | None], None]
 
 
@@ -157,13 +157,13 @@ def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progres
                 store.append([row])
             except DatabaseError as error:
                 raise DatabaseError(f"{error}. {done:,} of {total:,} cells are kept. Where the disk is full, free "
-                                    "space; the same run goes on from there") from error
+                                    "space; the same run resumes from there") from error
             expected.remove(identity)
             done += 1
             if progress is not None:
                 progress(done, total, row)
     if expected:
-        raise StudyError(f"{len(expected)} cells of {total} came back without a row; run the study again")
+        raise StudyError(f"{len(expected)} cells of {total} returned no row; run the study again")
 
 
 def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, None]:

@@ -11,7 +11,7 @@ from optid.studies.grid import Cell
 from optid.studies.sources.systems import simulate
 from optid.studies.sources.truth import Truth
 
-ANOTHER = 2**31  # added to the seed of a simulated record for the hold-out, which is a record of its own
+ANOTHER = 2**31  # added to the seed of a simulated record for the hold-out record
 
 
 @dataclass(frozen=True, eq=False)

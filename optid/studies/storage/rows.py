@@ -41,7 +41,7 @@ class Column:
     kind: str  # "text", "json" (text that parses), "number", "integer", "flag" or "time" (UTC, ISO 8601 in a row)
     meaning: str  # one sentence for people
     unit: str = ""  # of its numbers
-    always: bool = False  # whether every row has a value, whatever happened to the cell
+    always: bool = False  # whether every row has a value
 
     @property
     def sql(self) -> str:
@@ -186,7 +186,7 @@ def _cell_value(column: Column, value: Any) -> Any:
         raise ValueError(f"column {column.name!r} holds a {column.kind}, not {value!r}")
     if column.kind == "integer" and not -LARGEST <= value < LARGEST:
         raise ValueError(f"column {column.name!r} holds integers of 64 bits; this one is larger")
-    if isinstance(value, str):  # a solver's words may hold bytes that are no text
+    if isinstance(value, str):  # messages of solvers may be no valid text
         return value.encode(errors="replace").decode().replace("\0", "")
     return float(value) if column.kind == "number" else value
 

@@ -11,7 +11,7 @@ from optid.studies.verdicts.ranks import Ranking
 from optid.studies.verdicts.standings import Section, Standing
 from optid.studies.verdicts.statement import BAD, FAIR, GOOD, NO_DIFFERENCE, Statement, counting, listed, of, plural
 
-RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use
+RARE = 0.01  # share of refused problems, or of false claims, up to which a solver is recommended
 LONGEST = 90  # characters of a headline
 NO_SOLVER = "No solver can be recommended"
 
@@ -96,8 +96,8 @@ def evidence(section: Section) -> str:
 def no_solution(section: Section) -> str:
     """State how many problems are infeasible, and how many solvers agree."""
     k, (said, asked) = section.infeasible, section.deniers
-    return (f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no solution: {said} of {asked} solvers say so, and "
-            "none found one. That counts neither for nor against them.")
+    return (f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no solution according to {said} of {asked} solvers; "
+            "none found one. This counts neither for nor against them.")
 
 
 def _tone(lead: Standing, n: int) -> str:
@@ -129,17 +129,17 @@ def _count(section: Section, name: str) -> str:
 def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
     """State whether the order of solvers or formulations (the noun) holds on other data sets."""
     if ranking.missing:
-        text = f"Whether the order holds on other data sets cannot be told: the test {ranking.missing}."
+        text = f"Whether the order holds on other data sets is unknown: the test {ranking.missing}."
         return Statement(FAIR, "Other data: cannot tell", text, "data sets")
     best, *others = ranking.names
     least = min(ranking.probabilities.values())
     p = "below 0.001" if least < 0.001 else f"{least:.2g}"
     text = f"{best} has the best mean rank, {ranking.ranks[0]:.2f} (sign tests, {ranking.n} data sets, probability {p})"
     if not ranking.behind:
-        text += f"; no other {noun} is behind it beyond chance."
+        text += f"; no other {noun} is significantly behind it."
         return Statement(FAIR, "Other data: no difference", text, "data sets")
     same = [name for name in others if name not in ranking.behind]
-    text += f"; {listed(same)} cannot be told apart from it." if same else "; all others are behind beyond chance."
+    text += f"; {listed(same)} do not differ significantly." if same else "; all others are significantly behind."
     word = f"Other data: {listed([best, *same])} {'lead' if same else 'leads'}"
     return Statement(GOOD, word, text, "data sets")
 
@@ -170,7 +170,7 @@ def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) 
     if len(used[main]) > 1:
         text += f" {main} comes first, or ties for it, in {of(len(used[main]), count, 'formulation')}."
     if not all_told:
-        text += f" For {count - len(decided)} of {count} formulations it cannot be told."
+        text += f" For {count - len(decided)} of {count} formulations it is undecided."
     tones = [_tone(one.standing(name), len(one.found.data)) for name, theirs in used.items() for one in theirs]
     tone = max(tones if all_told else [*tones, FAIR], key=(GOOD, FAIR, BAD).index)
     depends = "It depends on the formulation"

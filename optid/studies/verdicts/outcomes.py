@@ -17,7 +17,7 @@ LESS_ACCURATE, WORSE_MINIMUM, OTHER_ACCURACY = "less accurate", "worse minimum",
 WARM_FAILED, UNTIMED = "warm solve failed", "no time"
 VALUE = 1e-6  # relative difference of objectives up to which two runs found the same minimum
 TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}  # measures: sums of columns
-VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, whatever is known of the time
+VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, with or without a time
 UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))  # ended before the solver had an answer
 MEANINGS = {
     SOLVED: "the verified accuracy was reached, at the best objective that any solver verified",
@@ -32,7 +32,7 @@ MEANINGS = {
     NOT_RUN: "no run in the database",
     INFEASIBLE: "the solver claims that no point satisfies the constraints; the claim has no point to verify",
     str(Status.UNBOUNDED): "the solver claims that the objective has no lower bound",
-    str(Status.LIMIT): "the solver stopped at a limit of its own, of iterations or time",
+    str(Status.LIMIT): "the solver stopped at its own limit of iterations or time",
     str(Status.INACCURATE): "the point misses the tolerance of its own accuracy, but not by enough for a false claim",
     str(Status.FAILED): "no point to judge, or a point far from the claim",
 }
@@ -56,7 +56,7 @@ class Results:
     group: np.ndarray  # number of formulation, data set and noise, (P,): what makes a problem slow but its length
     n: np.ndarray  # samples that the fits see, those held out left out, (P,); nan where no run got that far
     solvers: tuple[str, ...]  # labels, in alphabetical order
-    state: np.ndarray  # `SOLVED` or the word for why not, (P, S)
+    state: np.ndarray  # `SOLVED` or the reason, (P, S)
     reason: np.ndarray  # sentence of the first run that did not solve it, (P, S)
     false: np.ndarray  # whether a claim was false, of any repetition at any accuracy, or contradicted, (P, S)
     time: np.ndarray  # median over the repetitions in seconds, (P, S); nan unless solved
@@ -66,7 +66,7 @@ class Results:
     size: np.ndarray  # yardstick of differences of objectives, (P,)
     residual: np.ndarray  # worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point
     limit: np.ndarray  # time limit in seconds, (P,)
-    row: np.ndarray  # number of the row that speaks for the entry, (P, S); -1 where there is none
+    row: np.ndarray  # number of the row that represents the entry, (P, S); -1 without one
     accuracy: float  # requested relative accuracy that is compared at
     measure: str  # of time: "solve", "fit" or "warm"
 
@@ -103,12 +103,6 @@ class Results:
         return replace(self, **kept, solvers=tuple(np.array(self.solvers, dtype=object)[solvers]))
 
 
-def usual_accuracy(table: Table) -> float:
-    """Return the accuracy that most runs asked for, of equally frequent ones the strictest."""
-    known = table["accuracy"][np.isfinite(table["accuracy"]) & (table["accuracy"] > 0)]
-    return float(mode(known).mode) if known.size else 1e-8  # of equally frequent values the smallest
-
-
 def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -> Results:
     """Sort rows into problems and solvers, and decide which entries are solved.
 
@@ -127,7 +121,9 @@ def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -
     """
     if time not in TIMES:
         raise DataError(f"time is one of {', '.join(TIMES)}, not {time!r}")
-    accuracy = usual_accuracy(table) if accuracy is None else accuracy
+    if accuracy is None:
+        asked = table["accuracy"][np.isfinite(table["accuracy"]) & (table["accuracy"] > 0)]
+        accuracy = float(mode(asked).mode) if asked.size else 1e-8  # of equally frequent values the smallest
     residual, seconds = worst_residual(table), seconds_of(table, time)
     states = _row_states(table, accuracy, time)
     verified = np.isin(states, VERIFIED)
@@ -251,7 +247,7 @@ def _against_the_best(found: Results) -> Results:
 
 
 def states_of_rows(table: Table, found: Results) -> np.ndarray:
-    """Return `SOLVED` or the word for why not for every row, (rows,), once `tabulate` has made results of the table."""
+    """Return `SOLVED` or the reason for every row of the table of some results, (rows,)."""
     states = _row_states(table, found.accuracy, found.measure)
     for word in (WORSE_MINIMUM, CONTRADICTED):
         states[found.row[found.state == word]] = word

@@ -11,7 +11,7 @@ from optid.studies.verdicts.ranks import Ranking, rank
 
 SMALLEST = 1e-12  # parameter errors below are roundoff
 WORST = -100.0  # %; a simulation that runs away must not decide a mean over all records
-FEW = MINIMUM_PAIRS  # data sets, from which on they are compared as one sample; of fewer each speaks for itself
+FEW = MINIMUM_PAIRS  # data sets, from which on they are compared as one sample; fewer are compared one by one
 SLACK = 0.5  # share of the records by which a formulation may stay behind: fits compare on common records anyway
 FIGURES = ("simulation_fit", "one_step_fit", "parameter_error", "nonlinearity_error")
 
@@ -31,7 +31,7 @@ class DataSet:
 
     @property
     def decided(self) -> bool:
-        """Whether its records tell which of two or more formulations is the best here, or that they are equal."""
+        """Whether its records decide which of several formulations is the best, or that they are equal."""
         return self.choice.decided and bool(self.choice.against)
 
 

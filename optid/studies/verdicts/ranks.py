@@ -19,7 +19,7 @@ LEVEL = 0.05  # of all tests
 
 @dataclass(frozen=True)
 class Ranking:
-    """Mean ranks of k solvers over data sets, 1 the best, and who is behind the best."""
+    """Mean ranks of k solvers over data sets, 1 the best, and those behind the best."""
 
     names: tuple[str, ...]  # the solvers, best mean rank first
     ranks: np.ndarray  # their mean ranks

@@ -36,7 +36,7 @@ class FalseClaim:
     solver: str
     formulation: str
     count: int  # runs
-    claimed: str  # what the solver said
+    claimed: str  # status reported by the solver
     reason: str  # why it is false, of one of them
 
 
@@ -63,11 +63,11 @@ class Verdict:
     false_claims: tuple[FalseClaim, ...]  # most frequent first
     failures: tuple[Failure, ...]  # most frequent first, refusals at the end
     headline: Statement  # the verdict in one line
-    statements: tuple[Statement, ...]  # further recommendations, warnings, and what cannot be told
+    statements: tuple[Statement, ...]  # further recommendations, warnings and open questions
 
     @property
     def recommended(self) -> tuple[str, ...]:
-        """Solvers that come first or tie for it on all problems; empty where nobody can be recommended."""
+        """Solvers that come first or tie for it on all problems; empty if none is recommended."""
         return self.overall.recommended
 
     def __str__(self) -> str:
@@ -123,8 +123,8 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
             said.append(carries_over(overall.ranking))
     said += [_failed_data(found), _never(overall), _refuted(found, table)]
     if not quality.truth and any(quality.solved.values()):
-        said.append(Statement(FAIR, "Truth unknown", "Errors of parameters and nonlinearity cannot be told: the truth "
-                              "is not known for any record.", "formulation"))
+        said.append(Statement(FAIR, "Truth unknown", "Errors of parameters and nonlinearity are unknown: no record has "
+                              "a known truth.", "formulation"))
     other = states_of_rows(table, found) == OTHER_ACCURACY
     if other.any():
         asked = ", ".join(f"{value:.0e}" for value in np.unique(table["accuracy"][other]))
