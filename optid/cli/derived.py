@@ -45,7 +45,6 @@ class FittingCommand(Command):
 
 
 def _refused(error: LookupFailed) -> typer.Exit:
-    """Print the error and return the exit of the command."""
     complain(error)
     return typer.Exit(exit_code(error))
 
@@ -103,7 +102,6 @@ def _parameter(key: str, text: str, more: str, panel: str, flag: bool = False) -
 
 
 def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
-    """Let typer make options from parameters."""
 
     def shape(**_: Any) -> None: ...
 

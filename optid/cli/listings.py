@@ -77,7 +77,6 @@ def systems() -> None:
 
 
 def _entries(group: str) -> list[tuple[Text, Text]]:
-    """Names of a group with summary, arguments and named variables."""
     rows = []
     for name, point in sorted(registered(group).items()):
         found = _described(point)

@@ -196,7 +196,6 @@ def _now(row: dict[str, Any] | None) -> str:
 
 
 def _plan(described: Any, db: Path, **settings: Any) -> None:
-    """Print the size of a study and the cells left to run."""
     from optid.studies.execution import running
 
     every, left, former = running.plan(described, db, **settings)

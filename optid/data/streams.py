@@ -135,7 +135,6 @@ class Stream(Ports):
 
     @cached_property
     def _survey(self) -> Survey:
-        """Lengths, and ranges in raw units."""
         channels = replace(self._channels, units=None)
         if self.parts:
             found = reduced(self.parts, partial(_of_part, surveyed, channels), partial(joined, channels),

@@ -94,7 +94,6 @@ def _lead(verdict: Verdict) -> str:
 
 
 def _cards(verdict: Verdict) -> list[dict[str, str]]:
-    """Return the key figures."""
     section, table = verdict.overall, verdict.table
     runs, solved = (sum(getattr(s, name) for s in section.standings) for name in ("problems", "solved"))
     by_anyone = int(section.found.solved.any(axis=1).sum()) if len(section.found.data) else 0
@@ -157,7 +156,6 @@ def quality_table(quality: Quality) -> Table:
 
 
 def _models(quality: Quality | DataSet, name: str) -> tuple[str, ...]:
-    """The figures of one formulation as words."""
     figures = [quality.figures[c][name] for c in FIGURES]
     fits = [f"{number(v, 4)} %" if np.isfinite(v) else "-" for v in figures[:2]]
     errors = [f"{100 * v:.3g} %" if np.isfinite(v) else "truth unknown" for v in figures[2:]]

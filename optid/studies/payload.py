@@ -50,7 +50,6 @@ def _numbers(values: Any, digits: int = 5) -> list[float | None]:
 
 
 def _section(section: Section) -> dict[str, Any]:
-    """One section: standings, profiles, ranking."""
     ranking, said = section.ranking, [choice_of_solver(section)]
     if len(section.standings) > 1:
         said.append(carries_over(ranking))

@@ -130,7 +130,6 @@ class CsvFile:
                 for name, column in zip(wanted, series)}
 
     def _has_even_rows(self, block: bytes) -> bool:
-        """Whether every row has as many cells as the header."""
         signs = np.frombuffer(block, np.uint8)
         ends = signs == ord("\n")
         marks = ends[np.flatnonzero(ends | (signs == ord(self.delimiter)))]  # whether each separator ends a row

@@ -66,7 +66,6 @@ def parquet_parts(path: Path, chunk: int) -> list[Part]:
 
 @contextmanager
 def _undamaged(path: Path, *kinds: Any) -> Iterator[None]:
-    """Name the file where a library cannot read it."""
     try:
         yield
     except DataError:

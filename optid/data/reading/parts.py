@@ -47,7 +47,6 @@ def file_parts(parts: Sequence[Part], *paths: Path) -> list[Part]:
 
 
 def _fingerprint(path: Path) -> tuple[int, str]:
-    """Return the size of a file and a digest of its end."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         file.seek(max(size - TAIL, 0))

@@ -105,7 +105,6 @@ def _data(entry: Place) -> DataEntry:
 
 
 def _reading(at: Place) -> Any:
-    """Check one of the reading options."""
     key, value = at.name, at.value
     if key == "dt":
         return at.number("a positive number", 0.0)

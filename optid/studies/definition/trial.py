@@ -40,7 +40,6 @@ def note_all(folder: Path, data: Sequence[DataEntry], formulations: Sequence[For
 
 
 class _Records:
-    """The records of data entries, each read once."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -52,7 +52,6 @@ def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
 
 
 def _entry(key: str, entry: Any, label: str | None = None) -> Any:
-    """Return an entry of an axis as a mapping where possible."""
     if isinstance(entry, Data):
         entry = {"record": entry} if key == "data" else entry
     elif isinstance(entry, str) and key != "data":
@@ -66,7 +65,6 @@ def _entry(key: str, entry: Any, label: str | None = None) -> Any:
 
 
 def _entry_keys(entry: DataEntry | FormulationEntry | SolverEntry) -> dict[str, Any]:
-    """Return the keys and values of an entry that are not empty."""
     found = {f.name: getattr(entry, f.name) for f in fields(entry)}
     options = dict(found.pop("options"))
     if "files" in found:

@@ -167,7 +167,6 @@ def _loaded(cell: Cell) -> Record:
 
 
 def _verdict(fitted: Fit) -> dict[str, Any]:
-    """Return the columns of status, proof, residuals and times."""
     solution, program = fitted.solution, fitted.program
     bound, residuals = solution.bound, solution.residuals
     steps = [step for _, step in fitted.steps]

@@ -184,7 +184,6 @@ class _Flight:
         return None
 
     def _look(self) -> None:
-        """Update the number of threads, and check that the cluster exists."""
         now = monotonic()
         if now - self._looked < TICK:
             return

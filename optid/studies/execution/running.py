@@ -143,7 +143,6 @@ def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Exec
 
 
 def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progress: Progress | None) -> None:
-    """Run cells and write each row on arrival."""
     done = total - len(todo)
     if progress is not None:
         progress(done, total, None)

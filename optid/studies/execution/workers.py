@@ -197,7 +197,6 @@ class Pool:
 
 
 def _kill_group(process: int) -> None:
-    """Kill a worker with its children, which are of its group."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(process, signal.SIGKILL)
 

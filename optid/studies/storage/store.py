@@ -116,7 +116,6 @@ class Store:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Run a transaction, rolled back on an error."""
         with self._named("written"):
             self._connection.execute("BEGIN IMMEDIATE")
             try:

@@ -107,7 +107,6 @@ def _tone(lead: Standing, n: int) -> str:
 
 
 def _times_as(value: float) -> str:
-    """Write a ratio of times in words."""
     if 0.995 <= value <= 1.005:
         return "the same time"
     return f"{value:.3g} times the time" if value < 10 else f"{value:.0f} times the time"

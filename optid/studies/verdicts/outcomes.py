@@ -192,7 +192,6 @@ def _other_accuracy(table: Table, accuracy: float) -> np.ndarray:
 
 
 def _largest(*choices: np.ndarray) -> float:
-    """Largest finite number of the first choice that has one."""
     return next((float(np.max(c[np.isfinite(c)])) for c in choices if np.isfinite(c).any()), float("nan"))
 
 
@@ -212,7 +211,6 @@ def seconds_of(table: Table, time: str) -> np.ndarray:
 
 
 def _row_states(table: Table, accuracy: float, time: str) -> np.ndarray:
-    """`SOLVED` or why not, for every row by itself."""
     warm_failed = (time == "warm") & (table["warm_status"] != "") & ~np.isin(table["warm_status"], SUCCESS)
     status, outcome = table["status_verified"], table["outcome"]
     choices = [
