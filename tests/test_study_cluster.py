@@ -250,7 +250,7 @@ def test_clusters_that_cannot_run_the_cells_are_refused(client, monkeypatch):
     with pytest.raises(ClusterError, match="no scheduler can be reached"):
         next(cluster.execute(todo, behave, scheduler="tcp://127.0.0.1:1"))
     with pytest.raises(ClusterError, match="no scheduler can be reached"):
-        cluster.check(todo, "tcp://127.0.0.1:1")
+        running._executor(todo, None, "tcp://127.0.0.1:1")  # before the database is made
     with pytest.raises(StudyError, match="workers cannot import"):
         next(cluster.execute(todo, lambda c: {}, scheduler=client))
     assert {"clarabel", "cvxpy", "scipy", "optid"} <= set(cluster.packages(todo))

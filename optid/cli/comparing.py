@@ -117,14 +117,10 @@ def _as_options(text: str) -> str:
     """Write the keys of a study in a message as options of the command line."""
     import re
 
-    lines = [line.strip() for line in text.splitlines()[1:]] or [text]
-    found = []
-    for line in lines:
-        line = re.sub(r"^(?:\w+\[[^]]*\]\.)?(\w+)(?:\[\d+\])?: must",
-                      lambda m: f"--{m[1].replace('_', '-')} must", line)
-        line = re.sub(r"^(?:data|formulation|solvers?)\[[^]]*\](?:\.\w+)*(?:\[\d+\])?: ", "", line)
-        found.append(line)
-    return "\n".join(found)
+    text = "\n".join(line.strip() for line in text.splitlines()[1:]) or text
+    text = re.sub(r"(?m)^(?:\w+\[[^]\n]*\]\.)?(\w+)(?:\[\d+\])?: must",
+                  lambda m: f"--{m[1].replace('_', '-')} must", text)
+    return re.sub(r"(?m)^(?:data|formulation|solvers?)\[[^]\n]*\](?:\.\w+)*(?:\[\d+\])?: ", "", text)
 
 
 def _show(found: Any, formulation: str, record: str) -> None:

@@ -70,7 +70,7 @@ def reduced(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callab
     from dask.delayed import delayed
 
     task = delayed(_of_part, pure=False)
-    leaves = [task(leaf, _with_content(part, None), part.content) for part in parts]
+    leaves = [task(leaf, replace(part, content=None), part.content) for part in parts]
     return _computed(tree(leaves, len(leaves), delayed(merge, pure=False)), scheduler)
 
 
@@ -90,7 +90,7 @@ def _merged(results: Iterable[Any], merge: Callable[[Sequence[Any]], Any]) -> It
 
 def fetched(part: Part, scheduler: Any = None) -> Part:
     """Return a part with its content, computed where it is a Dask collection."""
-    return part if part.content is None else _with_content(part, _computed(part.content, scheduler))
+    return part if part.content is None else replace(part, content=_computed(part.content, scheduler))
 
 
 def _computed(task: Any, scheduler: Any) -> Any:
@@ -105,8 +105,4 @@ def _computed(task: Any, scheduler: Any) -> Any:
 
 
 def _of_part(leaf: Callable[[Part], Any], part: Part, content: Any) -> Any:
-    return leaf(_with_content(part, content))
-
-
-def _with_content(part: Part, content: Any) -> Part:
-    return part if content is part.content else replace(part, content=content)
+    return leaf(replace(part, content=content))

@@ -17,21 +17,11 @@ MEMORY, EXPANSION = 4 << 30, 32  # memory limit in bytes, or `EXPANSION` times t
 SECONDS, PACE = 60.0, 1 << 30  # time limit, and again for each `PACE` bytes
 
 
-def mat_names(path: Path) -> list[str]:
-    """Return the names of the numeric variables, fields of structures as "structure.field".
+def mat_variables(path: Path, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return numeric variables by name, fields of structures as "structure.field"; without names {name: None} of all.
 
     `DataError`: a damaged file, a link to another file, too much time or memory for its size, or h5py is missing.
     """
-    return list(_isolated(path, None))
-
-
-def mat_variables(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return variables by name; errors as of `mat_names`."""
-    found = _isolated(path, names)
-    return {name: found[name] for name in names}
-
-
-def _isolated(path: Path, names: Sequence[str] | None) -> dict[str, Any]:
     if not hasattr(os, "fork"):
         return _variables(path, names)
     size, damaged = path.stat().st_size, f"{path.name} is damaged, or not a MAT file"

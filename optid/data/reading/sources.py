@@ -103,9 +103,9 @@ def _file_table(path: Path, kind: str, columns: Sequence[str] | None, delimiter:
     if kind == ".npy":
         opened = open_npy(path, columns)
         return Table(path.name, list(opened.names), lambda wanted, *_: next(opened.blocks(opened.rows, wanted)))
-    from optid.data.reading.matlab import mat_names, mat_variables
+    from optid.data.reading.matlab import mat_variables
 
-    names = mat_names(path)
+    names = list(mat_variables(path))
     if not names:
         raise DataError(f"{path.name} holds no arrays of numbers.")
     return Table(path.name, names, lambda wanted, *_: mat_variables(path, wanted))

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Mapping
 from datetime import date
 from datetime import time as clock
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,31 +23,20 @@ T = TypeVar("T")
 LARGEST = 2**62  # limit of integers in the database
 
 
-class Problem(NamedTuple):
-    """A problem: the keys that lead to it, and its description."""
-
-    path: Path
-    text: str
-
-
-class Problems(list[Problem]):
-    """All problems, in the order in which they are found."""
-
-    def add(self, path: Path, text: str) -> None:
-        """Note one problem."""
-        self.append(Problem(path, text))
+class Problems(list[tuple[Path, str]]):
+    """All problems in the order in which they are found: the keys that lead to each, and its description."""
 
     def concern(self, key: str) -> bool:
         """Whether there is a problem below a key at the top."""
-        return any(problem.path[:1] == (key,) for problem in self)
+        return any(path[:1] == (key,) for path, _ in self)
 
     def told(self, label: str) -> None:
         """Raise a `StudyError` with one line per problem, if there are any; repeated problems count as one."""
         if not self:
             return
         places: dict[str, dict[str, None]] = {}
-        for problem in self:
-            places.setdefault(problem.text, {})[_written(problem.path)] = None
+        for path, text in self:
+            places.setdefault(text, {})[_written(path)] = None
         lines = []
         for text, (first, *others) in places.items():
             where = first + (f" and {len(others)} more" if others else "")
@@ -75,7 +64,7 @@ class Place:
 
     def note(self, text: str, *keys: str | int) -> None:
         """Note a problem, here or at keys below."""
-        self.problems.add((*self.path, *keys), text)
+        self.problems.append(((*self.path, *keys), text))
 
     def take(self, key: str, check: "Callable[[Place], T]", default: Any = None) -> T:
         """Return what a check makes of the value at a key, or the default where there is none."""

@@ -30,7 +30,7 @@ def note_all(folder: Path, data: Sequence[DataEntry], formulations: Sequence[For
 
     Relative files are in the folder; data entries with problems are skipped.
     """
-    records, wrong = _Records(folder), {problem.path[:2] for problem in problems}
+    records, wrong = _Records(folder), {path[:2] for path, _ in problems}
     for i, entry in enumerate(data):
         if ("data", i) not in wrong:
             _note_unreadable(("data", i), entry, records, problems)
@@ -84,7 +84,7 @@ def _note_unreadable(path: Keys, entry: DataEntry, records: _Records, problems: 
         if entry.files:
             records.read(entry)
     except DataError as error:
-        problems.add(at, str(error))
+        problems.append((at, str(error)))
 
 
 def note_impossible(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: _Records,
@@ -98,7 +98,8 @@ def note_impossible(data: Sequence[DataEntry], formulations: Sequence[Formulatio
         if all(_refused(entry, records.beginning(one)) for one in its_data):
             reasons = [_refused(entry, records.beginning(one, np.inf)) for one in its_data]  # was it too short?
             if reasons and all(reasons):
-                problems.add(("formulation", Label(entry.name)), f"the formulation does not fit the data: {reasons[0]}")
+                text = f"the formulation does not fit the data: {reasons[0]}"
+                problems.append((("formulation", Label(entry.name)), text))
 
 
 def _refused(entry: FormulationEntry, record: Data) -> str:
@@ -139,9 +140,9 @@ def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[Formula
         path, without = ("solver", Label(entry.name), "options"), f"{entry.solver} fail where it succeeds without"
         for key, why in alone.items():
             if why:
-                problems.add((*path, key), f"{key} makes {without}: {why}")
+                problems.append(((*path, key), f"{key} makes {without}: {why}"))
         if not any(alone.values()):
-            problems.add(path, f"these options make {without}: {all_fail}")
+            problems.append((path, f"these options make {without}: {all_fail}"))
 
 
 def _solved_without(solver: str, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: _Records

@@ -45,8 +45,8 @@ def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
             entries = [_entry(key, entry) for entry in (value if isinstance(value, list | tuple) else [value])]
         for i, entry in enumerate(entries):
             if not isinstance(entry, Mapping):
-                problems.add((key, i), f"{shown(entry)} is invalid: must be {takes}, or a mapping with the keys of "
-                             f"[[{key}]]")
+                problems.append(((key, i), f"{shown(entry)} is invalid: must be {takes}, or a mapping with the keys of "
+                                 f"[[{key}]]"))
         raw[key] = [plain(entry) for entry in entries if isinstance(entry, Mapping)]
     return raw
 

@@ -58,12 +58,6 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
             flight.end()
 
 
-def check(cells: Iterable[Cell], scheduler: Any) -> None:
-    """Raise ClusterError, as `execute`, for a cluster that cannot run the cells."""
-    with connected(scheduler, packages(cells)):
-        pass
-
-
 def packages(cells: Iterable[Cell]) -> list[str]:
     """Return the distributions that determine the results of the cells."""
     found = (name for cell in cells for name in _versions(cell) if not name.startswith("source of "))

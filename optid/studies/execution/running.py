@@ -134,7 +134,8 @@ def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Exec
     if scheduler is not None:
         from optid.studies.execution import cluster
 
-        cluster.check(grid, scheduler)
+        with cluster.connected(scheduler, cluster.packages(grid)):  # refused before the database is made
+            pass
         return lambda todo: cluster.execute(todo, scheduler=scheduler)
     from optid.studies.execution import workers as processes
 
