@@ -88,13 +88,13 @@ def compare_solvers(found: Results, name: str = "") -> Section:
     tried = kept.ran & kept.solved.any(axis=0)  # a solver without a solved problem is last without a test
     return Section(
         name, kept, int(gone.sum()), (int(says.any(axis=0).sum()), int(found.ran[gone].any(axis=0).sum())),
-        tuple(sorted(_standings(found, counted, choice), key=order)), idle, choice,
+        tuple(sorted(_standings(found, counted), key=order)), idle, choice,
         rank(kept.time, tried, kept.solvers, kept.data_set),
         dict(zip(kept.solvers, performance_profiles(kept.time))))
 
 
-def _standings(found: Results, counted: np.ndarray, choice: Choice) -> list[Standing]:
-    """Standings in the order of the solvers; counted are the entries that count for or against the solver, (P, S)."""
+def _standings(found: Results, counted: np.ndarray) -> list[Standing]:
+    """Return the standings in the order of the solvers; `counted` are the entries that count for or against, (P, S)."""
     times, fastest = found.time, time_ratios(found.time) == 1.0
     slowest = np.nanmax(times, axis=1, initial=0.0) if times.size else 0.0
     limits = np.where(np.isfinite(found.limit), np.fmax(found.limit, slowest), np.inf)
