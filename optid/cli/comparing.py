@@ -1,7 +1,5 @@
 """The command `optid compare`: a study with one record and one formulation."""
 
-import inspect
-from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,9 +12,9 @@ from optid.cli.options import File, Paths, Words
 from optid.cli.results import check_folders, check_names, command_line
 from optid.cli.studies import NOTHING_SOLVED, Workers, follow_progress
 from optid.cli.terminal import note, print_table, say
-from optid.errors import LookupFailed
+from optid.descriptions import describe
 from optid.lazy import import_cvxpy
-from optid.registry import formulation as look_up
+from optid.registry import FORMULATIONS, entry_point
 
 ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
 """Values of required arguments that are not given: the command compares solvers, not orders."""
@@ -60,7 +58,9 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
     entry, suggestion = _entry(data, how, example, seed)
     arguments = words.suited(suggestion, formulation) if suggestion else {}
     arguments |= words.pairs(settings, "--set")
-    assumed = _assumed(formulation, arguments)
+    needed = describe(entry_point(FORMULATIONS, formulation)).options
+    assumed = {key: ASSUMED[key] for key, parameter in needed.items()
+               if parameter.default is parameter.empty and key in ASSUMED and key not in arguments}
     arguments |= assumed
     constraints = constraint if constraint is not None else arguments.pop("constraints", [])
     arguments["constraints"] = [] if constraints == ["none"] else constraints
@@ -88,16 +88,6 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
         say(f"report written to {report}")
     if not found.lines:
         raise typer.Exit(NOTHING_SOLVED)
-
-
-def _assumed(formulation: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values of required arguments that are not given."""
-    try:
-        parameters = inspect.signature(look_up(formulation)[1]).parameters
-    except LookupFailed:  # the study says so
-        return {}
-    needed = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
-    return {key: ASSUMED[key] for key in needed if key not in arguments and key in ASSUMED}
 
 
 def _entry(files: list[Path] | None, how: dict[str, Any], example: str | None, seed: int
