@@ -1,4 +1,4 @@
-"""Run a function in a forked child: a crash, an endless loop, too much memory is an outcome, not the program's end."""
+"""Run a function in a forked child, so that a crash, an endless loop or too much memory does not end the program."""
 
 import faulthandler
 import os
@@ -15,18 +15,18 @@ from typing import Any
 
 def run_forked(function: Callable[..., Any], *arguments: Any, seconds: float | None = None, memory: int | None = None,
                quiet: bool = False) -> Any:
-    """Return what a function returns in a child of this process; its exceptions are raised here.
+    """Return the result of a function in a child of this process; its exceptions are raised here.
 
     Args:
-        function: what it returns, and raises, is sent by pickle.
+        function: its result and exceptions must be picklable.
         arguments: of the function.
-        seconds: after which the child is killed.
-        memory: bytes that it may take beyond those of this process.
-        quiet: whether what the child writes to the terminal is dropped.
+        seconds: time limit.
+        memory: limit in bytes beyond the memory of this process.
+        quiet: whether to discard the output of the child.
 
     Raises:
-        TimeoutError: the child was killed.
-        ChildProcessError: it could not be started, or died by itself, with the signal or the exit code.
+        TimeoutError: the time limit was exceeded.
+        ChildProcessError: the child could not be started, or died, with the signal or the exit code.
     """
     receiver, sender = Pipe(duplex=False)
     with warnings.catch_warnings():  # forking beside threads is deprecated; the child runs one function and ends
@@ -61,7 +61,7 @@ def run_forked(function: Callable[..., Any], *arguments: Any, seconds: float | N
 
 
 def limit_memory(more: int) -> None:
-    """Let the system refuse this process so many bytes beyond those that it has reserved."""
+    """Limit the address space of this process to so many bytes beyond those in use."""
     with suppress(ImportError, OSError, ValueError):  # a system without this figure
         import resource
 
@@ -72,7 +72,7 @@ def limit_memory(more: int) -> None:
 
 
 def death(code: int) -> str:
-    """Return the exit code of a process in words: the name of the signal where one killed it."""
+    """Return the exit code of a process, or the signal that killed it, in words."""
     if code >= 0:
         return f"exit code {code}"
     return f"signal {signal.Signals(-code).name}" if -code in set(signal.Signals) else f"signal {-code}"
@@ -95,7 +95,7 @@ def _work(sender: Connection, function: Callable[..., Any], arguments: tuple, me
         try:
             sender.send(answer)
         except (TypeError, AttributeError, pickle.PicklingError) as error:
-            sender.send((None, RuntimeError(f"the answer of a child process cannot be sent: {error}")))
+            sender.send((None, RuntimeError(f"the result of the child process cannot be sent: {error}")))
         code = 0
     finally:
         os._exit(code)

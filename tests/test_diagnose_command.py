@@ -101,7 +101,7 @@ def test_bad_input_is_one_message(folder, tmp_path):
         ((model, faulty, "--process", "leak=y9:-1"), "no output 'y9'"), ((model, faulty, "--rescale"), "healthy"),
         ((model, faulty, "--disturbance", "wind"), "'wind'"), ((model, faulty, "--zero", "u1"), "INPUT=VALUE"),
         ((model, faulty, "--disturbance", "y1", "--disturbance", "y2"), "nothing is left to judge"),
-        ((model, faulty, "--out", tmp_path / "no" / "d.json"), "no folder"), ((model, faulty, faulty), "one record"),
+        ((model, faulty, "--out", tmp_path / "no" / "d.json"), "no folder"), ((model, faulty, faulty), "2 experiments"),
         ((model, faulty, "--picture", tmp_path / "d.xyz"), "xyz"), ((model, faulty, "--dt", "0.5"), "sampled every"),
     ):
         result = run(*words)

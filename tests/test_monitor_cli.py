@@ -97,7 +97,7 @@ def test_rows_that_cannot_be_read_are_named_and_the_stream_goes_on(folder):
     text = "\r\n".join(rows) + "\r\n\r\n"
     out, errors = known(folder, text=text)
     for words in ("line 21, column 'y1' holds 'oops', not a number", "line 31 has 3 cells, the header has 5",
-                  "line 41, column 'y1' holds 'inf'", "line 61 is blank", "4 of 500 rows could not be read"):
+                  "line 41, column 'y1' holds 'inf'", "line 61 is blank", "4 of 500 rows were unreadable"):
         assert words in errors
     assert "isolated: sensor:y1" in out
     out, errors = known(folder, "--strict", text=text, code=2)
@@ -198,7 +198,7 @@ def test_dates_quotes_and_gaps():
     for text in ([*dates[:2], "3.5,1,2"], ["t,u,y", "0,1,2", "soon,1,2"]):
         found = reader().read(text)
         assert found.error == "" and found.y.ravel().tolist() == [2, 2]  # the row counts, its time is not known
-        assert [line for line, _ in found.bad] == [3] and "is no time stamp like those before" in found.bad[0][1]
+        assert [line for line, _ in found.bad] == [3] and "is not a time stamp like those before" in found.bad[0][1]
 
 
 def test_reading_goes_on_where_it_stopped():
@@ -234,12 +234,12 @@ def test_a_model_file_names_the_record_that_calibrates_its_monitor(tmp_path):
           "hammerstein_ss.sid", "--basis", "polynomial:2", "--set", "nx=1", "--model", "m.json")
     words = ["monitor", "m.json", *QUICK, "--follow", "later.csv", "--until-end"]
     out, told = optid(*words)
-    assert "are those of the record it was identified from, healthy.csv" in told
+    assert "are taken from the record of the identification, healthy.csv" in told
     assert out == optid(*words, "--identified", "healthy.csv", "--healthy", "healthy.csv")[0]
     (tmp_path / "healthy.csv").rename(tmp_path / "moved.csv")
     told = optid(*words)[1]
-    assert "healthy.csv, from which the model was identified, is no longer there" in told
-    assert "take the model as exact" in told
+    assert "healthy.csv, from which the model was identified, does not exist any more" in told
+    assert "assume an exact model" in told
     content = json.loads((tmp_path / "m.json").read_text())
     (tmp_path / "m.json").write_text(json.dumps({**content, "record": {"files": [3]}}))
     done = subprocess.run([sys.executable, "-m", "optid", *words], cwd=tmp_path, capture_output=True, text=True)

@@ -330,7 +330,7 @@ def test_bad_files(tmp_path):
         (tmp_path / f"r.{kind}").write_bytes(b"")
         refuses(DataError, "is empty", read, tmp_path / f"r.{kind}")
     np.save(tmp_path / "o.npy", np.array([None, 1]))
-    refuses(DataError, "plain numbers", read, tmp_path / "o.npy")
+    refuses(DataError, "real numbers", read, tmp_path / "o.npy")
 
 
 def test_bad_tables():
@@ -451,7 +451,7 @@ def test_bad_streams(tmp_path):
     write(tmp_path, "nonsense", "r.parquet")
     refuses(DataError, "not a Parquet file", open_stream, tmp_path / "r.parquet")
     pl.DataFrame({"u": ["a"], "y": [1.0]}).write_parquet(tmp_path / "r.parquet")
-    with pytest.raises(DataError, match="column 'u' is of type String, numbers"):
+    with pytest.raises(DataError, match="column 'u' is of type String; it must be numeric"):
         list(open_stream(tmp_path / "r.parquet"))
     for array, message in [
         (np.ones((2, 9)), "more channels than samples"),
@@ -463,7 +463,7 @@ def test_bad_streams(tmp_path):
     np.save(tmp_path / "r.npy", np.ones((9, 2)))
     whole = (tmp_path / "r.npy").read_bytes()
     (tmp_path / "r.npy").write_bytes(whole[:-8])
-    refuses(DataError, "truncated: its header says 18 numbers, 17 are there", open_stream, tmp_path / "r.npy")
+    refuses(DataError, "truncated: its header says 18 numbers, the file has 17", open_stream, tmp_path / "r.npy")
     (tmp_path / "r.npy").write_bytes(b"nonsense" * 9)
     refuses(DataError, "not an npy file", open_stream, tmp_path / "r.npy")
     np.save(tmp_path / "u.npy", np.ones(5))

@@ -14,7 +14,7 @@ from test_regressors import assert_gram, cases, formed
 import optid
 from optid.data.reading import parquet
 from optid.data.record import Data
-from optid.data.reduction import FAN_IN, _streamed
+from optid.data.reduction import FAN_IN, tree
 from optid.errors import DataError, RankError
 from optid.statistics import accumulate, collect, factorise
 from optid.statistics.blocks import Frame
@@ -37,7 +37,7 @@ class Cut:
                 self.parts.append(Piece(i, e.u[a:b], e.y[a:b]))
 
     def reduced(self, leaf, merge, threads):
-        return _streamed((leaf(part, [(part.u, part.y, None)]) for part in self.parts), merge)
+        return tree((leaf(part, [(part.u, part.y, None)]) for part in self.parts), len(self.parts), merge)
 
 
 class Piece:
@@ -86,7 +86,7 @@ def test_tree_of_a_pass_is_the_tree_of_tasks(count):
     level = [str(i) for i in range(count)]
     while len(level) > 1:
         level = [f"({' '.join(level[i:i + FAN_IN])})" for i in range(0, len(level), FAN_IN)]
-    assert _streamed(map(str, range(count)), lambda group: f"({' '.join(group)})") == level[0]
+    assert tree(map(str, range(count)), count, lambda group: f"({' '.join(group)})") == level[0]
 
 
 @pytest.fixture(scope="module")
@@ -280,7 +280,7 @@ def test_a_file_that_changes_after_opening_is_refused(record, folders):
     stream.ranges()
     frame = pd.read_parquet(folders[0] / "part.3.parquet")
     frame.assign(y=frame.y + 1).to_parquet(folders[0] / "part.3.parquet")
-    refuses(DataError, "part.3.parquet.*changed meanwhile", optid.fit, stream, **STRUCTURE)
+    refuses(DataError, "part.3.parquet.*differs from the file that was opened", optid.fit, stream, **STRUCTURE)
     (folders[0] / "part.3.parquet").unlink()
     refuses(DataError, "cannot read .*part.3.parquet.*No such file", optid.fit, stream, **STRUCTURE)
 

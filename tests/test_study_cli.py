@@ -217,7 +217,7 @@ def test_a_dry_run_names_the_solvers_that_are_not_installed(folder, monkeypatch)
     monkeypatch.setattr(grid, "find", missing)
     Path("rigs.toml").write_text(STUDY.format(solvers='["clarabel"]'))
     told = run("study", "run", "rigs.toml", "--dry-run").stdout
-    assert "6 cells that cannot be run here: solver 'clarabel' is not installed: pip install clarabel" in told
+    assert "6 cells cannot be run here: solver 'clarabel' is not installed: pip install clarabel" in told
 
 
 def test_the_database_is_called_as_the_study_file(folder):
@@ -254,7 +254,7 @@ def test_compare_says_why_a_solver_was_not_run_and_what_to_do(folder):
     words = ("compare", "rig.csv", "-u", "current", "-y", "thrust", "--na", 2, "--nb", 1, "--repetitions", 1)
     linear = run(*words, "-f", "arx", "--solvers", "mosek", "clarabel")
     assert linear.exit_code == 0 and "mosek: solver 'mosek' is not installed: pip install Mosek" in linear.stdout
-    assert "not for arx" not in linear.stdout
+    assert "not applicable to arx" not in linear.stdout
     nobody = run(*words, "--basis", "triangular:5", "--solvers", "clarabel")
     assert nobody.exit_code == 4 and "Use an NLP back end (gauss_newton, ipopt, uno)" in nobody.stdout
 
@@ -280,7 +280,7 @@ def test_compare_says_which_solver_to_use(folder):
     assert lines[0].startswith("6 cells to run") and Path("page.html").stat().st_size > 20_000
     sentence = next(line for line in lines if line.startswith("Use "))
     assert "reached the accuracy of 1e-08 (verified residuals up to 1e-06 count) in" in sentence
-    assert "proved globally optimal" in sentence and "not for hammerstein_arx.exact: clarabel" in found.stdout
+    assert "proved globally optimal" in sentence and "not applicable to hammerstein_arx.exact: clarabel" in found.stdout
     assert read_rows("kept.sqlite")["warm_s"].size == 6
     again = run(*words, "--db", "kept.sqlite")
     assert again.stdout.startswith("6 of 6 cells are in kept.sqlite already; nothing is left to run")
@@ -297,7 +297,7 @@ def test_compare_assumes_orders_that_nobody_gives_and_says_so(folder):
 def test_compare_tells_an_error_of_the_record_once(folder):
     Path("binary.csv").write_text("u,y\n" + "\n".join(f"{k // 3 % 2},{k % 7}" for k in range(60)))
     found = run("compare", "binary.csv", "--solvers", "gauss_newton", "uno", "--repetitions", 1)
-    assert found.exit_code == 2 and found.stderr.count("is binary") == 1 and "no solver could be tried" in found.stderr
+    assert found.exit_code == 2 and found.stderr.count("is binary") == 1 and "no solver was run" in found.stderr
 
 
 # -- what a new user gets wrong ----------------------------------------------------------------------------------------
@@ -342,7 +342,7 @@ def test_a_place_that_takes_no_files_is_told_before_any_work(folder, monkeypatch
 
     monkeypatch.setattr(results.os, "access", lambda path, mode: Path(path) == folder / "rig.csv")
     told = run("study", "report", "none.sqlite", "-o", "page.html").stderr
-    assert f"page.html cannot be written: folder {folder} is read-only here; give a file in another folder" in told
+    assert f"page.html cannot be written: folder {folder} is read-only; give a file in another folder" in told
     results.check_folders(folder / "rig.csv")
 
 

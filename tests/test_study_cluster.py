@@ -250,7 +250,7 @@ def test_clusters_that_cannot_run_the_cells_are_refused(client, monkeypatch):
     with pytest.raises(ClusterError, match="no scheduler can be reached"):
         next(cluster.execute(todo, behave, scheduler="tcp://127.0.0.1:1"))
     with pytest.raises(ClusterError, match="no scheduler can be reached"):
-        cluster.check(todo, "tcp://127.0.0.1:1")
+        running._executor(todo, None, "tcp://127.0.0.1:1")  # before the database is made
     with pytest.raises(StudyError, match="workers cannot import"):
         next(cluster.execute(todo, lambda c: {}, scheduler=client))
     assert {"clarabel", "cvxpy", "scipy", "optid"} <= set(cluster.packages(todo))
@@ -315,5 +315,5 @@ def test_a_row_that_cannot_be_fetched_is_no_fault_of_its_cell(client, monkeypatc
 
     with monkeypatch.context() as severed:
         severed.setattr(distributed.Future, "result", broken)
-        with pytest.raises(ClusterError, match="a row did not come back .*Rows so far are kept"):
+        with pytest.raises(ClusterError, match="a row was not received .*Rows so far are kept"):
             next(cluster.execute([cell(0)], behave, scheduler=client))

@@ -215,7 +215,7 @@ def test_tables_and_values_of_another_shape_are_refused(path, tmp_path):
     append(path, rows(3))
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE rows SET started = 'yesterday'")
-    with pytest.raises(DatabaseError, match="study.sqlite holds values that no run writes"):
+    with pytest.raises(DatabaseError, match="study.sqlite holds invalid values"):
         read_rows(path)
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("ALTER TABLE rows DROP COLUMN objective")

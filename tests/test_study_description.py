@@ -171,7 +171,7 @@ def test_what_is_missing_altogether():
 ])
 def test_what_is_not_toml_is_told_by_its_parser(text, place):
     (told,) = problems(text)
-    assert place in told and "a text stands in quotation marks" in told
+    assert place in told and "write texts in quotation marks" in told
 
 
 def test_a_number_that_python_does_not_read_is_told():
@@ -185,7 +185,7 @@ def test_files_that_are_not_there_or_not_text(tmp_path):
     with pytest.raises(StudyError, match="cannot be read"):
         Study.from_toml(tmp_path)
     (tmp_path / "latin.toml").write_bytes("name = 'a'\n# f\xfcr".encode("latin-1"))
-    with pytest.raises(StudyError, match="not UTF-8.*position 14"):
+    with pytest.raises(StudyError, match="must be UTF-8.*position 14"):
         Study.from_toml(tmp_path / "latin.toml")
     (tmp_path / "windows.toml").write_bytes(b"\xef\xbb\xbf" + SMALL.replace("\n", "\r\n").encode())
     assert Study.from_toml(tmp_path / "windows.toml") == Study.from_text(SMALL)
@@ -199,7 +199,7 @@ def test_a_study_without_a_title_is_called_as_its_file(tmp_path):
 @pytest.mark.parametrize("text, key, words", [
     (SMALL.replace("nb = 1", "nb = -1", 1), "formulation['arx']", "nb of input 'current' must be a positive integer"),
     (SMALL.replace("nb = 1", 'nb = 1\nconstraints = "saturation:5,1"', 1),
-     "formulation['arx + saturation:5,1']", "cannot be posed: "),
+     "formulation['arx + saturation:5,1']", "does not fit the data: "),
     (SMALL.replace("[[data]]", "[data]"), "data", "written as [[data]], with two brackets"),
     (SMALL.replace("[[data]]", "[[datas]]"), "datas", "Did you mean 'data'"),
     (SMALL.replace('solvers = ["clarabel", "gauss_newton"]', 'solver = "clarabel"'), "solver", 'solvers = "auto"'),
@@ -312,7 +312,7 @@ def test_what_is_wrong_in_a_grid_is_told_once():
     text = SMALL.replace("na = 2", "na = [1, 2, 0.5]", 1).replace("nb = 1", "nb = [1, 2]", 1)
     assert problems(text) == ["formulation[0].na: must be an integer; 0.5 is not"]
     (told,) = problems(SMALL.replace("na = 2", f"na = {list(range(20000))}", 1))
-    assert "na form a grid of 20,000 formulations; at most 10,000 are taken" in told
+    assert "na form a grid of 20,000 formulations; the limit is 10,000" in told
 
 
 def test_damaged_study_files_are_refused_by_name_or_read(tmp_path):
@@ -404,9 +404,9 @@ def test_python_hears_all_problems_with_their_places():
 
 
 @pytest.mark.parametrize("change, words", [
-    ({"data": {"rig": (np.zeros(9), np.zeros(9))}}, "is none of what is taken here: a record, optid.Data(u, y, dt)"),
-    ({"formulations": [3]}, "formulation[0]: 3 is none of what is taken here: the name of a formulation"),
-    ({"solvers": 3}, "solver[0]: 3 is none of what is taken here: the name of a solver"),
+    ({"data": {"rig": (np.zeros(9), np.zeros(9))}}, "is invalid: must be a record, optid.Data(u, y, dt)"),
+    ({"formulations": [3]}, "formulation[0]: 3 is invalid: must be the name of a formulation"),
+    ({"solvers": 3}, "solver[0]: 3 is invalid: must be the name of a solver"),
     ({"solvers": "al"}, "no solver is called 'al'. Did you mean 'all'?"), ({"data": []}, "there is no [[data]]"),
     ({"solvers": []}, "there is no solver"),
 ])
@@ -460,7 +460,7 @@ def test_cells_are_counted_without_being_made(rig):
                                                                  "data": ["linear", "rig"]}],
         solvers=["auto", {"solver": "scs", "accuracy": [1e-4, 1e-6]}])
     assert grid.number_of_cells(study) == len(grid.cells(study)) == (3 * 2 + 12 + 2) * 3 * 2
-    with pytest.raises(StudyError, match="has 600,000,060 cells; at most 1,000,000 are taken"):
+    with pytest.raises(StudyError, match="has 600,000,060 cells; at most 1,000,000 are allowed"):
         grid.cells(replace(study, repetitions=10_000_001))
 
 

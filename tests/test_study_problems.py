@@ -89,5 +89,5 @@ def test_bare_solvers_agree_with_the_verified_objectives(written, solver):
 def test_a_study_without_its_text_has_no_problems(tmp_path):
     with Store(tmp_path / "s.sqlite", write=True) as store:
         store.describe("in memory", "")
-    with pytest.raises(StudyError, match="no text of a study to pose its problems from: it has 'in memory'"):
+    with pytest.raises(StudyError, match="no text of a study, .* be built: it has 'in memory'"):
         write_problems(tmp_path / "s.sqlite", tmp_path / "out")

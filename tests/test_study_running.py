@@ -107,7 +107,7 @@ def test_rows_nobody_asked_for_and_doubles_are_left_out(path, grid):
 @pytest.mark.parametrize("settings, words", [
     ({"workers": 0}, "a positive integer"), ({"workers": 2.0}, "a positive integer"),
     ({"workers": True}, "a positive integer"),
-    ({"workers": 2, "scheduler": "tcp://x:1"}, "Leave workers or scheduler out"),
+    ({"workers": 2, "scheduler": "tcp://x:1"}, "leave workers or scheduler out"),
     ({"retry": ["done", "crahsed"]}, "Did you mean 'crashed'"),
 ])
 def test_settings_that_make_no_sense_are_refused_before_the_database_is_made(path, grid, settings, words):
@@ -119,7 +119,7 @@ def test_settings_that_make_no_sense_are_refused_before_the_database_is_made(pat
 
 def test_cells_that_come_back_without_a_row_are_told(path, grid):
     grid([cell(k) for k in range(3)])
-    with pytest.raises(StudyError, match="2 cells of 3 came back without a row"):
+    with pytest.raises(StudyError, match="2 cells of 3 returned no row"):
         run(STUDY, path, execute=lambda todo: iter([row(todo[0])]))
     assert len(finished(path)) == 1
 

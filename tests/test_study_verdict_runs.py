@@ -155,7 +155,7 @@ def test_problems_that_all_agree_to_be_infeasible_are_taken_out_and_said():
     rows += [run(s, 9, status_verified="infeasible", objective=None) for s in "ab"]
     verdict = conclude(rows)
     assert verdict.overall.infeasible == 1 and len(verdict.overall.found.data) == 8
-    assert not verdict.false_claims and "1 problem has no solution: 2 of 2 solvers say so" in str(verdict)
+    assert not verdict.false_claims and "1 problem has no solution according to 2 of 2 solvers" in str(verdict)
 
 
 def infeasible(solver, problem):
@@ -180,7 +180,7 @@ def test_who_crashes_on_a_problem_without_a_solution_has_failed_on_it_all_the_sa
     rows = [run(s, p) for s in "abc" for p in range(8)]
     rows += [infeasible("a", 8), infeasible("b", 8), dead("c", 8, "crashed")]
     verdict = conclude(rows)
-    assert verdict.overall.infeasible == 1 and "2 of 3 solvers say so" in str(verdict)
+    assert verdict.overall.infeasible == 1 and "according to 2 of 3 solvers" in str(verdict)
     a, c = verdict.overall.standing("a"), verdict.overall.standing("c")
     assert (a.problems, a.solved, a.failures) == (8, 8, {})
     assert (c.problems, c.solved, c.failures) == (9, 8, {"crashed": 1}) and c.penalised > a.penalised

@@ -45,9 +45,9 @@ FAILURES = {
     "complain": ("memory limit", "got no more memory .*std::bad_alloc"),
     "raise": ("error", "KeyError: 'no such thing'"),
     "garbage": ("error", "TypeError"),
-    "partial": ("error", "is no row: .*needs a value in every row"),
-    "vast": ("error", "is no row: column 'iterations' holds whole numbers of 64 bits"),
-    "other": ("error", "is no row: it is of another cell"),
+    "partial": ("error", "did not return a row: .*must have a value in every row"),
+    "vast": ("error", "did not return a row: column 'iterations' holds integers of 64 bits"),
+    "other": ("error", "did not return a row: it is of another cell"),
 }
 
 
@@ -212,7 +212,7 @@ def test_a_function_without_a_name_is_refused():
 def test_workers_that_do_not_start_are_an_error_with_their_last_words(monkeypatch):
     monkeypatch.setattr("optid.studies.execution.workers.prepare", study_trouble.fail_to_start)
     monkeypatch.setattr("optid.studies.execution.workers.run_cell", behave)
-    with pytest.raises(StudyError, match="before they could work, 3 times in a row: ModuleNotFoundError"):
+    with pytest.raises(StudyError, match="before they were ready, 3 times in a row: ModuleNotFoundError"):
         list(execute([cell(0)], behave))
 
 

@@ -40,7 +40,7 @@ def main(
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")] = False,
 ) -> None:
-    """Identify Hammerstein systems by optimisation with constraints, with a proof of global optimality."""
+    """Identify Hammerstein systems by constrained optimisation with proofs of global optimality, and detect faults."""
 
 
 for function in (fit, validate, solvers, formulations, constraints, examples, identify, compare, design, diagnose,

@@ -1,4 +1,4 @@
-"""From words of the command line to records and arguments."""
+"""Records and arguments from the words of the command line."""
 
 import inspect
 import json
@@ -13,16 +13,10 @@ from optid.errors import DataError, StructureError
 
 def read_record(files: Sequence[Path | str], how: Mapping[str, Any], *, stream: bool = False,
                 scheduler: str | None = None) -> Data | Stream:
-    """Read the files of a record, one experiment each.
+    """Read the files of a record, one experiment each, with the options of `optid.cli.options.READING`.
 
-    Args:
-        files: paths; for a stream also of folders of Parquet files.
-        how: the options of `optid.cli.options.READING`.
-        stream: read chunk by chunk.
-        scheduler: address of a Dask scheduler whose workers read them, chunk by chunk.
-
-    Raises:
-        DataError: what `optid.read` refuses.
+    A stream, or a Dask scheduler whose workers read it, takes folders of Parquet files as well. `DataError` as of
+    `optid.read`.
     """
     from optid.data.readers import open_stream, read
 
@@ -49,16 +43,10 @@ def record(files: Sequence[Path | str] | None, how: Mapping[str, Any], example: 
            asked: str = "a data file", **reading: Any) -> tuple[Any, dict[str, Any]]:
     """Return the record of files, or a built-in one with the arguments of a fit that it suggests.
 
-    Args:
-        files: as in `read_record`.
-        how: as in `read_record`.
-        example: name of a built-in record in their place.
-        seed: of the noise of the example.
-        asked: what the command takes in the way of files, for the messages.
-        reading: other arguments of `read_record`.
+    `files`, `how` and `reading` are those of `read_record`, `asked` is how messages call the files.
 
     Raises:
-        DataError: neither is given, or both are, or what `optid.read` refuses.
+        DataError: neither files nor an example, or both; what `optid.read` refuses.
         LookupFailed: no such example.
     """
     if example is None:
@@ -74,11 +62,7 @@ def record(files: Sequence[Path | str] | None, how: Mapping[str, Any], example: 
 
 
 def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
-    """Return those of the suggested arguments that the formulation takes.
-
-    Raises:
-        LookupFailed: no such formulation.
-    """
+    """Return the suggested arguments that the formulation takes (`LookupFailed` for an unknown one)."""
     from optid.registry import formulation as look_up
 
     takes = inspect.signature(look_up(formulation)[1]).parameters
@@ -89,7 +73,7 @@ def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
 
 
 def as_modelled(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
-    """Return how to read a record for a model: its channels and sampling time where none are given."""
+    """Return the reading options with channels and sampling time of a model where none are given."""
     return {
         **how,
         "inputs": how["inputs"] or list(model.inputs),
@@ -99,44 +83,20 @@ def as_modelled(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
 
 
 def state_space_model(path: Path) -> Any:
-    """Read the model that questions about faults are asked of.
-
-    Raises:
-        StructureError: a model of another kind.
-    """
+    """Read a state-space model for fault diagnosis; `StructureError` for another kind."""
     from optid.models.files import load
 
     model = load(path)
     if model.kind != "HammersteinSS":
-        raise StructureError(f"{path} is a {model.kind}: faults are judged with a state-space model that has noise "
+        raise StructureError(f"{path} is a {model.kind}; fault diagnosis needs a state-space model with noise "
                              "covariances (optid fit ... --formulation hammerstein_ss.asivid).")
     return model
 
 
-def models_and_data(files: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """Tell model files from data files: the first is a model, and so are all others that end in .json.
-
-    Raises:
-        DataError: no data file.
-    """
-    models = [path for i, path in enumerate(files) if i == 0 or path.suffix.lower() == ".json"]
-    data = [path for path in files if path not in models]
-    if not data:
-        raise DataError(f"give a data file after the model{'s' if len(models) > 1 else ''}")
-    return models, data
-
-
-def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Return the names of files without folder and ending where these differ, the whole paths where they do not."""
-    names = [path.stem for path in paths]
-    return names if len(set(names)) == len(names) else [str(path) for path in paths]
-
-
 def held_out(record: Any, share: float | None, files: Sequence[str] | None, how: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return the record to fit and the one to validate on: files, or the rest of the record after a share, or None.
+    """Return the records to fit and to validate on: other files, the rest after a share, or None.
 
-    Raises:
-        DataError: an impossible share, or a stream.
+    `DataError` for an impossible share, or a share of a stream.
     """
     if files:
         return record, read_record(files, how)
@@ -149,12 +109,12 @@ def held_out(record: Any, share: float | None, files: Sequence[str] | None, how:
 
 
 def listed(words: Sequence[str] | None) -> list[str] | None:
-    """Return the names in words that may be joined by commas; None stays None."""
+    """Split words at commas into names; None stays None."""
     return None if words is None else [part.strip() for word in words for part in word.split(",") if part.strip()]
 
 
 def one_or_all(values: list[Any] | None) -> Any:
-    """Return the single value of a list, the list itself when it has several, None for None."""
+    """Return the single value of a list, else the list itself."""
     return values[0] if values is not None and len(values) == 1 else values
 
 
@@ -164,11 +124,11 @@ def numbers(words: Sequence[str] | None, option: str) -> list[float] | None:
     try:
         return None if found is None else [float(part) for text in found for part in text.split()]
     except ValueError:
-        raise StructureError(f"{option} {' '.join(found or [])}: numbers are needed, one per channel") from None
+        raise StructureError(f"{option} {' '.join(found or [])}: must be numbers, one per channel") from None
 
 
 def value(word: str) -> Any:
-    """Return what a word that is JSON says (number, list, true); any other is text."""
+    """Return the value of a word that is JSON (number, list, true), else the word."""
     try:
         return json.loads(word)
     except json.JSONDecodeError:
@@ -177,7 +137,7 @@ def value(word: str) -> Any:
 
 def pairs(words: Sequence[str] | None, option: str, form: str = "key=value", read: Callable[[str], Any] = value
           ) -> dict[str, Any]:
-    """Read key=value words, the values by `read`; for any other the `StructureError` names option, word and form."""
+    """Read key=value words, the values by `read`; a `StructureError` names option, word and expected form."""
     found = {}
     for word in words or []:
         key, equals, text = word.partition("=")
@@ -191,16 +151,9 @@ def pairs(words: Sequence[str] | None, option: str, form: str = "key=value", rea
 
 
 def directions(words: Sequence[str] | None, option: str, model: Any = None) -> dict[str, Any]:
-    """Read NAME=E1,E2,... words: directions in the state equation by name, or NAME=y1:-1,y2:0.5 by outputs.
+    """Read NAME=E1,E2,... (directions in the state equation) or NAME=y1:-1,y2:0.5 (effects on outputs of a model).
 
-    Args:
-        words: as given.
-        option: that they were given to.
-        model: whose outputs are named.
-
-    Raises:
-        LookupFailed: no such output.
-        StructureError: a word that is something else, a direction of the wrong size.
+    `LookupFailed` for an unknown output, `StructureError` for another word or a direction of the wrong size.
     """
     def read(text: str) -> Any:
         parts = [part.rpartition(":") for part in text.split(",")]
@@ -222,5 +175,5 @@ def directions(words: Sequence[str] | None, option: str, model: Any = None) -> d
         elif len(change) != model.nx:
             word = next(word for word in words or () if word.partition("=")[0] == name)
             raise StructureError(f"{option} {word}: {len(change)} numbers for {model.nx} states. Give one per state, "
-                                 f"or say what it does to the outputs: {name}={model.outputs[0]}:-1")
+                                 f"or its effect on the outputs: {name}={model.outputs[0]}:-1")
     return found

@@ -9,15 +9,15 @@ from optid.cli.terminal import hearing, say
 
 def workbench(data: Paths = None, example: str | None = None, *, how: dict[str, Any], model: File = None,
               port: int = 0, browser: bool = True, seed: int = 0) -> None:
-    """Open a page on this machine to fit a record, constrain the model by hand, and diagnose faults.
+    """Open a local web page to fit a record, constrain the model by hand and diagnose faults.
 
     Example: optid workbench data.csv --inputs u --outputs y --dt 0.1
 
     The record:
-        model (--model -m MODEL): Diagnose with this state-space model (.json) instead of the fit.
+        model (--model -m MODEL): State-space model (.json) for the diagnosis. [dim]the fitted one[/]
     The page:
-        port: Of this machine. [dim]any that is free[/]
-        browser (--browser/--no-browser): Open the page in the browser.
+        port: Port of the local server; 0 takes any free port.
+        browser (--browser/--no-browser): Open the page in a browser.
     """
     from optid.cli import arguments as words
 

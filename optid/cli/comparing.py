@@ -1,7 +1,5 @@
-"""The command that compares solvers on one record: a study of one line."""
+"""The command `optid compare`: a study with one record and one formulation."""
 
-import inspect
-from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,12 +12,12 @@ from optid.cli.options import File, Paths, Words
 from optid.cli.results import check_folders, check_names, command_line
 from optid.cli.studies import NOTHING_SOLVED, Workers, follow_progress
 from optid.cli.terminal import note, print_table, say
-from optid.errors import LookupFailed
+from optid.descriptions import describe
 from optid.lazy import import_cvxpy
-from optid.registry import formulation as look_up
+from optid.registry import FORMULATIONS, entry_point
 
 ASSUMED = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nx": 2, "basis": "triangular:8"}
-"""What a formulation is given that needs it, where nobody says: which solver is the question, not which order."""
+"""Values of required arguments that are not given: the command compares solvers, not orders."""
 
 
 def compare(data: Paths = None, example: str | None = None, *, how: dict[str, Any], formulation: str = DEFAULT,
@@ -27,24 +25,24 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
             time_limit: float = 60.0, memory_limit: float = 2000.0, repetitions: int = 3, holdout: float = 0.3,
             seed: int = 0, db: File = None, workers: Workers = 1, accept_changed_data: bool = False, report: File = None
             ) -> None:
-    """Compare solvers on one record at equal verified accuracy, and say which to use.
+    """Compare solvers on one record at equal verified accuracy and recommend one.
 
     Example: optid compare data.csv --inputs u --outputs y --formulation hammerstein_arx.exact --na 2 --nb 2
     --basis triangular:8 --solvers all
 
     The record:
-        holdout (SHARE): Share kept out of the fit.
+        holdout (SHARE): Share of the record held out.
     The model:
-        constraint (-c NAME:VALUE...): See optid constraints.
-        settings (--set KEY=VALUE...): Any other argument.
+        constraint (-c NAME:VALUE...): Constraint; optid constraints lists them.
+        settings (--set KEY=VALUE...): Any argument of the formulation.
     The solver:
-        solvers (--solvers --solver -s NAME...): all, or names: see optid solvers.
-        accuracy: Relative, asked of every solver and verified.
-        time_limit (SECONDS): For each run.
-        memory_limit (MB): For each run.
+        solvers (--solvers --solver -s NAME...): Solvers; optid solvers lists them. [dim]all[/]
+        accuracy: Requested relative accuracy, verified for every solver.
+        time_limit (SECONDS): Time limit of a run.
+        memory_limit (MB): Memory limit of a run.
     The study:
-        repetitions: Runs of each solver; times are their median.
-        db (FILE): Keep the rows; go on where it stopped.
+        repetitions: Runs of each solver; the median time is reported.
+        db (FILE): Keep the results in this database, and resume from it.
     """
     check_names(constraint, formulation=formulation)
     from optid.cli import arguments as words
@@ -60,7 +58,9 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
     entry, suggestion = _entry(data, how, example, seed)
     arguments = words.suited(suggestion, formulation) if suggestion else {}
     arguments |= words.pairs(settings, "--set")
-    assumed = _assumed(formulation, arguments)
+    needed = describe(entry_point(FORMULATIONS, formulation)).options
+    assumed = {key: ASSUMED[key] for key, parameter in needed.items()
+               if parameter.default is parameter.empty and key in ASSUMED and key not in arguments}
     arguments |= assumed
     constraints = constraint if constraint is not None else arguments.pop("constraints", [])
     arguments["constraints"] = [] if constraints == ["none"] else constraints
@@ -77,10 +77,10 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
                            accept_changed_data=accept_changed_data)
     found = side_by_side(rows)
     if (reason := found.common_error) is not None:
-        raise StudyError(f"no solver could be tried: {reason}")
+        raise StudyError(f"no solver was run: {reason}")
     _show(found, study.formulations[0].name, entry["name"])
     if assumed:
-        note(f"{', '.join(f'{key} = {value}' for key, value in assumed.items())} assumed; optid order finds orders")
+        note(f"{', '.join(f'{key} = {value}' for key, value in assumed.items())} assumed; optid order selects orders")
     if report is not None:
         from optid.studies.page import write_page
 
@@ -88,16 +88,6 @@ def compare(data: Paths = None, example: str | None = None, *, how: dict[str, An
         say(f"report written to {report}")
     if not found.lines:
         raise typer.Exit(NOTHING_SOLVED)
-
-
-def _assumed(formulation: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Values for what a formulation needs and nobody gave."""
-    try:
-        parameters = inspect.signature(look_up(formulation)[1]).parameters
-    except LookupFailed:  # the study says so
-        return {}
-    needed = [key for key, p in parameters.items() if p.kind is p.KEYWORD_ONLY and p.default is p.empty]
-    return {key: ASSUMED[key] for key in needed if key not in arguments and key in ASSUMED}
 
 
 def _entry(files: list[Path] | None, how: dict[str, Any], example: str | None, seed: int
@@ -114,20 +104,16 @@ def _entry(files: list[Path] | None, how: dict[str, Any], example: str | None, s
 
 
 def _as_options(text: str) -> str:
-    """Say keys of a study as options of the command line."""
+    """Write the keys of a study in a message as options of the command line."""
     import re
 
-    lines = [line.strip() for line in text.splitlines()[1:]] or [text]
-    found = []
-    for line in lines:
-        line = re.sub(r"^(?:\w+\[[^]]*\]\.)?(\w+)(?:\[\d+\])?: must",
-                      lambda m: f"--{m[1].replace('_', '-')} must", line)
-        line = re.sub(r"^(?:data|formulation|solvers?)\[[^]]*\](?:\.\w+)*(?:\[\d+\])?: ", "", line)
-        found.append(line)
-    return "\n".join(found)
+    text = "\n".join(line.strip() for line in text.splitlines()[1:]) or text
+    text = re.sub(r"(?m)^(?:\w+\[[^]\n]*\]\.)?(\w+)(?:\[\d+\])?: must",
+                  lambda m: f"--{m[1].replace('_', '-')} must", text)
+    return re.sub(r"(?m)^(?:data|formulation|solvers?)\[[^]\n]*\](?:\.\w+)*(?:\[\d+\])?: ", "", text)
 
 
-def _show(found: Any, posed: str, record: str) -> None:
+def _show(found: Any, formulation: str, record: str) -> None:
     from optid.backends.choice import back_ends
     from optid.program.solution import GRADIENT
     from optid.show.wording import number, seconds
@@ -148,7 +134,7 @@ def _show(found: Any, posed: str, record: str) -> None:
             Text(word if good else line.state, "green" if line.proved else "yellow"),
             "0" if abs(line.above) < 1e-12 else small(line.above), small(line.residual), seconds(line.cold),
             seconds(line.warm), number(line.one_step, 4), number(line.simulation, 4)))
-    print_table(f"{posed} on {record}, accuracy {found.accuracy:.0e}",
+    print_table(f"{formulation} on {record}, accuracy {found.accuracy:.0e}",
                 ("solver", "verified", "excess", "residual", "cold", "warm", "1-step", "simul."), table,
                 firm=(0, *range(2, 8)), right=range(2, 8), padding=(0, 0, 0, 1))
     for reason, solvers in found.reasons.items():
@@ -160,8 +146,8 @@ def _show(found: Any, posed: str, record: str) -> None:
         else:
             unfit.append(solver)
     if unfit:
-        say(Text(f"not for {posed}: {', '.join(unfit)}", "dim"))
-    say(Text("optimal: proved globally optimal. excess: objective above the best, relative. residual: how far the "
-             "point is from optimal, measured by optid (constraints, complementarity, and gradient / "
-             f"{GRADIENT:g}). 1-step, simul.: fit in % on held-out samples.", "dim"))
+        say(Text(f"not applicable to {formulation}: {', '.join(unfit)}", "dim"))
+    say(Text("optimal: proved globally optimal. excess: relative distance of the objective from the best. "
+             "residual: largest residual of the optimality conditions, verified by optid (constraints, "
+             f"complementarity, and gradient / {GRADIENT:g}). 1-step, simul.: fit in % on held-out samples.", "dim"))
     say(Text(found.recommendation, "bold"))

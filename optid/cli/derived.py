@@ -1,4 +1,4 @@
-"""Options that a formulation brings along: one for each of its arguments, from its signature and its docstring."""
+"""Options for the arguments of a formulation, made from its signature and docstring."""
 
 import inspect
 import json
@@ -21,7 +21,7 @@ class FittingCommand(Command):
     """A command that takes the arguments of the formulation named by ``--formulation`` as options."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse, after the options of the formulation have joined those of the command."""
+        """Parse, after adding the options of the formulation to those of the command."""
         self.params = [p for p in self.params if not getattr(p, "derived", False)]
         name = chosen(args)
         try:
@@ -39,19 +39,18 @@ class FittingCommand(Command):
                 raise
             raise _refused(LookupFailed(unknown(name, option))) from None
         values = {p.name: ctx.params.pop(p.name) for p in self.params if getattr(p, "derived", False) and p.name}
-        words = [f"{key}={_json(value)}" for key, value in values.items() if value not in (None, (), [])]
+        words = [f"{key}={_json(key, value)}" for key, value in values.items() if value not in (None, (), [])]
         ctx.params["settings"] = [*words, *(ctx.params.get("settings") or ())] or None
         return rest
 
 
 def _refused(error: LookupFailed) -> typer.Exit:
-    """Print what is wrong before the command begins, and return what ends it."""
     complain(error)
     return typer.Exit(exit_code(error))
 
 
 def chosen(args: Sequence[str]) -> str:
-    """Return the formulation that words of the command line name; the default where they name none."""
+    """Return the formulation named on the command line, or the default."""
     found = DEFAULT
     for word, following in zip(args, [*args[1:], ""]):
         if word in ("--formulation", "-f"):
@@ -62,12 +61,7 @@ def chosen(args: Sequence[str]) -> str:
 
 
 def derived_options(name: str, taken: set[str]) -> list[Any]:
-    """Return one option for every argument of a formulation that the command has no option for.
-
-    Args:
-        name: of the formulation.
-        taken: option words of the command.
-    """
+    """Return options for the arguments of a formulation for which the command has none (`taken` are its options)."""
     found = describe(entry_point(FORMULATIONS, name))
     about, parameters = found.arguments(), []
     for key, parameter in found.options.items():
@@ -81,7 +75,7 @@ def derived_options(name: str, taken: set[str]) -> list[Any]:
 
 
 def options_of_others(taken: set[str]) -> list[Any]:
-    """Return one option for every argument that only formulations other than the default have, for the help text."""
+    """Return options for the arguments that only other formulations have, for the help text."""
     texts: dict[str, str] = {}
     having: dict[str, list[str]] = {}
     for name, found in descriptions():
@@ -99,15 +93,15 @@ def options_of_others(taken: set[str]) -> list[Any]:
 
 def _parameter(key: str, text: str, more: str, panel: str, flag: bool = False) -> inspect.Parameter:
     word = option_of(key)
+    text = text if text.startswith("optid.") else text[:1].upper() + text[1:]
     option = typer.Option(
         f"{word}/--no-{word[2:]}" if flag else word, metavar=None if flag else "VALUE...", show_default=False,
-        help=escape(f"{text[:1].upper()}{text[1:]}.{more}"), rich_help_panel=panel)
+        help=escape(f"{text}.{more}"), rich_help_panel=panel)
     kind: Any = bool | None if flag else list[str] | None
     return inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=Annotated[kind, option])
 
 
 def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
-    """Let typer make options of a signature."""
 
     def shape(**_: Any) -> None: ...
 
@@ -122,7 +116,7 @@ def _options(parameters: Sequence[inspect.Parameter]) -> list[Any]:
 
 
 def unknown(name: str, option: str) -> str:
-    """Say that a formulation has no such option, what it has, and which formulations have it."""
+    """Return a message: the formulation has no such option; its options, and the formulations that have it."""
     key = option.removeprefix("--").partition("=")[0].replace("-", "_")
     having = [other for other, found in descriptions() if key in found.options]
     takes = " ".join(option_of(k) for k in describe(entry_point(FORMULATIONS, name)).options if k != "constraints")
@@ -130,10 +124,13 @@ def unknown(name: str, option: str) -> str:
     return f"formulation {name} takes no {option}; its own options are {takes}.{others}"
 
 
-def _json(words: Any) -> str:
-    """Write the words of one option as the value of ``--set``: numbers and true as such, several as a list."""
+def _json(key: str, words: Any) -> str:
+    """Write the words of the option of an argument as the value of ``--set``: JSON, several as a list."""
     from optid.cli.arguments import listed, one_or_all, value
 
     if isinstance(words, bool):
         return json.dumps(words)
-    return json.dumps(one_or_all([value(word) for word in listed(words) or []]))
+    found = listed(words)
+    if not found:
+        raise typer.BadParameter(f"{option_of(key)} needs a value")
+    return json.dumps(one_or_all([value(word) for word in found]))

@@ -1,4 +1,4 @@
-"""The commands before a fit: an excitation for the plant of a record, and the order that a record asks for."""
+"""The commands `optid design` (excitation signals) and `optid order` (order selection)."""
 
 from typing import Any
 
@@ -11,29 +11,28 @@ def design(like: Words = None, example: str | None = None, *, how: dict[str, Any
            amplitude: list[float] | None = None, shaped: bool = False, hold: int = 5, periods: int = 1,
            candidates: int = 8, seed: int = 0, basis: Words = None, feedback_basis: Words = None, rows: int = 10,
            output: File = None) -> None:
-    """Design an excitation for the plant of a record, with a promise about the expanded regressor.
+    """Design an excitation signal with a guaranteed condition number of the expanded regressor.
 
     Example: optid design --like data.csv --inputs u --outputs y --kind multisine --levels 12 -o excitation.csv
 
     The record:
-        like (FILE...): Record of the plant, one file or several.
+        like (FILE...): Record of the plant, one or several files.
     The excitation:
-        kind (-k NAME): multisine, chirp, noise or levels.
-        samples (-n): Samples; as many as the record has.
-        levels: Equally spaced values each input may take.
-        band (LOW HIGH): Lowest and highest frequency; from the measured response.
-        amplitude (LOW HIGH...): Range of all inputs, or one pair per input; the range of the record.
+        kind (-k NAME): Kind of signal: multisine, chirp, noise or levels.
+        samples (-n): Number of samples. [dim]that of the record[/]
+        levels: Number of equally spaced values of each input.
+        band (LOW HIGH): Lowest and highest frequency. [dim]from the measured response[/]
+        amplitude (LOW HIGH...): Range of all inputs, or one pair per input. [dim]that of the record[/]
         shaped: Weight the spectrum by the inverse of the measured gain.
-        hold: Samples for which levels are held.
-        periods: Periods of a multisine.
-        candidates: Realisations to choose the best from.
-        seed: Seed of the first of them.
+        hold: Samples for which a level is held.
+        periods: Number of periods of a multisine.
+        candidates: Number of realisations, of which the best is chosen.
+        seed: Seed of the first realisation.
     The model:
-        basis (-b NAME:SIZE...): Basis of the nonlinearity to be identified, one or one per input.
-            [dim]polynomial:4[/]
-        rows: Lags of every function: block rows, or nb.
+        basis (-b NAME:SIZE...): Basis of the nonlinearity, one for all inputs or one per input. [dim]polynomial:4[/]
+        rows: Number of lags of the expanded regressor: block rows, or nb.
     The result:
-        output (-o FILE): Write time and inputs to a CSV file.
+        output (-o FILE): Write time and inputs (CSV).
     """
     from optid.cli import arguments as words
     from optid.errors import StructureError
@@ -61,18 +60,19 @@ def design(like: Words = None, example: str | None = None, *, how: dict[str, Any
 def order(data: Paths = None, example: str | None = None, *, how: dict[str, Any], basis: Words = None,
           feedback_basis: Words = None, block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6,
           nk: int = 8, holdout: float = 0.3, level: float | None = None, seed: int = 0, picture: File = None) -> None:
-    """Find the order of a record: singular values, thresholds, criteria, a recommendation with its reasons.
+    """Select the model order from a record by singular values, information criteria and hold-out.
 
     Example: optid order data.csv --inputs u1 u2 --outputs y1 y2 --picture order.png
 
     The model:
-        basis (-b NAME:SIZE...): Basis of the nonlinearity, one or one per input, e.g. polynomial:4. [dim]linear[/]
-        block_rows: Future block rows, above the order. [dim]10, or fewer[/]
-        nx: Largest number of states of interest.
-        na: Most output lags compared.
-        nb: Most input lags compared.
-        nk: Largest delay compared.
-        holdout (SHARE): Share that is held out.
+        basis (-b NAME:SIZE...): Basis of the nonlinearity, one for all inputs or one per input, such as polynomial:4.
+            [dim]linear[/]
+        block_rows: Future block rows; must exceed the order. [dim]10, or fewer[/]
+        nx: Largest number of states.
+        na: Largest number of output lags.
+        nb: Largest number of input lags.
+        nk: Largest delay.
+        holdout (SHARE): Share of the record held out.
         level: Probability of rejecting the true order. [dim]at most 0.01[/]
     """
     with working(picture=picture) as work:

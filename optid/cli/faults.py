@@ -6,22 +6,22 @@ from typing import Any
 from optid.cli.options import File, Paths, Words
 from optid.cli.results import command_line, working
 
-ZERO = "INPUT=VALUE, the input at which the actuator does nothing"
+ZERO = "INPUT=VALUE, the input at which the actuator has no effect"
 
 
 def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: float = 0.95, false_alarm: float = 0.01,
                 kinds: Words = None, load: Words = None, disturbance: Words = None, state_jump: bool = True,
                 draws: int = 1000, seed: int = 0, picture: File = None) -> None:
-    """Find how large every fault must be to be noticed, and to be told from the others; no data are needed.
+    """Compute the smallest size at which each fault is detectable and isolable; needs no data.
 
     Example: optid isolability model.json --window 100 --load pump=0.5,-0.3,0.4,0.2 --picture isolability.png
 
     The model:
-        window (-w N): Samples of a window.
+        window (-w N): Length of the window in samples.
         onset (K): Sample of the onset, or unknown.
-        prob: Probability to be noticed, and to be named.
-        false_alarm: Probability that a healthy window raises an alarm.
-        kinds (-k NAME...): bias, drift. [dim]bias[/]
+        prob: Required probability of detection and of isolation.
+        false_alarm: Probability of a false alarm in a window.
+        kinds (-k NAME...): Kinds of faults: bias, drift. [dim]bias[/]
         draws: Simulated windows per fault.
         seed: Seed of the simulation.
     """
@@ -29,7 +29,7 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
     from optid.errors import StructureError
 
     if onset != "unknown" and not onset.isdecimal():
-        raise StructureError(f"--onset {onset}: the number of a sample, or unknown, is needed")
+        raise StructureError(f"--onset {onset}: must be the number of a sample, or unknown")
     with working(picture=picture) as work:
         from optid.faults import dictionary
 
@@ -50,27 +50,28 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
              disturbance: Words = None, zero: Words = None, state_jump: bool = True, max_faults: int = 1,
              false_alarm: float = 0.01, coverage: float = 0.95, robust: bool = False, method: str = "exact",
              solver: str = "auto", seed: int = 0, out: File = None, report: File = None, picture: File = None) -> None:
-    """Find out whether a record is healthy, and if not, what broke, when, and how much of it.
+    """Diagnose a record: healthy or faulty, which fault, its onset and size.
 
     Example: optid diagnose model.json faulty.csv --max-faults 2 --out d.json --report d.html
 
     Files:
-        data (DATA): The record: a CSV, Parquet, MAT, NPZ or npy file.
+        data (DATA): The record: a CSV, Parquet, MAT, NPZ or NPY file.
     The record:
-        healthy (FILE...): A healthy record: its innovations must be white and of the size that the model says.
-        identified (FILE...): The record that the model was identified from, or the name of a built-in one: the
-            uncertainty of the model counts as noise. [dim]the model is exact[/]
-        rescale: Take the scale of the noise from --healthy.
+        healthy (FILE...): A healthy record, on which the innovations are tested for whiteness and variance.
+        identified (FILE...): The record from which the model was identified, or the name of an example; the
+            uncertainty of the model is added to the noise. [dim]exact model[/]
+        rescale: Scale the noise covariance to that of --healthy.
     The model:
-        kinds (-k NAME...): bias, loss, stuck, drift, frozen, noise, spike. [dim]bias, loss, spike[/]
-        zero (INPUT=VALUE...): Where an actuator does nothing, for shares lost. [dim]not known[/]
-        max_faults: Faults that may be in the record.
-        false_alarm: Probability that a healthy record raises an alarm.
-        coverage: Of the set of answers and of the intervals.
-        robust: Bound the influence of outliers.
+        kinds (-k NAME...): Kinds of faults: bias, loss, stuck, drift, frozen, noise, spike. [dim]bias, loss, spike[/]
+        zero (INPUT=VALUE...): Input at which an actuator has no effect; a loss is a share of the distance from it.
+            [dim]unknown[/]
+        max_faults: Largest number of simultaneous faults.
+        false_alarm: Probability of a false alarm on a healthy record.
+        coverage: Coverage of the set of candidates and of the confidence intervals.
+        robust: Limit the influence of outliers.
     The solver:
-        method: exact, sparse, sparse+polish or set.
-        seed: Seed of simulated thresholds, and of an example.
+        method: Search method: exact, sparse, sparse+polish or set.
+        seed: Seed of the simulated thresholds and of the example.
     The result:
         out (FILE): Write the diagnosis (.json).
     """
@@ -85,8 +86,8 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
         how = words.as_modelled(how, plant)
         record: Any = words.record(data, how, example, seed)[0]
         if record.n_experiments > 1:
-            raise DataError(f"{record.n_experiments} experiments: diagnose one record at a time (give one file, and "
-                            "cut it to the experiment).")
+            raise DataError(f"the record has {record.n_experiments} experiments: give one file with one experiment."
+                            "")
         sound: Any = words.read_record(healthy, how) if healthy else None
         origin = _origin(identified, how)
         work.step("signatures")
@@ -114,8 +115,8 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
         work.draw(answer.plot, picture)
         if origin is None and answer.detected:
             work.heard.append(
-                "The model counts as exact, so that its errors may look like a fault: --identified FILE (the record "
-                "that it was identified from) takes its uncertainty into account."
+                "The model is assumed exact: a model error may appear as a fault. --identified FILE (the record "
+                "from which the model was identified) accounts for its uncertainty."
             )
         work.text = str(answer)
 
@@ -139,27 +140,27 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
                 constraint: Words = None, stage: str = "auto", nodes: int = 7, low: Words = None, high: Words = None,
                 target: Words = None, if_ambiguous: str = "auto", solver: str = "auto", seed: int = 0,
                 saved: File = None, report: File = None, picture: File = None) -> None:
-    """Turn a healthy model and a diagnosis into the damaged system: its model, what observes it, what it can still do.
+    """Build the model of the damaged system from a healthy model and a diagnosis.
 
     Example: optid reformulate model.json d.json faulty.csv --model damaged.json --report r.html
 
     Files:
         model (MODEL): Model file (.json) of the healthy plant.
-        diagnosis (DIAGNOSIS): Written by optid diagnose --out.
-        data (DATA): The record of the diagnosis: CSV, Parquet, MAT, NPZ or npy.
+        diagnosis (DIAGNOSIS): Diagnosis (.json) written by optid diagnose --out.
+        data (DATA): The diagnosed record: a CSV, Parquet, MAT, NPZ or NPY file.
     The model:
-        constraint (-c NAME:VALUE...): Of a damaged nonlinearity; by default monotone and nowhere steeper than before;
-            'none' for none.
-        stage: 'affected only', 'all with prior' or auto (by hold-out).
-        nodes: Values of a damaged nonlinearity.
-        low (U...): Least inputs.
-        high (U...): Largest inputs.
-        if_ambiguous: wait, probe, robust or auto.
+        constraint (-c NAME:VALUE...): Constraints on a damaged nonlinearity; 'none' removes them.
+            [dim]monotone, no steeper than before[/]
+        stage: Parameters to refit: 'affected only', 'all with prior' or auto (chosen by hold-out).
+        nodes: Number of nodes of a damaged nonlinearity.
+        low (U...): Lower limits of the inputs, one per input.
+        high (U...): Upper limits of the inputs, one per input.
+        if_ambiguous: Action when several faults explain the record: wait, probe, robust or auto.
     The solver:
-        seed: Seed of draws and probes, and of an example.
+        seed: Seed of the draws, the probes and the example.
     The result:
-        target (Y...): Can these outputs be held? One number each.
-        saved (--model -m FILE): Write the damaged model (JSON).
+        target (Y...): Check whether these constant outputs are attainable; one number per output.
+        saved (--model -m FILE): Write the model of the damaged system (JSON).
     """
     with working(model=saved, report=report, picture=picture) as work:
         from optid.cli import arguments as words

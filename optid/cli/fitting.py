@@ -1,4 +1,4 @@
-"""The commands that make models of records, and judge them: fit, identify, validate."""
+"""The commands `optid fit`, `optid identify` and `optid validate`."""
 
 from functools import partial
 from pathlib import Path
@@ -7,6 +7,7 @@ from typing import Any
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
 from optid.cli.results import Work, check_names, working
+from optid.errors import DataError
 from optid.lazy import import_cvxpy
 
 BUDGET = 60.0
@@ -17,24 +18,24 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         constraint: Words = None, holdout: str | None = None, settings: Words = None, solver: str = "auto",
         accuracy: float = 1e-8, time_limit: float | None = None, prove: bool = True, option: Words = None,
         seed: int = 0, report: File = None, saved: File = None) -> None:
-    """Fit a model to a record, prove it optimal, and report it; without orders, search for them as optid identify does.
+    """Fit a model to a record, prove global optimality and report; without orders, search for them like optid identify.
 
     Example: optid fit data.csv --inputs u --outputs y --dt 0.1 --na 2 --nb 2 --basis triangular:10
     --constraint monotone:increasing --report report.html
 
     The record:
-        stream: Read chunk by chunk: for a file larger than memory.
-        scheduler (ADDRESS): Let a Dask cluster (tcp://host:8786) read the row groups of Parquet files or folders.
-        split (SHARE): Fit on this share, validate on the rest, e.g. 0.7.
+        stream: Read in chunks, for files larger than memory.
+        scheduler (ADDRESS): Read Parquet files or folders on a Dask cluster (tcp://host:8786).
+        split (SHARE): Fit on this share of the record and validate on the rest, such as 0.7.
     The model:
-        constraint (-c NAME:VALUE...): e.g. monotone:increasing; see optid constraints. 'none' drops those an example
-            suggests.
-        holdout (PENALTY): Choose the weight of ridge, curvature or weight (nuclear norm) by hold-out.
-        settings (--set KEY=VALUE...): Any other argument of the formulation.
+        constraint (-c NAME:VALUE...): Constraint, such as monotone:increasing; optid constraints lists them. 'none'
+            removes those of the example.
+        holdout (PENALTY): Choose this weight by hold-out: ridge, curvature or weight (of the nuclear norm).
+        settings (--set KEY=VALUE...): Any argument of the formulation.
     The solver:
-        accuracy: Relative, for any solver.
-        time_limit (SECONDS): Stop the solver after this time.
-        prove (--prove/--no-prove): Ask for a proof of global optimality.
+        accuracy: Requested relative accuracy of the solver.
+        time_limit (SECONDS): Time limit of the solver.
+        prove (--prove/--no-prove): Try to prove global optimality.
         option (KEY=VALUE...): Native options of the solver.
     """
     check_names(constraint, solver, formulation)
@@ -64,7 +65,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         work.step("standard errors")
         work.text = describe(found)
         if found.verdict is not None and found.verdict.word in ("poor", "useless"):
-            work.step("looking for what would help")
+            work.step("searching for advice")
             work.text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
         _finish(work, found, held_out, saved, None if stream or scheduler else data, how)
         work.page(found, report, held_out)
@@ -74,20 +75,19 @@ def identify(data: Paths = None, example: str | None = None, *, how: dict[str, A
              horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
              workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0,
              report: File = None, saved: File = None) -> None:
-    """Find the structure of a record by cross-validation, and fit it: formulation, delay, orders, functions.
+    """Select formulation, delay, orders and bases by cross-validation, and fit the model.
 
     Example: optid identify data.csv --inputs u --outputs y --dt 0.1 --report report.html
 
     The model:
-        budget (SECONDS): Time of the search.
-        horizon (N): Compare predictions so many samples ahead. [dim]free runs[/]
-        classes (NAME...): Classes of models to be tried: linear, 'input functions', feedback, 'latent signals'.
-            [dim]all[/]
-        constraint (-c NAME:VALUE...): What every model has to obey.
+        budget (SECONDS): Time budget of the search.
+        horizon (N): Compare N-step-ahead predictions. [dim]simulation[/]
+        classes (NAME...): Model classes: linear, 'input functions', feedback, 'latent signals'. [dim]all[/]
+        constraint (-c NAME:VALUE...): Constraint on every model; optid constraints lists them.
     The solver:
-        workers (N): Processes. [dim]one per processor[/]
+        workers (N): Number of processes. [dim]one per core[/]
     The record:
-        split (SHARE): Search on this share, validate on the rest.
+        split (SHARE): Search on this share of the record and validate on the rest.
     """
     _search(data, example, how, seed, split, test, constraint, solver, saved, report, budget=budget, horizon=horizon,
             workers=workers, **({"classes": classes} if classes else {}))
@@ -112,7 +112,7 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
 
 def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
             what: str = "fit") -> None:
-    """Validate on what was held out, and write the model, with the place of a record that it is from as a whole."""
+    """Validate on the held-out record and save the model; a record that was used whole is named in its file."""
     from optid.cli.arguments import listed
 
     if held_out is not None:
@@ -129,14 +129,14 @@ def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Pat
 
 
 def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:
-    """Validate saved models on another record: fits, residual tests; several models side by side.
+    """Validate one or several saved models on another record: fits and residual tests.
 
-    Inputs, outputs and sampling time are those of the first model where they are not given.
+    Inputs, outputs and sampling time are by default those of the first model.
 
     Files:
         files (MODEL... DATA...): Model files (.json) written by fit --model, then files of the record.
     The result:
-        horizon (N): Predict so many samples ahead, too.
+        horizon (N): Also compute N-step-ahead predictions.
     """
     with working(report=report) as work:
         from optid.cli import arguments as words
@@ -144,8 +144,12 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
         from optid.identify.validation import validate as check
         from optid.models.files import load
 
-        paths, data = words.models_and_data(files)
-        models = dict(zip(words.distinct_names(paths), map(load, paths)))
+        paths = [path for i, path in enumerate(files) if i == 0 or path.suffix.lower() == ".json"]
+        data = [path for path in files if path not in paths]
+        if not data:
+            raise DataError(f"give a data file after the model{'s' if len(paths) > 1 else ''}")
+        distinct = len({path.stem for path in paths}) == len(paths)
+        models = {path.stem if distinct else str(path): load(path) for path in paths}
         first = next(iter(models.values()))
         record: Any = words.read_record(data, words.as_modelled(how, first))
         work.step("validating")

@@ -1,4 +1,4 @@
-"""Lines of a stream: the standard input, or a file that is still being written, rotated, cut or replaced."""
+"""Lines of a stream: the standard input, or a file that is being appended, rotated, truncated or replaced."""
 
 import hashlib
 import os
@@ -10,13 +10,13 @@ from typing import Any
 
 from optid.cli.terminal import note
 
-POLL = 0.1  # seconds between looks at a file that is followed
+POLL = 0.1  # seconds between checks of a followed file
 BLOCK = 1 << 16  # bytes read at a time
-MARK = 256  # bytes before the place reached by which a file is known again
+MARK = 256  # bytes before the current place that identify a file
 
 
 def standard_input() -> Iterator[tuple[list[bytes], str]]:
-    """Yield complete lines as they come, without their ends, and an empty remark."""
+    """Yield complete lines as they arrive, without their ends, and an empty remark."""
     if sys.stdin.isatty():
         note("reading from the terminal; end with Ctrl-D, or pipe a file: optid monitor model.json < stream.csv")
     rest = b""
@@ -32,35 +32,25 @@ class Followed:
     """A file that is followed.
 
     Attributes:
-        place: where the next line begins, in JSON types: path, offset, inode, and a hash of the bytes before it.
+        place: start of the next line, in JSON types: path, offset, inode, and a hash of the bytes before it.
     """
 
     def __init__(self, path: Path, place: Mapping[str, Any] | None) -> None:
-        """Open a file.
-
-        Args:
-            path: of the file.
-            place: where to go on, of an earlier run.
-
-        Raises:
-            OSError: no such file.
-        """
+        """Open a file, to be read from the place of an earlier run, if given (`OSError`: no such file)."""
         self._path, self._old = path, dict(place) if place else None
         with open(path, "rb") as file:
             self.place: dict[str, Any] = {"path": str(path.resolve()), "offset": 0, "inode": _inode(file), "mark": ""}
         self._tail = b""
 
     def advance(self, count: int, lines: list[bytes]) -> None:
-        """Say that lines of so many bytes have been taken in."""
+        """Record that lines of so many bytes have been processed."""
         self._tail = (self._tail + b"".join(line + b"\n" for line in lines[-MARK:]))[-MARK:]
         self.place |= {"offset": self.place["offset"] + count, "mark": _hash(self._tail)}
 
     def lines(self, until_end: bool, *, partial: bool = True) -> Iterator[tuple[list[bytes], str]]:
         """Yield complete lines, without their ends, and a remark where another file begins.
 
-        Args:
-            until_end: stop at the end of the file.
-            partial: whether a last line without an end counts.
+        It stops at the end of the file if `until_end`; a last line without an end counts if `partial`.
         """
         remark, self._partial = "", partial
         if self._old is not None:
@@ -68,7 +58,8 @@ class Followed:
             if found is None:
                 remark = f"{self._path} is not the file that was read before: it is read from its beginning"
             else:
-                self._go_on(found, self._old)
+                self._tail = _before(found, int(self._old["offset"]))
+                self.place |= {key: self._old[key] for key in ("offset", "inode", "mark")}
                 yield from self._of(found, until_end or not _same(found, self._path))
                 if not _same(found, self._path):
                     remark = f"{self._path} was rotated: the rest of {found.name} was read"
@@ -77,8 +68,8 @@ class Followed:
                 else:
                     remark = self._remark
         while True:
-            self._begin()
-            first = True
+            self.place |= {"offset": 0, "inode": os.stat(self._path).st_ino, "mark": ""}
+            self._tail, first = b"", True
             for raw in self._of(self._path, until_end):
                 yield raw[0], remark if first else ""
                 first = False
@@ -86,16 +77,8 @@ class Followed:
                 return
             remark = self._remark
 
-    def _begin(self) -> None:
-        self.place |= {"offset": 0, "inode": os.stat(self._path).st_ino, "mark": ""}
-        self._tail = b""
-
-    def _go_on(self, found: Path, old: Mapping[str, Any]) -> None:
-        self._tail = _before(found, int(old["offset"]))
-        self.place |= {"offset": int(old["offset"]), "inode": int(old["inode"]), "mark": old["mark"]}
-
     def _found(self, old: Mapping[str, Any]) -> Path | None:
-        """The file that an earlier run read: under its name, or the name that a rotation gave it."""
+        """Return the file that an earlier run read: under its name, or under the name after a rotation."""
         for path in (self._path, *sorted(self._path.parent.glob(self._path.name + "?*"))):
             if path.is_file() and path.stat().st_size >= int(old["offset"]) and \
                     _hash(_before(path, int(old["offset"]))) == old["mark"] and \
@@ -104,7 +87,7 @@ class Followed:
         return None
 
     def _of(self, path: Path, until_end: bool) -> Iterator[tuple[list[bytes], str]]:
-        """Yield lines of one file from the place on, until it ends or is no longer the file of that name."""
+        """Yield lines of one file from the place on, until its end or until another file has its name."""
         rest, self._remark = b"", ""
         with open(path, "rb") as file:
             file.seek(self.place["offset"])
@@ -146,7 +129,7 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def _before(path: Path, place: int) -> bytes:
-    """Return the bytes of a file before a place, at most `MARK`."""
+    """Return at most `MARK` bytes of a file before a place."""
     with open(path, "rb") as file:
         file.seek(max(place - MARK, 0))
         return file.read(min(MARK, place))

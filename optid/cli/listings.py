@@ -1,4 +1,4 @@
-"""The commands that list what there is to choose from, generated from the registries and from nothing else."""
+"""The commands that list solvers, formulations, constraints, examples and simulated systems."""
 
 from importlib.metadata import EntryPoint
 
@@ -12,7 +12,7 @@ CLASSES = ("LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one")
 
 
 def solvers() -> None:
-    """List every back end: what it accepts and whether it is installed."""
+    """List the solvers: the problem classes that each accepts, and whether it is installed."""
     rows = []
     with Waiting() as waiting:
         waiting.step("asking the back ends")
@@ -26,24 +26,24 @@ def solvers() -> None:
                            for yes in (back_end.duals, back_end.warm, back_end.installed)),
                          back_end.about if back_end.installed else Text(missing, "dim")))
     print_table("Back ends", ("solver", "takes", "prices", "warm", "here", "about"), rows,
-                "Use one with --solver NAME. prices: returns multipliers, so that constraints have prices. "
-                "warm: can start from a given point. here: installed.", firm=(0, 1))
+                "Use one with --solver NAME. prices: returns multipliers, from which the prices of constraints are "
+                "computed. warm: accepts a starting point. here: installed.", firm=(0, 1))
 
 
 def formulations() -> None:
-    """List the formulations, their arguments and the variables that constraints may use."""
+    """List the formulations, their arguments and the variables for constraints."""
     with Waiting() as waiting:
         waiting.step("loading the formulations")
         fits, faults = _entries(FORMULATIONS), _entries(FAULTS)
-    print_table("Formulations", ("formulation", "what it poses"), fits,
-                "Constraints speak about the variables; with several inputs they carry the input, as in mu[valve]. "
-                "Arguments in brackets may be left out.")
-    print_table("Programmes about faults", ("programme", "what it poses"), faults,
-                "Posed and solved by optid diagnose, optid reformulate and the functions of optid.faults.")
+    print_table("Formulations", ("formulation", "problem"), fits,
+                "Constraints refer to the variables by name; with several inputs the name has the input, as mu[valve]. "
+                "Arguments in brackets are optional.")
+    print_table("Fault programmes", ("programme", "problem"), faults,
+                "Solved by optid diagnose, optid reformulate and the functions of optid.faults.")
 
 
 def constraints() -> None:
-    """List the constraints by the words the command line takes."""
+    """List the constraints and their arguments."""
     rows = []
     for name, point in sorted(registered(CONSTRAINTS).items()):
         found = _described(point)
@@ -51,8 +51,8 @@ def constraints() -> None:
             rows.append((Text(name, "dim"), "", found))
         else:
             rows.append((Text(name, "bold"), _arguments(found), found.summary))
-    print_table("Constraints", ("constraint", "arguments", "what it demands"), rows,
-                "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets may be left out.")
+    print_table("Constraints", ("constraint", "arguments", "meaning"), rows,
+                "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets are optional.")
 
 
 def examples() -> None:
@@ -60,24 +60,23 @@ def examples() -> None:
     from optid.examples import EXAMPLES
 
     rows = [(Text(name, "bold"), describe_function(function).summary) for name, function in sorted(EXAMPLES.items())]
-    print_table("Built-in records", ("example", "what it is"), rows, "Use one with optid fit --example NAME.")
+    print_table("Built-in records", ("example", "description"), rows, "Use one with optid fit --example NAME.")
 
 
 def systems() -> None:
-    """List the simulated systems that a study file may name."""
+    """List the simulated systems for study files."""
     from optid.studies.sources.systems import SYSTEMS
 
     rows = [(Text(name, "bold"), str(system.samples), f"{system.noise:.3g}",
              *(str(system.suggestion.get(key, default)) for key, default in (("na", "-"), ("nb", "-"), ("nk", 0))),
              system.about) for name, system in SYSTEMS.items()]
-    print_table("Simulated systems", ("system", "samples", "noise", "na", "nb", "nk", "what it is"), rows,
-                "samples and noise are those used where a study names none; noise is relative to the noise-free "
-                "output. na, nb and nk suit the system; with other ones a model may be far from the truth.",
+    print_table("Simulated systems", ("system", "samples", "noise", "na", "nb", "nk", "description"), rows,
+                "samples and noise are the defaults of a study; noise is relative to the noise-free output. na, nb and "
+                "nk are those of the system.",
                 right=range(1, 6))
 
 
 def _entries(group: str) -> list[tuple[Text, Text]]:
-    """Names of a group with summary, arguments and named variables."""
     rows = []
     for name, point in sorted(registered(group).items()):
         found = _described(point)

@@ -11,10 +11,10 @@ from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
 
-LOUD = 20  # rows that cannot be read that are named for each block read; the others are counted
+LOUD = 20  # unreadable rows reported individually per block read; the others are counted
 
 ARL0 = 10_000
-"""Mean samples between false alarms that are asked for where nothing is said."""
+"""Default mean number of samples between false alarms."""
 
 KEPT = 10_000  # samples after which the state is saved, events or not
 
@@ -25,31 +25,31 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, inputs: W
             load: Words = None, state_jump: bool = True, arl0: float | None = None, window: int = 100,
             identified: Paths = None, healthy: Paths = None, thresholds: File = None, extrapolate: bool = False,
             seed: int = 0, state: File = None, lines: bool = False) -> None:
-    """Watch a stream: one line for every alarm, every fault that is named, and everything that is over.
+    """Monitor a stream of samples: print one line per alarm, isolated fault and end of a fault.
 
-    Rows that cannot be read are named on the error stream and count as missing samples. A file that is rotated, cut or
-    replaced is followed. With --json every line has the fields kind, sample, line, time, candidates, onset, size,
+    Unreadable rows are reported on the error stream and count as missing samples. A file that is rotated, truncated
+    or replaced is followed. With --json every line has the fields kind, sample, line, time, candidates, onset, size,
     statistic and note.
 
     Example: optid monitor model.json --arl0 10000 < stream.csv
 
     The record:
-        follow (-f FILE): Read this file, and what is written to it later, instead of the standard input.
-        until_end: With --follow: stop at the end of the file.
-        fill_gaps (N): Count up to N samples that the time stamps skip as missing; of a longer gap N.
-        strict: Stop at a row that cannot be read.
+        follow (-f FILE): Read this file and follow what is appended to it. [dim]standard input[/]
+        until_end: Stop at the end of the followed file.
+        fill_gaps (N): Insert at most N missing samples where the time stamps have a gap.
+        strict: Stop at the first unreadable row.
     The model:
-        kinds (-k NAME...): bias, loss, stuck, drift, spike. [dim]bias, loss, spike[/]
-        arl0 (N): Mean samples between false alarms. [dim]10000, or that of --thresholds[/]
-        window (-w N): Samples of the window.
-        identified (FILE...): The record that the model was identified from: the uncertainty of its parameters counts.
-        healthy (FILE...): A later healthy record: the noise that it shows is used, and the thresholds keep it quiet.
-        thresholds (FILE): Thresholds of an earlier run (.json); written there when there is no such file.
-        extrapolate: Allow thresholds beyond what a simulation supports.
-        seed: Seed of simulated thresholds.
+        kinds (-k NAME...): Kinds of faults: bias, loss, stuck, drift, spike. [dim]bias, loss, spike[/]
+        arl0 (N): Mean number of samples between false alarms (ARL0). [dim]10000, or that of --thresholds[/]
+        window (-w N): Length of the window in samples.
+        identified (FILE...): The record from which the model was identified; accounts for its uncertainty.
+        healthy (FILE...): A later healthy record, from which noise and thresholds are calibrated.
+        thresholds (FILE): Read the thresholds from this file (.json), or write them if it does not exist.
+        extrapolate: Allow thresholds extrapolated beyond the simulated run lengths.
+        seed: Seed of the simulated thresholds.
     The result:
-        state (FILE): Go on from this state (.npz) where there is one, and keep it there.
-        lines (--json): One JSON object per line instead of words.
+        state (FILE): Resume from this state (.npz) if it exists, and save the state to it.
+        lines (--json): Print one JSON object per line.
     """
     from optid.cli import arguments as words
     from optid.data.reading.rows import RowReader
@@ -77,15 +77,15 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, inputs: W
             if sound is None and origin is not None:
                 _doubt(plant, origin)
             elif sound is None and thresholds is None:
-                note("the thresholds take the model as exact and its innovations as white: name the record that it was "
-                     "identified from (--identified FILE...) and a later healthy one (--healthy FILE...)")
+                note("the thresholds assume an exact model and white innovations: give the record from which it was "
+                     "identified (--identified FILE...) and a later healthy record (--healthy FILE...)")
     for sentence in heard:
         note(sentence)
     _Watch(watcher, reader, follow, state, strict=strict, as_json=lines).run(until_end)
 
 
 def _identified_from(path: Path) -> Any:
-    """Read the record that a model file names, and say so; None where it names none or its files are gone."""
+    """Read the record that a model file names; None if it names none or the files do not exist."""
     from optid.cli.arguments import read_record
     from optid.errors import ModelFileError
     from optid.models.files import record_of
@@ -95,17 +95,17 @@ def _identified_from(path: Path) -> Any:
         return None
     files = named.pop("files")
     if named.keys() != set(READING):
-        raise ModelFileError(f"{path} does not say how its record is read as this release does: fit the model again")
+        raise ModelFileError(f"{path} does not hold the reading options of this release: fit the model again")
     if gone := [name for name in files if not Path(name).is_file()]:
-        note(f"{gone[0]}, from which the model was identified, is no longer there")
+        note(f"{gone[0]}, from which the model was identified, does not exist any more")
         return None
-    note("noise and uncertainty of the model are those of the record it was identified from, "
-         f"{', '.join(Path(name).name for name in files)}: name a later healthy one with --healthy FILE...")
+    note("noise and model uncertainty are taken from the record of the identification, "
+         f"{', '.join(Path(name).name for name in files)}: give a later healthy record with --healthy FILE...")
     return read_record(files, named)
 
 
 def _doubt(plant: Any, origin: Any) -> None:
-    """Say whether the noise of a model is that of the record behind it, and how to calibrate the monitor if not."""
+    """Warn if the innovations on the record of the identification are not white or not of the predicted size."""
     from optid.faults import health, whiten
 
     judged = health(whiten(plant, origin))
@@ -126,7 +126,7 @@ def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | No
         try:
             known = Calibration.from_dict(json.loads(path.read_text(encoding="utf-8")))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ModelFileError(f"{path} does not hold thresholds ({error}): name another file") from None
+            raise ModelFileError(f"{path} does not hold thresholds ({error}): give another file") from None
         if arl0 is not None and arl0 != known.arl0:
             raise StructureError(f"{path} holds thresholds for a false alarm every {known.arl0:g} samples, --arl0 asks "
                                  f"for {arl0:g}: leave --arl0 out, or name another file")
@@ -148,7 +148,7 @@ def _resumed(state: Path, plant: Any, path: Path) -> Any:
 
 
 class _Watch:
-    """Reads, judges and tells until the stream ends."""
+    """Reads the stream, runs the monitor and prints its events."""
 
     def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: Path | None, *, strict: bool,
                  as_json: bool) -> None:
@@ -178,14 +178,14 @@ class _Watch:
                 self._take_in(raw)
         except KeyboardInterrupt:
             pass
-        except BrokenPipeError:  # whoever read the events has gone
+        except BrokenPipeError:  # the reader of the events has ended
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         finally:
             self._keep()
         if not self.watcher.samples:
-            note("no sample was read: there was nothing behind the header")
+            note("no sample was read: no rows follow the header")
         if self.bad:
-            note(f"{self.bad} of {self.watcher.samples} rows could not be read in full")
+            note(f"{self.bad} of {self.watcher.samples} rows were unreadable in part or in full")
 
     def _take_in(self, raw: list[bytes]) -> None:
         from optid.errors import DataError
@@ -224,7 +224,7 @@ class _Watch:
 
 
 def _clean(stamp: str) -> str:
-    """A time stamp without the last digits of a sum of floating-point numbers."""
+    """Return a time stamp without the rounding errors of accumulated sampling times."""
     try:
         return f"{float(stamp):.12g}"
     except ValueError:

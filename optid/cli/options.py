@@ -1,8 +1,8 @@
 """Options of the commands: types and defaults from the signature, words and help from the docstring.
 
 A docstring describes the parameters in sections, one for every panel of the help text ("Files" are arguments, "Options"
-have no panel), each as ``name (words METAVAR): help``. Words are given where the option is not the name of its
-parameter, or has a letter besides. What several commands share is described once, in `SHARED`.
+have no panel), each as ``name (words METAVAR): help [dim]default[/]``. Words are given where the option differs from
+the name of its parameter or has a short form. Options of several commands are described once, in `SHARED`.
 """
 
 import ast
@@ -25,37 +25,37 @@ File = Path | None
 
 SHARED = """
 Files:
-    data (DATA...): CSV, Parquet, MAT, NPZ or npy files, one experiment each.
+    data (DATA...): CSV, Parquet, MAT, NPZ or NPY files, one experiment each.
     model (MODEL): Model file (.json) of a state-space model.
-    db (DATABASE): Written by optid study run.
+    db (DATABASE): Database written by optid study run.
 The record:
-    example (NAME): A built-in record instead: see optid examples.
+    example (NAME): Use a built-in record instead of files; optid examples lists them.
     inputs (-u NAME...): Columns of the inputs. [dim]u, u1, u2, ...[/]
     outputs (-y NAME...): Columns of the outputs. [dim]y, y1, y2, ...[/]
-    dt: Sampling time; from the time stamps where there are some.
+    dt: Sampling time. [dim]from the time stamps[/]
     time (NAME): Column of time stamps; 'none' ignores them. [dim]t, time[/]
     experiment (NAME): Column that names the experiment of each row.
     columns (NAME...): Names of the columns of a file without a header.
-    delimiter: Between the cells of a CSV file.
+    delimiter: Delimiter of a CSV file.
     decimal: Decimal mark of a CSV file.
     test (FILE...): Validate on these files.
-    seed: Seed of the noise of an example.
+    seed: Seed of the noise of the example.
 The model:
-    formulation (-f NAME): See optid formulations.
-    feedback_basis (NAME:SIZE...): Basis of the functions of the outputs that are fed back, one or one per output.
-    load (--load --process NAME=E1,E2,...): Direction of a process fault: one number per state, or what it does to
-        outputs, as leak=y1:-1.
-    disturbance (NAME): An input, an output or a --process direction that may do anything without being a fault.
-    state_jump (--state-jump/--no-state-jump): May the state jump?
+    formulation (-f NAME): Formulation of the model; optid formulations lists them.
+    feedback_basis (NAME:SIZE...): Basis of the nonlinear output feedback, one for all outputs or one per output.
+    load (--load --process NAME=E1,E2,...): Direction of a process fault: one number per state, or its effect on the
+        outputs, such as leak=y1:-1.
+    disturbance (NAME): Unknown disturbance that is not a fault: an input, an output or a --process direction.
+    state_jump (--state-jump/--no-state-jump): Include a jump of the state as a fault.
 The solver:
-    solver (-s NAME): See optid solvers.
+    solver (-s NAME): Solver; optid solvers lists them.
 The result:
     report (-o FILE): Write a self-contained HTML report.
     saved (--model -m FILE): Write the model (JSON).
-    picture (-p FILE): Write the picture (PNG, PDF).
+    picture (-p FILE): Write a figure (PNG, PDF).
 Options:
-    title (--study TITLE): Of a database that holds several: this study.
-    accept_changed_data: Run cells again whose data file is not what it was at the last run.
+    title (--study TITLE): Study to use, if the database holds several.
+    accept_changed_data: Rerun the cells whose data file has changed since the last run.
 """
 
 READING: dict[str, tuple[Any, Any]] = {
@@ -147,6 +147,7 @@ def _option(parameter: inspect.Parameter, panel: str, words: str, text: str) -> 
     metavar = " ".join(word for word in words.split() if not word.startswith("-")) or None
     if panel == "Files":
         return typer.Argument(metavar=metavar, help=text, show_default=False)
+    text = text.replace("[dim]", r"[dim]\[default: ").replace("[/]", "][/]")
     if not any(flag.startswith("--") for flag in flags):
         flags.insert(0, option_of(parameter.name))
     return typer.Option(*flags, metavar=metavar, help=text, rich_help_panel=None if panel == "Options" else panel,

@@ -1,9 +1,9 @@
-"""What surrounds the work of a command: refusals before it, notes and progress, and what it leaves behind."""
+"""The frame of a command: checks before it starts, progress and warnings, results and files."""
 
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,7 @@ from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, render
 
 
 def check_names(constraints: Iterable[str] | None, solver: str = "auto", formulation: str | None = None) -> None:
-    """Refuse names of formulations, constraints and solvers that do not exist, before any heavy import.
-
-    Raises:
-        LookupFailed: with the nearest name.
-        SolverMissing: a solver that is not installed.
-    """
+    """Refuse unknown constraints, solvers and formulations before heavy imports (`LookupFailed`, `SolverMissing`)."""
     if formulation is not None:
         entry_point(FORMULATIONS, formulation)
     for word in constraints or ():
@@ -32,11 +27,7 @@ def check_names(constraints: Iterable[str] | None, solver: str = "auto", formula
 
 
 def check_folders(*paths: Path | None) -> None:
-    """Refuse a file that cannot be written, before any work is done.
-
-    Raises:
-        DataError: its folder is not there or takes no files, or it is a folder itself.
-    """
+    """Refuse files that cannot be written (`DataError`) before any work is done."""
     for path in (path for path in paths if path is not None):
         folder = path.absolute().parent
         if not folder.is_dir():
@@ -44,27 +35,23 @@ def check_folders(*paths: Path | None) -> None:
         if path.is_dir():
             raise DataError(f"{path} cannot be written: it is a folder; name a file in it")
         if not os.access(path if path.exists() else folder, os.W_OK):
-            raise DataError(f"{path} cannot be written: {'it' if path.exists() else f'folder {folder}'} is read-only "
-                            "here; give a file in another folder")
+            raise DataError(f"{path} cannot be written: {'it' if path.exists() else f'folder {folder}'} is "
+                            "read-only; give a file in another folder")
 
 
 class Work(Waiting):
-    """The work of a command: its progress, and the text that it prints at the end.
+    """The progress of a command, and the text that it prints at the end.
 
     Attributes:
         text: the result.
-        heard: sentences for the user that the result may hold already.
+        heard: warnings for the user, which the result may already contain.
     """
 
     text = ""
     heard: list[str]
 
     def draw(self, figure: Callable[[], Any], path: Path | None) -> None:
-        """Write a figure of matplotlib where one was asked for.
-
-        Raises:
-            DataError: an ending that matplotlib does not know.
-        """
+        """Write a figure of matplotlib if a path is given; `DataError` for an unknown ending."""
         if path is not None:
             self.step("drawing")
             try:
@@ -73,7 +60,7 @@ class Work(Waiting):
                 raise DataError(f"{path}: {error}") from None
 
     def page(self, result: Any, path: Path | None, *more: Any) -> None:
-        """Write the page of a result where one was asked for; more arguments are those of its renderer."""
+        """Write the report of a result if a path is given; more arguments are those of its renderer."""
         if path is not None:
             self.step("writing the report")
             render(result, "page", path, *more, command=command_line())
@@ -81,25 +68,17 @@ class Work(Waiting):
 
 @contextmanager
 def working(**written: Path | None) -> Iterator[Work]:
-    """Give a command its `Work`; print its result, the notes that this does not carry, and what was written where.
+    """Give a command its `Work`; then print its result, the warnings that this does not contain, and the files written.
 
-    Args:
-        written: files by what they hold, e.g. ``report=path``; None for those that were not asked for.
-
-    Raises:
-        DataError: one of the files cannot be written.
+    The files are given by their content, such as ``report=path``; `DataError` where one cannot be written.
     """
     check_folders(*written.values())
     with hearing() as heard, Work() as work:
         work.heard = heard
         work.step("reading")
         yield work
-    _conclude(work.text, heard, written)
-
-
-def _conclude(text: str, heard: Sequence[str], written: dict[str, Path | None]) -> None:
-    say(coloured(text))
-    said = " ".join(text.split())
+    say(coloured(work.text))
+    said = " ".join(work.text.split())
     for sentence in heard:
         if " ".join(sentence.split()) not in said:
             note(sentence)
@@ -109,5 +88,5 @@ def _conclude(text: str, heard: Sequence[str], written: dict[str, Path | None]) 
 
 
 def command_line() -> str:
-    """Return the words of this run, as a page says them."""
+    """Return the command line of this run, for a report."""
     return shlex.join(["optid", *sys.argv[1:]])

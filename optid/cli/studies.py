@@ -16,33 +16,33 @@ from optid.cli.results import check_folders, command_line
 from optid.cli.terminal import Command, SafeConsole, say
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
-                    help="Compare formulations and solvers on your data: run a study, report it, export its rows.")
+                    help="Compare formulations and solvers on your data: run, report and export a study.")
 
 STOPPED = 130  # exit code after Ctrl-C, by convention of shells
 NOTHING_SOLVED = 4  # exit code of a run in which no cell has an answer, as where one fit fails in its solver
 
 Workers = Annotated[
     int | None,
-    typer.Option("--workers", "-w", metavar="N", min=1, help="Processes that run cells; one per core if not given."),
+    typer.Option("--workers", "-w", metavar="N", min=1, help="Number of worker processes; one per core by default."),
 ]
 
 
 def run(file: File = None, example: bool = False, db: File = None, workers: Workers = None,
         scheduler: str | None = None, accept_changed_data: bool = False, retry: Words = None, export: File = None,
         dry_run: bool = False) -> None:
-    """Run a study, or what is left of it; stop it whenever you like, the same command goes on.
+    """Run a study, or resume an interrupted one.
 
     Example: optid study run study.toml --db study.sqlite
 
     Files:
         file (STUDY.toml): The study file.
     Options:
-        example: A built-in study of half a minute instead.
-        db (FILE): Database of the rows; the study file's name with .sqlite.
-        scheduler (ADDRESS): Run on a Dask cluster: tcp://host:8786.
-        retry (OUTCOME...): Run cells of these outcomes again, e.g. 'time limit'.
-        export (FILE): Also write the rows (.parquet, .csv) at the end.
-        dry_run: Say what would be run, and run nothing.
+        example: Run a built-in study, which takes half a minute.
+        db (FILE): Database of the results. [dim]name of the study file with .sqlite[/]
+        scheduler (ADDRESS): Run on a Dask cluster (tcp://host:8786).
+        retry (OUTCOME...): Rerun the cells with these outcomes, such as 'time limit'.
+        export (FILE): Write the results at the end (.parquet, .csv).
+        dry_run: List the cells that would be run, without running them.
     """
     from optid.errors import StudyError
     from optid.studies.definition.description import Study
@@ -72,14 +72,14 @@ def run(file: File = None, example: bool = False, db: File = None, workers: Work
 
 def report(db: Path, page: File = None, title: str | None = None, accuracy: float | None = None, clock: str = "solve"
            ) -> None:
-    """Print the verdict of a study, and write its page.
+    """Print the verdict of a study and write its report.
 
     Example: optid study report study.sqlite -o study.html
 
     Options:
-        page (--report -o FILE): Write a self-contained HTML page.
-        accuracy: Compare at this accuracy; that of most cells if not given.
-        clock (--time WORD): Time to compare: solve (cold), fit (whole) or warm.
+        page (--report -o FILE): Write a self-contained HTML report.
+        accuracy: Relative accuracy of the comparison. [dim]that of most cells[/]
+        clock (--time WORD): Time compared: solve (cold), fit (whole fit) or warm.
     """
     from optid.cli.study_summary import print_former, print_models, print_reasons
     from optid.studies.page import write_page
@@ -98,7 +98,7 @@ def report(db: Path, page: File = None, title: str | None = None, accuracy: floa
 
 
 def export(db: Path, target: Path, title: str | None = None) -> None:
-    """Write the rows of a database, of one study or of all, to a Parquet or CSV file.
+    """Export the results of one or all studies of a database to a Parquet or CSV file.
 
     Example: optid study export study.sqlite rows.parquet
 
@@ -116,7 +116,7 @@ def export(db: Path, target: Path, title: str | None = None) -> None:
 
 
 def problems(db: Path, out: Path, title: str | None = None) -> None:
-    """Write every convex programme of a study in standard form (.npz, MPS), and a script that solves them.
+    """Export the convex programmes of a study in standard form (NPZ, MPS), with a script that solves them.
 
     Example: optid study problems study.sqlite --out problems
 
@@ -132,7 +132,7 @@ def problems(db: Path, out: Path, title: str | None = None) -> None:
 
 
 def schema() -> None:
-    """Print what a row of the database holds, as Markdown."""
+    """Print the columns of the database as Markdown."""
     from optid.studies.storage.rows import markdown
 
     typer.echo(markdown(), nl=False)
@@ -144,11 +144,9 @@ for function in (run, report, export, problems, systems, schema):
 
 @contextmanager
 def follow_progress(db: Path | None, described: Any = None) -> Iterator[Any]:
-    """A bar on the error stream, and a message where a study goes on; Ctrl-C keeps what is done.
+    """Show a progress bar on the error stream and report the cells to run; Ctrl-C keeps the finished rows.
 
-    Args:
-        db: the database, if the user named one.
-        described: the study, to say which of its former rows are set aside.
+    `db` is the database if the user named one, `described` the study whose superseded rows are reported.
     """
     from rich import progress
 
@@ -198,23 +196,25 @@ def _now(row: dict[str, Any] | None) -> str:
 
 
 def _plan(described: Any, db: Path, **settings: Any) -> None:
-    """Print the size of a study and what is left of it."""
     from optid.studies.execution import running
 
     every, left, former = running.plan(described, db, **settings)
     say(f"{described.name}: {len(described.data)} data, {len(described.formulations)} formulations, "
         f"{len(described.solvers)} solvers; {len(every):,} cells, {len(left):,} of them to run")
     for refusal, count in Counter(cell.refusal for cell in every if cell.refusal).items():
-        say(f"{count:,} cells that cannot be run here: {refusal}")
+        say(f"{count:,} cells cannot be run here: {refusal}")
     if former:
         say(former)
 
 
 def _summary(db: Path, name: str) -> bool:
-    """Print how the cells ended, by solver, why, and the verdict in one line; return whether anything was solved."""
+    """Print outcomes by solver, reasons and the headline of the verdict; return whether any cell was solved."""
     import shlex
 
+    import numpy as np
+
     from optid.cli import study_summary as summary
+    from optid.program.solution import Status
     from optid.studies.storage.store import read_rows
     from optid.studies.verdicts.verdict import conclude
 
@@ -229,4 +229,5 @@ def _summary(db: Path, name: str) -> bool:
     words = ["optid", "study", "report", str(db), "-o", f"{db.stem}.html"]
     words += ["--study", name] if len(rows["key"]) < len(every["key"]) else []
     say(Text(shlex.join(words), "dim"))
-    return not summary.nothing_solved(rows)
+    answers = rows["reached"] | np.isin(rows["status_verified"], (str(Status.INFEASIBLE), str(Status.UNBOUNDED)))
+    return bool(answers.any())

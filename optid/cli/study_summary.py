@@ -1,22 +1,20 @@
-"""What the commands of studies print about rows: how cells ended, why, and which rows are kept apart."""
+"""Printed summaries of the rows of a study: outcomes, reasons, models and superseded rows."""
 
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.text import Text
 
 from optid.cli.terminal import print_table, say
-from optid.program.solution import Status
 from optid.studies.storage.rows import DONE, REFUSED
 
 LISTED = 12  # reasons that are printed; the page has them all
 
 
 def print_outcomes(title: str, rows: Mapping[str, Any]) -> None:
-    """Print a table of how the cells ended, by solver; rows are {column: (rows,) array}."""
+    """Print a table of the outcomes of the cells by solver; rows are {column: (rows,) array}."""
     table = []
     for solver in sorted(set(rows["solver"])):
         mine = {key: values[rows["solver"] == solver] for key, values in rows.items()}
@@ -36,9 +34,9 @@ def _failures(rows: Mapping[str, Any]) -> list[str]:
 
 
 def print_reasons(rows: Mapping[str, Any]) -> None:
-    """Print why cells did not reach their accuracy: every reason once, with its solvers and how often it came.
+    """Print the reasons why cells missed their accuracy, each once with its solvers and count; refusals come last.
 
-    Sentences that differ in their numbers alone count as one. Refusals come last.
+    Sentences that differ only in numbers count as one.
     """
     from optid.studies.verdicts.choice import listed
     from optid.studies.verdicts.verdict import without_numbers
@@ -54,11 +52,11 @@ def print_reasons(rows: Mapping[str, Any]) -> None:
         names = listed(sorted({solver for solver, _ in found}), most=20)
         say(Text(f"{names}: {word} {len(found):,}: {reasons.pop() if len(reasons) == 1 else shape}", "dim"))
     if len(ordered) > LISTED:
-        say(Text(f"and {len(ordered) - LISTED} more reasons, which the page and the database have", "dim"))
+        say(Text(f"and {len(ordered) - LISTED} more reasons, listed in the report and the database", "dim"))
 
 
 def print_models(verdict: Any) -> None:
-    """Print the figures of the formulations, where the study of a verdict compares them with one solver."""
+    """Print the figures of the formulations where a study compares these with a single solver."""
     if len(verdict.overall.standings) != 1 or len(verdict.quality.formulations) < 2:
         return
     from optid.studies.page import quality_table
@@ -67,14 +65,8 @@ def print_models(verdict: Any) -> None:
     print_table(found.title, found.head, found.rows, firm=(), right=range(2, len(found.head)), padding=(0, 1, 0, 0))
 
 
-def nothing_solved(rows: Mapping[str, Any]) -> bool:
-    """Return whether no cell has an answer: a verified point, or the verified word that there is none."""
-    answers = rows["reached"] | np.isin(rows["status_verified"], (str(Status.INFEASIBLE), str(Status.UNBOUNDED)))
-    return not answers.any()
-
-
 def print_former(db: Path, study: str | None = None) -> None:
-    """Say how many rows are in the database that no report has."""
+    """Print the number of superseded rows in a database."""
     from optid.studies.storage.store import Store
 
     if db.suffix == ".parquet":

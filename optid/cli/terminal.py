@@ -1,4 +1,4 @@
-"""How the command line reads its words and speaks: greedy options, one clean message for an error, notes, progress."""
+"""The terminal: options with several values, one message per error, warnings, tables and progress."""
 
 import re
 import warnings
@@ -33,7 +33,7 @@ class Command(TyperCommand):
         return super().parse_args(ctx, spread(args, several))
 
     def invoke(self, ctx: Any) -> Any:
-        """Run; what is raised on purpose is told in one message, unless `--debug` asks for the traceback."""
+        """Run the command; an error becomes one message, with `--debug` a traceback."""
         try:
             return super().invoke(ctx)
         except (typer.Exit, typer.Abort):
@@ -46,7 +46,7 @@ class Command(TyperCommand):
 
 
 class Group(TyperGroup):
-    """The commands; `--debug` may stand anywhere."""
+    """The commands; `--debug` may come anywhere."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse, after `--debug` has been moved in front of the command."""
@@ -55,9 +55,9 @@ class Group(TyperGroup):
 
 
 def spread(args: Sequence[str], several: dict[str, bool]) -> list[str]:
-    """Repeat an option in front of each of its values.
+    """Repeat an option before each of its values.
 
-    The values end at the next option, at ``--``, and at a data file, unless files are what the option takes.
+    The values end at the next option, at ``--``, and at a data file, unless the option takes files.
 
     Args:
         args: words of the command line.
@@ -98,7 +98,7 @@ def exit_code(error: BaseException) -> int:
 
 
 class SafeConsole(Console):
-    """A console that shows control characters of texts instead of obeying them: names and messages come from files."""
+    """A console that replaces control characters in texts: names and messages come from files."""
 
     def render(self, renderable: Any, options: Any = None) -> Iterator[Segment]:
         """Yield the segments with a visible character in place of each control character."""
@@ -122,7 +122,7 @@ def say(text: str | Text) -> None:
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str | Text]], footer: str = "", *,
                 firm: Collection[int] = (0,), right: Collection[int] = (), padding: Any = (0, 1)) -> None:
-    """Print a table, and what is said below; columns by number: `firm` are never broken, `right` hold numbers."""
+    """Print a table and a footer; of the column numbers, `firm` are never broken and `right` hold numbers."""
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False,
                   padding=padding)
     for c, column in enumerate(columns):
@@ -159,7 +159,7 @@ def complain(error: BaseException) -> None:
     elif isinstance(error, OSError) and error.strerror:
         text = f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
     if exit_code(error) == 1:
-        text = f"{type(error).__name__}: {text}. This is a defect of optid; --debug shows where it happened"
+        text = f"{type(error).__name__}: {text}. This is a defect of optid; --debug prints the traceback"
     _tell("error", "bold red", text)
 
 
@@ -175,7 +175,7 @@ def _tell(word: str, style: str, text: str) -> None:
 
 @contextmanager
 def hearing() -> Iterator[list[str]]:
-    """Collect the data warnings raised inside, each sentence once; print them if an error ends the block."""
+    """Collect the data warnings of a block, each sentence once; print them if an error ends the block."""
     heard: list[str] = []
 
     def keep(message: Any, category: type[Warning], *_: Any, **__: Any) -> None:
@@ -195,7 +195,7 @@ def hearing() -> Iterator[list[str]]:
 
 
 class Waiting:
-    """Progress on the error stream once something takes longer than `PATIENCE`; nothing where nobody looks."""
+    """Progress on the error stream after `PATIENCE` seconds; nothing where that is no terminal."""
 
     def __init__(self) -> None:
         from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -214,7 +214,7 @@ class Waiting:
         self._timer.daemon = True
 
     def step(self, text: str) -> None:
-        """Say what is being done now."""
+        """Show the current step."""
         self._progress.update(self._task, description=text)
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Channels: their names and units, what they look like, and the way back to raw units."""
+"""Channels: names, units, statistics, and the transform to raw units."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,11 +9,11 @@ import numpy as np
 
 from optid.errors import DataError
 
-MOST_LEVELS = 1000  # counting of distinct values stops here: above it a channel counts as continuous
+MOST_LEVELS = 1000  # largest number of distinct values that is counted; above it a channel is continuous
 
 
 class Ports:
-    """Named inputs and outputs: what a record, a stream, the columns of a regression and a model share."""
+    """Named inputs and outputs of a record, a stream, a regression or a model."""
 
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -81,7 +81,7 @@ class Transform:
 
 @dataclass(frozen=True)
 class Channel:
-    """What one channel looks like over all experiments; missing samples do not count.
+    """Statistics of a channel over all experiments, without missing samples.
 
     Attributes:
         name: name of the channel.
@@ -151,9 +151,9 @@ def channel_fields(
     ):
         names, units = listed(given), listed(units) or [""] * count
         if names is not None and (len(names) != count or not all(isinstance(name, str) and name for name in names)):
-            raise DataError(f"{kind}s {names}: one non-empty name for each of the {count} channels is needed.")
+            raise DataError(f"{kind}s {names}: must be one non-empty name for each of the {count} channels.")
         if len(units) != count:
-            raise DataError(f"{kind}_units {units}: one unit for each of the {count} channels is needed.")
+            raise DataError(f"{kind}_units {units}: must be one unit for each of the {count} channels.")
         found[f"{kind}s"] = numbered_names(letter, count) if names is None else tuple(names)
         found[f"{kind}_units"] = tuple(str(unit) for unit in units)
     everything = found["inputs"] + found["outputs"]
@@ -166,7 +166,7 @@ def channel_fields(
 def sampling_time(dt: Any) -> float:
     """Return dt as a float; refuse what is not a positive number (`DataError`)."""
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.integer | np.floating) or not 0 < dt < np.inf:
-        raise DataError(f"dt = {dt!r}: the sampling time is a positive number.")
+        raise DataError(f"dt = {dt!r}: the sampling time must be a positive number.")
     return float(dt)
 
 

@@ -1,4 +1,4 @@
-"""Dask clusters: reach a scheduler, refuse workers that run other programs, and say in words why a task was lost."""
+"""Dask clusters: connect to a scheduler, compare the versions of its workers, and explain lost tasks."""
 
 import json
 import re
@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 
 from optid.errors import ClusterError
 
-REACH = 3.0  # seconds to reach the machine of a scheduler
-ANSWER = 10.0  # seconds a scheduler has to answer once its machine is reached; one with much to do takes some
-LOOKS = 3  # times that versions are compared before a difference counts: source files may be edited while workers look
+REACH = 3.0  # seconds to connect to the machine of a scheduler
+ANSWER = 10.0  # seconds until a busy scheduler answers
+LOOKS = 3  # comparisons of versions before a difference counts: source files may be edited meanwhile
 
 NO_SCHEDULER = (
     "what answers at {} is no Dask scheduler, or one of another version. Is this the port of the scheduler (8786 by "
@@ -21,24 +21,23 @@ NO_SCHEDULER = (
 )
 
 PACKAGES = ("optid", "numpy", "scipy", "numba")
-"""What workers and this process must have alike: they exchange objects of these, and compute the same digits."""
+"""Packages that must be equal on workers and here: their objects are exchanged, and digits must agree."""
 
 SOURCES = ("optid", "formulations")
-"""Packages that are compared by their source files as well: an editable installation keeps its version number."""
+"""Packages also compared by their source files: an editable installation keeps its version number."""
 
 
 @contextmanager
 def connected(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[Any]:
-    """Give a `distributed.Client` whose workers all run the same versions as this process.
+    """Give a `distributed.Client` whose workers run the same versions as this process.
 
     Args:
         scheduler: address ("tcp://host:8786", "host:8786"), path of a scheduler file (.json), or an open Client, which
             stays open; for a cluster with certificates open the Client yourself.
-        packages: names of distributions to compare.
+        packages: distributions to compare.
 
     Raises:
-        ClusterError: Dask is not installed, nothing or something else answers at the address, no worker is there, or
-            workers have other versions; the message has the difference.
+        ClusterError: Dask is not installed, no scheduler at the address, no worker, or workers with other versions.
     """
     try:
         from distributed import Client
@@ -46,7 +45,7 @@ def connected(scheduler: Any, packages: Sequence[str] = PACKAGES) -> Iterator[An
         raise ClusterError('a scheduler needs dask and distributed: pip install "optid[distributed]"') from None
     if isinstance(scheduler, Client):
         if scheduler.asynchronous:
-            raise ClusterError("an asynchronous Client cannot be waited for here: open Client(address).")
+            raise ClusterError("an asynchronous Client cannot be used here: open Client(address).")
         if scheduler.status != "running":
             raise ClusterError(f"the Client is {scheduler.status}, not running: open it again.")
         opened = nullcontext(scheduler)
@@ -76,7 +75,7 @@ def _opened(client: Callable[..., Any], scheduler: Any) -> Any:
 
 
 def _reached(text: str) -> str:
-    """Return the complete address of a scheduler whose machine accepts a connection at that port."""
+    """Return the complete address of a scheduler that accepts connections."""
     address = text if "://" in text else f"tcp://{text}"
     try:
         parts = urlsplit(address)
@@ -97,9 +96,9 @@ def _reached(text: str) -> str:
 
 
 def _greets(connection: socket.socket) -> bool:
-    """Say whether what answers speaks as Dask does: at once, and first the length of a short message.
+    """Whether the server speaks the protocol of Dask: it starts with the length of a short message.
 
-    A Client would wait for ever at most other servers.
+    A Client would wait without limit for most other servers.
     """
     connection.settimeout(ANSWER)
     try:
@@ -110,7 +109,7 @@ def _greets(connection: socket.socket) -> bool:
 
 
 def _reader(packages: Sequence[str]) -> Callable[[], dict[str, str]]:
-    """What reads the versions of a process: Python, each distribution, and a digest of optid's source files."""
+    """Return a function that reads the versions of a process, with a digest of the source files."""
     names, sources = tuple(packages), SOURCES
 
     def read() -> dict[str, str]:  # nested: it travels by value, and so runs where optid is not installed
@@ -141,13 +140,13 @@ def _reader(packages: Sequence[str]) -> Callable[[], dict[str, str]]:
 
 
 def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """Return what differs in words, "" where nothing does."""
+    """Return the differing versions as text, "" if there are none."""
     return ", ".join(f"{name}: {here[name]} here, {there.get(name, 'not installed')} there"
                      for name in here if there.get(name) != here[name])
 
 
 def check_workers(client: Any, packages: Sequence[str]) -> None:
-    """Refuse no workers, and workers with other versions than this process (`ClusterError` with the difference)."""
+    """Raise a `ClusterError` if there are no workers, or workers with other versions."""
     reader, refusal = _reader(packages), ""
     for _ in range(LOOKS):
         here, there = reader(), client.run(reader, on_error="return")
@@ -169,11 +168,7 @@ def check_workers(client: Any, packages: Sequence[str]) -> None:
 
 
 def result_of(client: Any, task: Any) -> Any:
-    """Return the computed result of a delayed task; errors of the task itself are raised as they are.
-
-    Raises:
-        ClusterError: the workers that ran it died, or the scheduler went away.
-    """
+    """Return the result of a delayed task; `ClusterError` for dead workers or a lost scheduler, else its own error."""
     from distributed import CancelledError, KilledWorker
     from distributed.comm.core import CommClosedError
 

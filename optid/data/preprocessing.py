@@ -54,7 +54,7 @@ def scale(data: Changed, factors: Mapping[str, float] | None = None) -> Changed:
         if name not in names:
             raise DataError(f"no channel {name!r}. {nearest(name, names)}")
         if not 0 < value < np.inf:
-            raise DataError(f"scale of channel {name!r} is {value}; a positive number is needed.")
+            raise DataError(f"scale of channel {name!r} is {value}; it must be positive.")
     return _rescaled(data, np.array([float(factors.get(name, 1.0)) for name in names]), np.zeros(len(names)))
 
 

@@ -227,7 +227,7 @@ class Data(Ports):
             DataError: a part would be empty.
         """
         if isinstance(at, bool | np.bool_) or not isinstance(at, int | float | np.integer | np.floating):
-            raise DataError(f"split at {at!r}: a share such as 0.7 or a number of samples is needed.")
+            raise DataError(f"split at {at!r}: must be a share such as 0.7 or a number of samples.")
         whole = isinstance(at, int | np.integer)
         if not whole and not 0 < at < 1:
             raise DataError(f"split at {at}: a share lies between 0 and 1; write int({at}) for a number of samples.")

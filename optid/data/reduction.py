@@ -1,7 +1,7 @@
 """Reduce the parts of a record to one result: on the threads of this machine, or as a tree of tasks on a Dask cluster.
 
-The tree is fixed by the parts alone, not by who is done first: the result is the same to the last digit on one thread
-and on any number of workers, also when some of them die and their parts are read again elsewhere.
+The tree depends on the parts alone, so the result is the same to the last digit on one thread and on any number of
+workers, also when workers die and their parts are read again elsewhere.
 """
 
 import os
@@ -56,8 +56,8 @@ def reduced(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callab
 
     Args:
         parts: at least one, in order.
-        leaf: what is made of a part; it travels to the workers.
-        merge: what is made of at most `FAN_IN` results that are neighbours, in order; it must not change them.
+        leaf: function of a part, which is sent to the workers.
+        merge: function of at most `FAN_IN` neighbouring results, in order; it must not change them.
         scheduler: address of a Dask scheduler, a `distributed.Client`, or None for this machine, where the partitions
             of Dask collections are computed by Dask's current scheduler.
         threads: threads that read parts on this machine.
@@ -66,19 +66,31 @@ def reduced(parts: Sequence[Part], leaf: Callable[[Part], Result], merge: Callab
         ClusterError: the cluster cannot be used.
     """
     if scheduler is None and all(part.content is None for part in parts):
-        return _streamed(mapped(leaf, parts, threads), merge)
+        return tree(mapped(leaf, parts, threads), len(parts), merge)
     from dask.delayed import delayed
 
-    task, join = delayed(_of_part, pure=False), delayed(merge, pure=False)
-    level = [task(leaf, _with_content(part, None), part.content) for part in parts]
-    while len(level) > 1:
-        level = [join(level[i : i + FAN_IN]) for i in range(0, len(level), FAN_IN)]
-    return _computed(level[0], scheduler)
+    task = delayed(_of_part, pure=False)
+    leaves = [task(leaf, replace(part, content=None), part.content) for part in parts]
+    return _computed(tree(leaves, len(leaves), delayed(merge, pure=False)), scheduler)
+
+
+def tree(results: Iterable[Any], count: int, merge: Callable[[Sequence[Any]], Any]) -> Any:
+    """Merge so many results, at least one, by a tree; of an iterator at most `FAN_IN` of each level are in memory."""
+    while count > 1:
+        results, count = _merged(results, merge), -(-count // FAN_IN)
+    (root,) = results
+    return root
+
+
+def _merged(results: Iterable[Any], merge: Callable[[Sequence[Any]], Any]) -> Iterator[Any]:
+    rest = iter(results)
+    while neighbours := list(islice(rest, FAN_IN)):
+        yield merge(neighbours)
 
 
 def fetched(part: Part, scheduler: Any = None) -> Part:
-    """Return a part whose content is here: what Dask is to compute is computed."""
-    return part if part.content is None else _with_content(part, _computed(part.content, scheduler))
+    """Return a part with its content, computed where it is a Dask collection."""
+    return part if part.content is None else replace(part, content=_computed(part.content, scheduler))
 
 
 def _computed(task: Any, scheduler: Any) -> Any:
@@ -92,30 +104,5 @@ def _computed(task: Any, scheduler: Any) -> Any:
         return result_of(client, task)
 
 
-def _streamed(results: Iterable[Result], merge: Callable[[Sequence[Result]], Result]) -> Result:
-    """Merge by the same tree with at most `FAN_IN` results of each level in memory."""
-    levels: list[list[Result]] = [[]]
-    for result in results:
-        levels[0].append(result)
-        for depth, level in enumerate(levels):
-            if len(level) < FAN_IN:
-                break
-            if depth + 1 == len(levels):
-                levels.append([])
-            levels[depth + 1].append(merge(level))
-            level.clear()
-    for level, above in zip(levels, levels[1:]):
-        if level:
-            above.append(merge(level))
-    top = levels[-1]
-    while len(top) > 1:
-        top = [merge(top[i : i + FAN_IN]) for i in range(0, len(top), FAN_IN)]
-    return top[0]
-
-
 def _of_part(leaf: Callable[[Part], Any], part: Part, content: Any) -> Any:
-    return leaf(_with_content(part, content))
-
-
-def _with_content(part: Part, content: Any) -> Part:
-    return part if content is part.content else replace(part, content=content)
+    return leaf(replace(part, content=content))

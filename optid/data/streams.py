@@ -1,4 +1,4 @@
-"""Records larger than memory: files, folders and Dask collections read chunk by chunk, again on every pass."""
+"""Records larger than memory: files, folders and Dask collections, read in chunks on every pass."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -31,9 +31,9 @@ class Stream(Ports):
 
     Attributes:
         dt, inputs, outputs, input_units, output_units, name: as of `Data`.
-        n_samples: number of samples, None where only a pass can tell (CSV, Dask data frames).
-        parts: what can be read apart, in order; empty where the record is one experiment that is read from its
-            beginning to its end.
+        n_samples: number of samples, None if only a pass gives it (CSV, Dask data frames).
+        parts: parts that can be read independently, in order; empty if the record is read from its beginning to its
+            end.
         scheduler: the Dask cluster that reads the parts; None for this machine.
     """
 
@@ -51,11 +51,11 @@ class Stream(Ports):
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         if self.n_experiments > 1:
-            raise DataError(f"this stream has {self.n_experiments} experiments; one at a time can be read in order.")
+            raise DataError(f"this stream has {self.n_experiments} experiments; only one can be read in order.")
         return self._in_order()
 
     def _in_order(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Samples of all parts of the one experiment; the clock must run on from each part to the next."""
+        """Yield the samples of the only experiment, with a clock that continues from part to part."""
         last, done = None, 0
         for part in self._sources():
             begun = False
@@ -73,7 +73,7 @@ class Stream(Ports):
         return DataError(f"{self.name if self._whole is None else self._whole.label} has no rows.")
 
     def _sources(self) -> Iterator[Part]:
-        """Parts with what Dask computes of them, or the whole record where it is read in one go."""
+        """Yield the parts, with computed Dask content, or the whole record."""
         yield from (fetched(part, self.scheduler) for part in self.parts)
         if not self.parts and self._whole is not None:
             yield self._whole
@@ -106,12 +106,12 @@ class Stream(Ports):
 
     def reduced(self, leaf: Callable[[Part, Iterable[Chunk]], Result], merge: Callable[[Sequence[Result]], Result],
                 threads: int = 1) -> Result:
-        """Reduce the parts, each with its chunks, where they are read; see `optid.data.reduction.reduced`."""
+        """Reduce the parts, each with its chunks, where they are stored; see `optid.data.reduction.reduced`."""
         return reduced(self.parts, partial(_of_part, leaf, self._channels), merge, self.scheduler, threads)
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Samples of each experiment; a pass is made where only that can tell."""
+        """Samples of each experiment, by a pass if necessary."""
         if self.n_samples is None:
             return tuple(self._survey.lengths[i] for i in range(self.n_experiments))
         if not self.parts:
@@ -135,7 +135,6 @@ class Stream(Ports):
 
     @cached_property
     def _survey(self) -> Survey:
-        """Lengths, and ranges in raw units."""
         channels = replace(self._channels, units=None)
         if self.parts:
             found = reduced(self.parts, partial(_of_part, surveyed, channels), partial(joined, channels),
@@ -215,7 +214,7 @@ def open_stream(  # noqa: D417 - the others stand with `read`
 
 def _chosen(opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
             ) -> tuple[dict[str, str], dict[str, str], str | None]:
-    """Return {channel: column} of inputs and outputs and the clock, the same for all sources."""
+    """Return {channel: column} of inputs and outputs and the clock, equal for all sources."""
     found = []
     for one in opened:
         ins, outs = (choose(one.names, wanted, c, one.label) for wanted, c in ((inputs, "u"), (outputs, "y")))
@@ -227,7 +226,7 @@ def _chosen(opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str
 
 
 def _step(sources: Iterable[Any], clock: str, tolerance: float) -> tuple[float | None, str]:
-    """Return the step of the first stamps that have one, and where they are; None where no source has two stamps."""
+    """Return the first time step and its source; None if no source has two stamps."""
     for one in sources:
         stamps = np.empty(0)
         for block in one.blocks([clock], clock):

@@ -1,4 +1,4 @@
-"""Gaps: records cut where an input is missing, since no state is known beyond, and straight lines across."""
+"""Gaps: records cut at missing inputs, after which the state is unknown, and linear interpolation."""
 
 import warnings
 
@@ -10,12 +10,12 @@ from optid.errors import DataError, DataWarning
 
 
 def runs_of(present: ArrayLike) -> NDArray[np.intp]:
-    """Return first and one past the last position of every run of marks, (R, 2)."""
+    """Return first and one past the last position of every run of true marks, (R, 2)."""
     return np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(present, dtype=np.int8), [0]]))).reshape(-1, 2)
 
 
 def interpolated(samples: ArrayLike) -> NDArray[np.float64]:
-    """Fill what is missing of samples (N, c) linearly, column by column; zeros where nothing is present."""
+    """Interpolate missing samples (N, c) linearly by column; zeros where all are missing."""
     filled = np.array(samples, dtype=float)
     for column in filled.T:
         lost = np.isnan(column)
@@ -25,14 +25,9 @@ def interpolated(samples: ArrayLike) -> NDArray[np.float64]:
 
 
 def between_gaps(data: Data, shortest: int) -> Data:
-    """Cut a record where an input is missing; the stretches are its experiments.
+    """Cut a record at missing inputs; the stretches are its experiments.
 
-    Args:
-        data: the record.
-        shortest: outputs (of every channel) that a stretch must hold to be kept.
-
-    Raises:
-        DataError: no stretch is long enough.
+    `shortest` is the number of samples that every output of a stretch must have; `DataError` if no stretch has them.
     """
     if not any(data.missing[name] for name in data.inputs) and all(
         np.min(np.sum(~np.isnan(e.y), axis=0)) >= shortest for e in data.experiments
@@ -50,7 +45,7 @@ def between_gaps(data: Data, shortest: int) -> Data:
 
 
 def with_whole_inputs(data: Data, shortest: int) -> Data:
-    """Return a record in which no input is missing: as it is, or cut by `between_gaps`, which a `DataWarning` tells."""
+    """Return a record without missing inputs: as it is, or cut by `between_gaps` with a `DataWarning`."""
     gaps = [~np.isfinite(e.u) for e in data.experiments]
     lost = np.sum([gap.sum(axis=0) for gap in gaps], axis=0)
     if not lost.any():

@@ -1,4 +1,4 @@
-"""The grid of a study as cells, each with the hash of everything that determines its result, versions included."""
+"""The cells of a study, each with the hash of everything that determines its result, versions included."""
 
 import hashlib
 import inspect
@@ -19,9 +19,9 @@ from optid.registry import FORMULATIONS, registered
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.sources.systems import system
 
-KEY_VERSION = 1  # part of every key: to be counted up when what a key says changes its meaning
+KEY_VERSION = 1  # part of every key, to be increased if the meaning of keys changes
 ALWAYS = ("optid", "numpy", "scipy", "cvxpy")  # distributions behind every result
-MOST = 1_000_000  # cells of a study: more would take months, and minutes to count one by one
+MOST = 1_000_000  # cells of a study
 
 
 @dataclass(frozen=True)
@@ -42,14 +42,14 @@ class Cell:
     formulation_name: str  # registered name
     options: Mapping[str, Any]  # arguments of the formulation
     constraints: tuple[str, ...]  # named constraints as texts
-    solver_name: str  # word of the back end, or "auto"
+    solver_name: str  # name of the back end, or "auto"
     solver_options: Mapping[str, Any]  # its native options
     accuracy: float  # requested relative accuracy
     warm: bool  # whether it is also solved a second time from its own solution
     time_limit: float  # seconds
     memory_limit: float  # MB
     holdout: float  # share of the record that the fit does not see
-    refusal: str = ""  # why the solver cannot take this formulation: nothing is run, the row says so
+    refusal: str = ""  # why the cell is not run; empty if it is
 
     @property
     def identity(self) -> tuple[str, int]:
@@ -60,16 +60,14 @@ class Cell:
 def cells(study: Study) -> list[Cell]:
     """Return the cells of a study: data x formulations x solvers x accuracies x seeds x repetitions.
 
-    Cells of one record and formulation stand next to each other, so that a worker need not read or simulate it again.
-    A solver that is not installed gives cells that are refused with the reason, and a pair of solver and formulation
-    that do not fit is found out when the cell is run: what a study names always has a row.
+    Cells of one record and formulation are neighbours, so that a worker need not load it again. A solver that is not
+    installed, or does not take the formulation, still has rows, with the reason.
 
     Raises:
-        StudyError: more cells than `MOST`, data files that cannot be read, or entries that differ in nothing but their
-            labels.
+        StudyError: more cells than `MOST`, unreadable data files, or entries that differ only in their labels.
     """
     if (count := number_of_cells(study)) > MOST:
-        raise StudyError(f"study {study.name!r} has {count:,} cells; at most {MOST:,} are taken. Make two of it")
+        raise StudyError(f"study {study.name!r} has {count:,} cells; at most {MOST:,} are allowed: split it")
     study.check_data()
     entries = [located(entry, study.folder) for entry in study.data]
     try:
@@ -93,7 +91,7 @@ def cells(study: Study) -> list[Cell]:
 
 
 def number_of_cells(study: Study) -> int:
-    """Return how many cells a study has, without making them."""
+    """Return the number of cells of a study."""
     count = 0
     for entry in study.data:
         records = 1 if entry.system is None else len(entry.samples or "1") * len(entry.noise or "1") * len(study.seeds)
@@ -102,10 +100,7 @@ def number_of_cells(study: Study) -> int:
 
 
 def check_unchanged(all_cells: Iterable[Cell], hashes: Mapping[tuple[str, str], Collection[str]]) -> None:
-    """Raise StudyError, with their names, where data files are not those of the rows there are.
-
-    These have hashes by (study, data label).
-    """
+    """Raise StudyError if data files differ from those of the rows, given by hashes by (study, data label)."""
     changed = {}
     for cell in all_cells:
         if cell.data_hash and (known := hashes.get((cell.study, cell.data))) and set(known) != {cell.data_hash}:
@@ -180,7 +175,7 @@ def _cell(study: Study, entry: DataEntry, content: str, record: _Simulated, form
 
 
 def _refusal(solver: str) -> str:
-    """Why a back end cannot run here; empty for one that can, and for auto."""
+    """Return why a back end cannot run here; empty if it can, and for auto."""
     try:
         if solver != "auto":
             find(solver)
@@ -196,7 +191,7 @@ def _refusal(solver: str) -> str:
 def determining(formulation: str, solver: str, simulated: bool = False) -> dict[str, str]:
     """Return the versions that determine a result, by name.
 
-    They are those of a registered formulation (its distribution and source), of a back end (for "auto" those that it
+    They are those of a registered formulation (its distribution and source), of a back end (for "auto" all that it
     chooses from) and, for a simulated record, the source of the systems.
     """
     found = {name: installed(name) for name in ALWAYS}
@@ -235,10 +230,7 @@ def source_hash(module: str) -> str:
 
 
 def _of_back_end(name: str) -> dict[str, str]:
-    """Distributions of a back end, those it names for pip and the one its code is in, and its source.
-
-    The source may be edited in place; ours is looked at, too, so that no key depends on how optid was installed.
-    """
+    """Return the versions of a back end's distributions and the hash of its source, which may be edited in place."""
     back_end = back_ends().get(name)
     if back_end is None:
         return {}

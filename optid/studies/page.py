@@ -94,22 +94,21 @@ def _lead(verdict: Verdict) -> str:
 
 
 def _cards(verdict: Verdict) -> list[dict[str, str]]:
-    """The figures of the first glance."""
     section, table = verdict.overall, verdict.table
     runs, solved = (sum(getattr(s, name) for s in section.standings) for name in ("problems", "solved"))
     by_anyone = int(section.found.solved.any(axis=1).sum()) if len(section.found.data) else 0
     proved = int((table["proved"] & (states_of_rows(table, verdict.found) == SOLVED)).sum())
     cards = {
-        "problems that some solver solved": f"{by_anyone:,} of {len(section.found.data):,}",
+        "problems solved by any solver": f"{by_anyone:,} of {len(section.found.data):,}",
         f"of {runs:,} attempts reached the accuracy": f"{100 * solved / runs:.1f} %" if runs else "none",
         "runs proved globally optimal": f"{proved:,}",
-        "claims that were false": f"{sum(claim.count for claim in verdict.false_claims):,}",
+        "false claims": f"{sum(claim.count for claim in verdict.false_claims):,}",
     }
     return [{"value": value, "label": label} for label, value in cards.items()]
 
 
 def _picks(verdict: Verdict) -> list[dict[str, Any]]:
-    """One line per formulation: who to use there, and why; of a single solver how good the models are, and why."""
+    """Return one line per formulation: the recommended solver, or of a single solver the quality of the models."""
     lines, quality = [], verdict.quality
     for section in verdict.sections:
         said, first = choice_of_solver(section), section.choice.first
@@ -137,7 +136,7 @@ def _claims(verdict: Verdict) -> Table | None:
              short(c.reason, REASON) or "verified otherwise") for c in claims[:LISTED]]
     note = f"The {LISTED} most frequent kinds of {len(claims)}." if len(claims) > LISTED else ""
     head = ("solver", "formulation", "runs", "claimed", "but")
-    return Table("Claims that were false", head, rows, note) if claims else None
+    return Table("False claims", head, rows, note) if claims else None
 
 
 def quality_table(quality: Quality) -> Table:
@@ -157,7 +156,6 @@ def quality_table(quality: Quality) -> Table:
 
 
 def _models(quality: Quality | DataSet, name: str) -> tuple[str, ...]:
-    """The figures of one formulation as words."""
     figures = [quality.figures[c][name] for c in FIGURES]
     fits = [f"{number(v, 4)} %" if np.isfinite(v) else "-" for v in figures[:2]]
     errors = [f"{100 * v:.3g} %" if np.isfinite(v) else "truth unknown" for v in figures[2:]]

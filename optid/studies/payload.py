@@ -1,4 +1,4 @@
-"""What the scripts of a study page draw and list: the verdict and its rows as plain JSON values, kept small."""
+"""The verdict and its rows as compact JSON values for the scripts of a study page."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from optid.studies.verdicts.standings import Section, Standing
 from optid.studies.verdicts.verdict import Verdict
 
 TEXT_BUDGET = 1_500_000  # characters of different texts that a column may bring to the page
-POINTS = 400  # steps of a profile that a screen can show
+POINTS = 400  # steps of a profile on the page
 DIGITS = {"objective": 10, "bound": 10, "scale": 8}
 
 
@@ -50,7 +50,6 @@ def _numbers(values: Any, digits: int = 5) -> list[float | None]:
 
 
 def _section(section: Section) -> dict[str, Any]:
-    """One section: standings, profiles, ranking."""
     ranking, said = section.ranking, [choice_of_solver(section)]
     if len(section.standings) > 1:
         said.append(carries_over(ranking))
@@ -86,7 +85,7 @@ def _standing(s: Standing, section: Section) -> dict[str, Any]:
 
 
 def _profile(profile: Profile) -> list[list[float | None]]:
-    """Steps of a profile; of very many, those that stand far enough apart for a screen, the first and the last kept."""
+    """Return the steps of a profile; of many, `POINTS` of them with the first and the last."""
     most = len(profile.factors)
     at = np.unique(np.rint(np.linspace(0, most - 1, POINTS)).astype(int)) if most > POINTS else np.arange(most)
     return [_numbers(profile.factors[at]), _numbers(profile.shares[at])]
@@ -94,8 +93,8 @@ def _profile(profile: Profile) -> list[list[float | None]]:
 
 def _columns(table: Table, states: np.ndarray, time: str) -> list[dict[str, Any] | None]:
     made = [
-        _texts("state", "solved, or why it does not count", states),
-        _figures("time_s", "the time compared: " + " + ".join(TIMES[time]), "s", seconds_of(table, time), 5),
+        _texts("state", "solved, or the reason why it does not count", states),
+        _figures("time_s", "compared time: " + " + ".join(TIMES[time]), "s", seconds_of(table, time), 5),
         _figures("residual", f"largest of violation, complementarity and stationarity / {GRADIENT:g}", "",
                  worst_residual(table), 3),
     ]

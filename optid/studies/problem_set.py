@@ -7,6 +7,7 @@ off-diagonal entries times sqrt(2), as Clarabel takes them. Linear and quadratic
 
 import csv
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +19,7 @@ import scipy.sparse as sp
 from optid.errors import OptidError, StudyError
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
-from optid.solving.solve import run
+from optid.solving.solve import solve
 from optid.studies.definition.description import Study
 from optid.studies.definition.trial import posed
 from optid.studies.grid import Cell, cells
@@ -46,7 +47,7 @@ class StandardForm:
 
 
 def write_problems(database: str | Path, folder: str | Path, study: str | None = None) -> list[dict[str, Any]]:
-    """Write every convex programme that the cells of a study pose, and a script that solves them.
+    """Write the convex programmes of the cells of a study, and a script that solves them.
 
     Programmes of procedures that depend on the solutions of earlier ones are those after optid's own solutions.
 
@@ -66,7 +67,7 @@ def write_problems(database: str | Path, folder: str | Path, study: str | None =
     with Store(database) as store:
         texts = {name: text for name, text in store.descriptions().items() if study in (None, name)}
     if not any(texts.values()):
-        raise StudyError(f"{database} has no text of a study to pose its problems from"
+        raise StudyError(f"{database} has no text of a study, from which its problems could be built"
                          + (f": it has {', '.join(map(repr, texts))}" if texts else ""))
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -89,30 +90,18 @@ def write_problems(database: str | Path, folder: str | Path, study: str | None =
 
 
 def _programmes(cell: Cell) -> list[tuple[Program, Solution]]:
-    """The programmes that a cell poses, with optid's solutions; none where it cannot be posed."""
+    """Return the programmes of a cell with optid's solutions, up to the first failure."""
     found: list[tuple[Program, Solution]] = []
-
-    def recorded(problem: Any) -> Any:
-        answer = None
+    with warnings.catch_warnings(), suppress(StopIteration, OptidError, ArithmeticError, np.linalg.LinAlgError):
+        warnings.simplefilter("ignore")  # the row of the cell has the reason of a failure
+        problem = posed(cell.formulation_name, load(cell).data, cell.constraints, cell.options)
+        program = problem if isinstance(problem, Program) else next(problem)
         while True:
-            try:
-                program = problem.send(answer)
-            except StopIteration as stop:
-                return stop.value
-            answer = yield program
-            found.append((program, answer))
-
-    settings = {"accuracy": ACCURACY, "time_limit": cell.time_limit, "prove": False}
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            problem = posed(cell.formulation_name, load(cell).data, cell.constraints, cell.options)
-            if not isinstance(problem, Program):
-                run(recorded(problem), **settings)
-            else:
-                found.append((problem, run(problem, **settings).solution))
-    except (OptidError, ArithmeticError, np.linalg.LinAlgError):  # the study has a row that says why
-        pass
+            solution = solve(program, accuracy=ACCURACY, time_limit=cell.time_limit, prove=False)
+            found.append((program, solution))
+            if program is problem:
+                break
+            program = problem.send(solution)
     return found
 
 

@@ -1,4 +1,4 @@
-"""From blocks of columns to checked chunks of a record: numbers that are finite, and a clock that is uniform."""
+"""Chunks of a record from blocks of columns, with finite samples and a uniform clock."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ Chunk = tuple[np.ndarray, np.ndarray, np.ndarray | None]
 
 
 class End(NamedTuple):
-    """Where a run of parts begins or ends: the part, its experiment and the stamp (1,)."""
+    """The first or last stamp (1,) of successive parts, with its part and experiment."""
 
     label: str
     experiment: int
@@ -42,8 +42,7 @@ class Channels:
     def read(self, part: Any) -> Iterator[Chunk]:
         """Start a pass over a part.
 
-        Raises:
-            DataError: an infinite sample, integers beyond the digits of float64, or a clock that is not uniform.
+        `DataError` for an infinite sample, integers beyond the digits of float64, or a non-uniform clock.
         """
         done, last = 0, None
         columns = [*self.inputs.values(), *self.outputs.values(), *([self.clock] if self.clock else [])]
@@ -62,11 +61,7 @@ class Channels:
             yield u, y, stamps
 
     def check_border(self, last: End | None, first: End | None) -> None:
-        """Refuse a part whose first stamp does not follow the last one of the part before, in the same experiment.
-
-        Raises:
-            DataError: samples are lost between the parts, or they are not in the order of time.
-        """
+        """Raise a `DataError` if a part does not follow the previous one of the same experiment in time."""
         if last is None or first is None or last.experiment != first.experiment:
             return
         if last.stamp.dtype.kind != first.stamp.dtype.kind:
@@ -95,7 +90,7 @@ def _gathered(block: Block, pairs: Mapping[str, str], label: str, done: int) -> 
 
 @dataclass(frozen=True)
 class Survey:
-    """What a pass over neighbouring parts found."""
+    """Lengths, ranges and ends of neighbouring parts."""
 
     lengths: Mapping[int, int]  # samples by experiment
     lo: np.ndarray  # (m,) smallest sample of each input, NaN where every one is missing; without samples one NaN
@@ -119,7 +114,7 @@ def surveyed(part: Any, chunks: Iterable[Chunk]) -> Survey:
 
 
 def joined(channels: Channels, surveys: Sequence[Survey]) -> Survey:
-    """Join the surveys of neighbours; a clock that does not run on from one to the next raises a `DataError`."""
+    """Join the surveys of neighbours; `DataError` if the clock does not continue from one to the next."""
     lengths: Counter[int] = Counter()
     lo = hi = np.asarray(np.nan)
     first, last = None, None

@@ -1,4 +1,4 @@
-"""Which columns are inputs, outputs and time, and whether the time stamps are uniform."""
+"""The columns of inputs, outputs and time, and the check of time stamps."""
 
 import re
 import warnings
@@ -64,14 +64,14 @@ def column_name(known: Sequence[str], wanted: str | int, label: str) -> str:
 
 def time_column(known: Sequence[str], time: str | int | bool | None, taken: Sequence[str], label: str,
                 index: str | None = None) -> str | None:
-    """Return the column of time stamps: the one named, else a column t or time or the index, None where there is none.
+    """Return the column of time stamps: the one named, else t, time or the index, None if there is none.
 
     Args:
-        known: names of the columns of the source.
+        known: columns of the source.
         time: a column; None looks for t or time, True requires it, False ignores it.
-        taken: columns that are inputs or outputs already.
+        taken: columns of inputs and outputs.
         label: name of the source, for the message.
-        index: name of a time index of the source, which need not be among its columns.
+        index: name of a time index, which need not be among the columns.
 
     Raises:
         DataError: no such column.
@@ -90,10 +90,7 @@ def time_column(known: Sequence[str], time: str | int | bool | None, taken: Sequ
 def as_stamps(values: Any, label: str) -> np.ndarray:
     """Return time stamps (N,) as float64, as dates or as durations (datetime64, timedelta64, in nanoseconds).
 
-    Numbers, numpy dates and durations, and ISO 8601 text are read; blank text is a missing stamp.
-
-    Raises:
-        DataError: neither numbers nor dates; with the label of the column.
+    Numbers, numpy dates and durations, and ISO 8601 text are read, else `DataError`; blank text is a missing stamp.
     """
     array = np.asarray(values)
     if array.dtype.kind in "UO":
@@ -147,11 +144,7 @@ def uniform_step(stamps: np.ndarray, tolerance: float, label: str, step: float |
 
 
 def agreed_step(found: float | None, dt: float | None, tolerance: float, label: str) -> float | None:
-    """Return dt where given, else the step found, rounded to 12 digits so that 0.1 stays 0.1.
-
-    Raises:
-        DataError: both are there and differ.
-    """
+    """Return dt if given, else the step found, rounded to 12 digits; `DataError` if they differ."""
     if found is None:
         return dt
     if dt is None:
@@ -185,7 +178,7 @@ def _parsed(text: np.ndarray, label: str) -> np.ndarray:
 
 
 def _unnamed(pairs: dict[str, str], known: Sequence[str], letter: str) -> dict[str, str]:
-    """Name channels after their letter where the column's only name is its position."""
+    """Name channels after their letter if the columns have only positions."""
     if any(not column.isdigit() or known[int(column)] != column for column in pairs.values()):
         return pairs
     return dict(zip(numbered_names(letter, len(pairs)), pairs.values()))

@@ -1,8 +1,8 @@
 """Comma separated files: polars reads them in blocks, the csv module reads a block that polars refuses.
 
-Polars fills short rows in silence and knows no row of a bad cell. So each block is first checked to have the cells of
-the header in every row, and one that polars refuses goes through the csv module, which reads what is right in it
-(quotes, blanks around cells, any spelling of a missing sample) and names the row and the column of what is not.
+Polars fills short rows without an error and does not report the row of a bad cell. So the rows of each block must have
+as many cells as the header, and a block that polars refuses is read by the csv module, which accepts quotes, blanks
+around cells and any spelling of a missing sample, and names the row and the column of a bad cell.
 """
 
 import csv
@@ -21,10 +21,10 @@ import numpy as np
 from optid.errors import DataError
 
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
-"""Cells that mean a missing sample, in any case and with blanks around them."""
+"""Cells of missing samples, in any case and with blanks around them."""
 
 NULLS = ["NA", "N/A", "null", "NULL", "None", "nan", "NaN", "NAN"]
-"""Common spellings of `MISSING`, which polars takes at full speed."""
+"""Common spellings of `MISSING`, which polars reads at full speed."""
 
 SMALL = 1 << 18  # bytes up to which the csv module reads a file in less time than polars needs to be imported
 BLOCK = 1 << 22  # bytes read at a time
@@ -45,12 +45,9 @@ class CsvFile:
     decimal: str  # decimal mark, "." or ","
 
     def columns(self, wanted: Sequence[str], clock: str | None, group: str | None) -> Columns:
-        """Return the wanted columns whole as float64, NaN where a cell says missing.
+        """Return whole columns as float64, NaN for missing samples.
 
-        Args:
-            wanted: names of columns.
-            clock: the one of them that is returned as text where it does not hold numbers.
-            group: the one of them that is returned as text.
+        A clock that is not numeric, and the column of the experiments (`group`), are returned as text.
 
         Raises:
             DataError: no rows, a cell that is not a number, a row of another width, a blank row inside the table, or
@@ -62,7 +59,7 @@ class CsvFile:
         return _joined(whole, wanted)
 
     def blocks(self, rows: int, wanted: Sequence[str], clock: str | None) -> Iterator[Columns]:
-        """Yield the wanted columns `rows` rows at a time; arguments and errors as of `columns`."""
+        """Yield columns `rows` rows at a time; arguments and errors as of `columns`."""
         kept: list[Columns] = []
         count = 0
         for block in self._blocks(wanted, clock, None):
@@ -111,9 +108,9 @@ class CsvFile:
                 yield from self._exact(lines, wanted, text, done)
 
     def _parsed(self, block: bytes, wanted: Sequence[str], as_text: Set[str], nulls: list[str]) -> Columns | None:
-        """Return the columns of whole rows, None where polars refuses a cell or a row has other cells than the header.
+        """Return the columns of a block without quotes, None if polars refuses a cell or a row has a wrong width.
 
-        Nothing in the block is quoted; `as_text` are not converted; `nulls` mean a missing sample, as nothing does.
+        Columns `as_text` are not converted; cells in `nulls` are missing samples.
         """
         import polars as pl
 
@@ -133,7 +130,6 @@ class CsvFile:
                 for name, column in zip(wanted, series)}
 
     def _has_even_rows(self, block: bytes) -> bool:
-        """Say whether every row has as many cells as the header."""
         signs = np.frombuffer(block, np.uint8)
         ends = signs == ord("\n")
         marks = ends[np.flatnonzero(ends | (signs == ord(self.delimiter)))]  # whether each separator ends a row
@@ -211,7 +207,7 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
     except csv.Error as error:
         raise DataError(f"{path.name} is not a text table ({error}).") from error
     if not first:
-        raise DataError(f"{path.name} is empty: a header row and at least one row of numbers are needed.")
+        raise DataError(f"{path.name} is empty: it must have a header row and at least one row of numbers.")
     if following is not None:
         raise DataError(f"{path.name} has quoted names and carriage returns as line ends: save it with line feeds.")
     if columns is None and all(is_number(cell) for cell in first):
@@ -227,9 +223,9 @@ def open_csv(path: Path, columns: Sequence[str] | None, delimiter: str, decimal:
 
 
 def check_marks(delimiter: Any, decimal: Any) -> None:
-    """Refuse a delimiter or a decimal mark that cannot be one (`DataError`)."""
+    """Refuse an invalid delimiter or decimal mark (`DataError`)."""
     if not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter.isalnum() or delimiter in '"\r\n+-\0':
-        raise DataError(f"delimiter = {delimiter!r}: one character such as ',' or ';' or a tab is needed.")
+        raise DataError(f"delimiter = {delimiter!r}: must be one character such as ',' or ';' or a tab.")
     if decimal not in (".", ",") or decimal == delimiter:
         raise DataError(f"decimal = {decimal!r} with delimiter = {delimiter!r}: '.' or ',' and not the delimiter.")
 
@@ -254,7 +250,7 @@ def _whole_lines(file: BinaryIO | io.RawIOBase, start: int) -> Iterator[tuple[in
 
 
 def _is_plain(block: bytes) -> bool:
-    """Say whether lines end in one way, with nothing quoted and nothing but UTF-8."""
+    """Whether the block has one kind of line ends, no quotes and only UTF-8."""
     if b'"' in block or b"\0" in block or (b"\r" in block and block.count(b"\r") != block.count(b"\r\n")):
         return False
     if not block.isascii():
@@ -266,7 +262,7 @@ def _is_plain(block: bytes) -> bool:
 
 
 def is_number(cell: str) -> bool:
-    """Say whether float() reads a cell."""
+    """Whether float() reads a cell."""
     try:
         float(cell)
     except ValueError:
@@ -275,5 +271,5 @@ def is_number(cell: str) -> bool:
 
 
 def is_missing(cell: str) -> bool:
-    """Say whether a cell means a missing sample."""
+    """Whether a cell is a missing sample."""
     return cell.strip().lower() in MISSING

@@ -76,7 +76,7 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None,
             # Through integers, because a time zone would make objects of the dates.
             loaded[name] = column.dt.timestamp("ns").to_numpy().astype("M8[ns]") if dates else column.to_numpy()
         elif not column.dtype.is_numeric():
-            raise DataError(f"{label}: column {name!r} is of type {column.dtype}, numbers are needed. Convert it first "
+            raise DataError(f"{label}: column {name!r} is of type {column.dtype}; it must be numeric. Convert it first "
                             "(pandas.to_numeric, polars cast).")
         elif column.dtype.is_integer() and column.null_count() == 0:
             loaded[name] = column.to_numpy()

@@ -1,7 +1,4 @@
-"""MAT files of version 5 and 7.3, read in a process of its own.
-
-A damaged file can crash the library that reads it, or ask for terabytes.
-"""
+"""MAT files of version 5 and 7.3, read in a child process: a damaged file may crash the library or exhaust memory."""
 
 import os
 import warnings
@@ -16,29 +13,15 @@ from optid.processes import run_forked
 
 MAT = 'pip install "optid[mat]"'
 TEXT = (b"char", b"cell", b"function_handle")
-# bytes that a MAT file may take, or `EXPANSION` times its size where that is more
-MEMORY, EXPANSION = 4 << 30, 32
-# time that a MAT file may take, and as much again for each `PACE` bytes
-SECONDS, PACE = 60.0, 1 << 30
+MEMORY, EXPANSION = 4 << 30, 32  # memory limit in bytes, or `EXPANSION` times the size of the file if that is more
+SECONDS, PACE = 60.0, 1 << 30  # time limit, and again for each `PACE` bytes
 
 
-def mat_names(path: Path) -> list[str]:
-    """Return the names of the numeric variables, those of the fields of structures as "structure.field".
+def mat_variables(path: Path, names: Sequence[str] | None = None) -> dict[str, Any]:
+    """Return numeric variables by name, fields of structures as "structure.field"; without names {name: None} of all.
 
-    Raises:
-        DataError: a damaged file, a link to another file, more time or memory than a file of its size may take, or
-            h5py is missing.
+    `DataError`: a damaged file, a link to another file, too much time or memory for its size, or h5py is missing.
     """
-    return list(_isolated(path, None))
-
-
-def mat_variables(path: Path, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return some variables by name; errors as of `mat_names`."""
-    found = _isolated(path, names)
-    return {name: found[name] for name in names}
-
-
-def _isolated(path: Path, names: Sequence[str] | None) -> dict[str, Any]:
     if not hasattr(os, "fork"):
         return _variables(path, names)
     size, damaged = path.stat().st_size, f"{path.name} is damaged, or not a MAT file"

@@ -1,4 +1,4 @@
-"""NumPy files, read and not mapped: mapped pages count as resident memory; headers are compared with the file first."""
+"""NumPy files; these are read, not mapped, since mapped pages count as resident memory."""
 
 import warnings
 import zipfile
@@ -47,15 +47,10 @@ class NpyFile:
 
 
 def open_npy(path: Path, columns: Sequence[str] | None = None) -> NpyFile:
-    """Read the header of an npy file.
+    """Read the header of an npy file; `columns` are the names of its columns, by default their positions.
 
-    Args:
-        path: the file.
-        columns: names of its columns; their positions when not given.
-
-    Raises:
-        DataError: not an npy file, not real numbers, not (N,) or (N, channels), empty, shorter than its header says, or
-            another number of columns.
+    `DataError`: not an npy file, not real numbers, not (N,) or (N, channels), empty, shorter than its header says, or
+    another number of columns.
     """
     with open(path, "rb") as file, _named(path.name, "an npy file"):
         version = np.lib.format.read_magic(file)
@@ -67,37 +62,28 @@ def open_npy(path: Path, columns: Sequence[str] | None = None) -> NpyFile:
             raise ValueError(f"its header has shape {shape}")
         offset = file.tell()
     if dtype.kind not in "iuf":
-        raise DataError(f"{path.name} holds {dtype}, real numbers are needed.")
+        raise DataError(f"{path.name} holds {dtype}; it must hold real numbers.")
     if len(shape) not in (1, 2) or 0 in shape:
-        raise DataError(f"{path.name} has shape {shape}; (samples,) or (samples, channels) is needed, with samples.")
+        raise DataError(f"{path.name} has shape {shape}; it must be (samples,) or (samples, channels), with samples.")
     rows, width = shape if len(shape) == 2 else (shape[0], 1)
     if width > rows:
         raise DataError(f"{path.name} has shape {shape}: more channels than samples. Save the transpose (x.T).")
     there = (path.stat().st_size - offset) // dtype.itemsize
     if there < rows * width:
-        raise DataError(f"{path.name} is truncated: its header says {rows * width} numbers, {there} are there.")
+        raise DataError(f"{path.name} is truncated: its header says {rows * width} numbers, the file has {there}.")
     names = tuple(position_names(columns, width, path.name))
     return NpyFile(path, names, rows, dtype, bool(by_column), offset)
 
 
 def side_by_side(files: Mapping[str, NpyFile], rows: int, wanted: Sequence[str], _: Any = None
                  ) -> Iterator[dict[str, np.ndarray]]:
-    """Yield blocks of channels that have a file of one column each."""
+    """Yield blocks of channels with one single-column file each."""
     for parts in zip(*(files[name].blocks(rows, files[name].names) for name in wanted), strict=True):
         yield {name: column for name, part in zip(wanted, parts) for column in part.values()}
 
 
-def load_npy(path: Path, label: str) -> np.ndarray:
-    """Return the array of an npy file of plain numbers; `DataError` with the label otherwise."""
-    with _named(label, "a NumPy file of plain numbers"), open(path, "rb") as file:
-        array = np.load(file, allow_pickle=False)
-        if not isinstance(array, np.ndarray):
-            raise ValueError("it is an archive; name it .npz")
-        return array
-
-
 def npz_arrays(path: Path, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return the arrays of these names of an npz file, or only all names; `DataError` where one is damaged."""
+    """Return the arrays of these names of an npz file, by default only all names; `DataError` if one is damaged."""
     with _named(path.name, "a NumPy file of plain numbers"), open(path, "rb") as file:
         with np.load(file, allow_pickle=False) as archive:
             return dict.fromkeys(archive.files) if names is None else {name: archive[name] for name in names}

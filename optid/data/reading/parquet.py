@@ -1,4 +1,4 @@
-"""Parquet files: whole through polars; block by block and in parts through pyarrow, whose memory can be bounded."""
+"""Parquet files: whole by polars; in blocks and parts by pyarrow, whose memory can be bounded."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -32,11 +32,7 @@ def load_parquet(path: Path, wanted: Sequence[str], clock: str | None, group: st
 
 
 def parquet_footer(path: Path) -> tuple[list[str], int]:
-    """Return the names of the columns and the number of rows.
-
-    Raises:
-        DataError: a damaged file, or pyarrow is not installed; with the pip line.
-    """
+    """Return columns and number of rows; `DataError` if the file is damaged or pyarrow is missing."""
     parquet = _pyarrow_parquet(path)
     with _undamaged(path):
         return list(parquet.read_schema(path).names), parquet.read_metadata(path).num_rows
@@ -44,7 +40,7 @@ def parquet_footer(path: Path) -> tuple[list[str], int]:
 
 def parquet_blocks(path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], clock: str | None
                    ) -> Iterator[Block]:
-    """Yield some columns of some row groups, of all for None, `chunk` rows at a time; errors as of `load_parquet`."""
+    """Yield columns of some row groups, or of all for None, `chunk` rows at a time; errors as of `load_parquet`."""
     parquet = _pyarrow_parquet(path)
     import pyarrow as pa
 
@@ -70,7 +66,6 @@ def parquet_parts(path: Path, chunk: int) -> list[Part]:
 
 @contextmanager
 def _undamaged(path: Path, *kinds: Any) -> Iterator[None]:
-    """Name the file where a library cannot read it."""
     try:
         yield
     except DataError:

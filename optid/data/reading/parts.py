@@ -1,7 +1,7 @@
-"""Parts of a record that can be read apart, on this machine or on the worker of a cluster that is told to.
+"""Parts of a record that can be read independently, on this machine or on the worker of a cluster.
 
-A part travels to the worker, not its samples: a file is opened there, and a partition of a Dask collection is already
-there or is computed there.
+A part is sent to the worker, not its samples: a file is opened there, and a partition of a Dask collection is stored
+or computed there.
 """
 
 import hashlib
@@ -15,43 +15,38 @@ from optid.data.reading.chunks import Block
 from optid.errors import DataError
 
 TAIL = 1 << 16
-"""Bytes at the end of a file (of a Parquet file: its table of contents) that tell it from another of the same size."""
+"""Bytes at the end of a file (of a Parquet file its footer) that distinguish it from others of the same size."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Successive samples of one experiment, on every pass read anew."""
+    """Successive samples of one experiment, read on every pass."""
 
-    label: str  # which ones, for messages
+    label: str  # for messages
     # yields blocks of (columns, the one of them that is the clock); of a Dask partition of (its content, columns,
     # clock)
     read: Callable[..., Iterator[Block]] = field(repr=False)
     n_samples: int | None = None  # number of samples, or None
-    # path, size and digest of the end of each file, as the one who opened the record saw them
+    # path, size and digest of the end of each file when the record was opened
     files: tuple[tuple[Path, int, str], ...] = field(default=(), repr=False)
     experiment: int = 0  # which experiment of the record they belong to
-    # what Dask is to compute, or its result: a frame, or an array (n, channels); None for files
+    # task of Dask, or its result: a frame, or an array (n, channels); None for files
     content: Any = field(default=None, repr=False)
 
     def blocks(self, wanted: Sequence[str], clock: str | None) -> Iterator[Block]:
-        """Start a pass over some columns once the files are known to be those that were opened.
-
-        Raises:
-            DataError: no such file on this machine, or one with another content.
-        """
+        """Start a pass over some columns; `DataError` if a file is missing on this machine or has other content."""
         for path, size, digest in self.files:
             _check_same(path, (size, digest))
         return self.read(wanted, clock) if self.content is None else self.read(self.content, wanted, clock)
 
 
 def file_parts(parts: Sequence[Part], *paths: Path) -> list[Part]:
-    """Return parts that know their files again; workers must see them under their absolute paths."""
+    """Return parts with their files; workers must have these under their absolute paths."""
     files = tuple((path.absolute(), *_fingerprint(path)) for path in paths)
     return [replace(part, files=files) for part in parts]
 
 
 def _fingerprint(path: Path) -> tuple[int, str]:
-    """Return the size of a file and a digest of its end: enough to tell two versions apart without reading them."""
     size = path.stat().st_size
     with open(path, "rb") as file:
         file.seek(max(size - TAIL, 0))
@@ -68,5 +63,5 @@ def _check_same(path: Path, wanted: tuple[int, str]) -> None:
             "every worker sees under the same path, or open it as a Dask collection.") from error
     if found != wanted:
         what = f"{found[0]} bytes, not {wanted[0]}" if found[0] != wanted[0] else "the same size, another content"
-        raise DataError(f"machine {machine!r} has another {str(path)!r} than the one that was opened ({what}): it "
-                        "changed meanwhile, or the machines have copies that differ. Open it again, or copy it anew.")
+        raise DataError(f"on machine {machine!r} {str(path)!r} differs from the file that was opened ({what}): it "
+                        "was changed, or the machines have different copies. Open it again, or copy it again.")

@@ -1,4 +1,4 @@
-"""Rows of a table of text that is still being written, with a name for everything that is wrong with one of them."""
+"""Rows of a CSV table that is still being written, with a message for every bad cell and row."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -11,19 +11,19 @@ from optid.data.reading.columns import TIME_TOLERANCE, as_stamps, choose, second
 from optid.data.reading.csvfile import check_marks, is_missing, is_number
 from optid.errors import DataError
 
-LARGEST = 1e100  # larger numbers are no readings: what is computed from them a sample later must not overflow either
+LARGEST = 1e100  # larger numbers are not samples: they would overflow in later computations
 
 
 class Rows(NamedTuple):
-    """What was read."""
+    """Rows of samples."""
 
     values: Array  # (N, channels) samples, inputs first, NaN where missing
     m: int  # number of inputs
     lines: np.ndarray  # (N,) line of the stream, from 1; 0 for a sample that was put into a gap
     stamps: list[str]  # (N,) text of the time stamps; empty without them
-    bad: list[tuple[int, str]]  # (line, what is wrong) of the rows that could not be read, and count as missing samples
-    error: str = ""  # what ends the stream after these rows; empty where it goes on
-    stop: int = 0  # the line that does
+    bad: list[tuple[int, str]]  # (line, message) of rows that could not be read and count as missing samples
+    error: str = ""  # why the stream ends after these rows; empty if it continues
+    stop: int = 0  # the line of the error
 
     @property
     def u(self) -> Array:
@@ -42,7 +42,7 @@ class Rows(NamedTuple):
 
 
 class RowReader:
-    """Reads the lines of a CSV table as they come; the first one is the header unless the columns are named.
+    """Reads the lines of a CSV table as they arrive; the first one is the header unless `columns` are given.
 
     Attributes:
         line: lines read.
@@ -51,22 +51,22 @@ class RowReader:
     def __init__(self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
                  columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: int = 0,
                  label: str = "stream", tolerance: float = TIME_TOLERANCE) -> None:
-        """Say what is read.
+        """Prepare for the columns of inputs and outputs with time stamps at the sampling time dt.
 
         Args:
             inputs: columns of the inputs.
             outputs: columns of the outputs.
-            dt: sampling time that the time stamps must have.
-            time: column of time stamps; t or time when not given; False ignores it.
+            dt: sampling time of the time stamps.
+            time: column of time stamps; by default t or time; False ignores it.
             columns: names of the columns of a table without a header.
             delimiter: between the cells.
             decimal: decimal mark.
-            fill: largest number of missing samples that a gap of whole sampling times is filled with; 0 refuses gaps.
-            label: what messages call the table.
+            fill: largest number of missing samples inserted into a gap of whole sampling times; 0 refuses gaps.
+            label: name of the table in messages.
             tolerance: largest deviation of a time step from dt, relative to it.
 
         Raises:
-            DataError: a delimiter or decimal mark that cannot be used.
+            DataError: an invalid delimiter or decimal mark.
         """
         check_marks(delimiter, decimal)
         self._wanted, self._dt, self._fill, self._label, self._tolerance = (
@@ -91,14 +91,14 @@ class RowReader:
 
     @property
     def memory(self) -> dict[str, Any]:
-        """What must be kept to read on later, in JSON types."""
+        """The state from which to resume, in JSON types."""
         last = None if self._last is None else str(self._last[0])
         return {
             "line": self.line, "names": self._names, "last": last, "since": self._since, "blank": list(self._blank)
         }
 
     def resume(self, memory: Mapping[str, Any]) -> None:
-        """Read on where `memory` was taken."""
+        """Resume from the state `memory`."""
         self.line, self._since, self._blank = int(memory["line"]), int(memory["since"]), list(memory["blank"])
         if memory["names"] is not None:
             self._known(list(memory["names"]))
@@ -106,7 +106,7 @@ class RowReader:
             self._last = as_stamps([memory["last"]], self._label)
 
     def begin_file(self) -> None:
-        """Expect the header of another file; its time stamps may begin anew."""
+        """Expect the header of another file; its time stamps may start again."""
         if self._headed:
             self._names = None
         self.line, self._since = 0, 0  # lines read, and rows since the last stamp
@@ -114,11 +114,7 @@ class RowReader:
         self._last: np.ndarray | None = None
 
     def read(self, lines: Sequence[str]) -> Rows:
-        """Read complete lines, without their ends.
-
-        Raises:
-            DataError: a header without the columns that are needed.
-        """
+        """Read complete lines, without their ends; `DataError` for a header without the required columns."""
         lines = list(lines)
         if self._names is None:
             while lines and not lines[0].strip():
@@ -179,7 +175,7 @@ class RowReader:
         return Rows(values, m, np.array(numbers, dtype=int), [] if self._clock is None else stamps, bad)
 
     def _row(self, cells: list[str]) -> tuple[list[float], str, list[str]]:
-        """Return the samples of a row, its stamp, and what is wrong with it."""
+        """Return the samples of a row, its stamp, and messages about bad cells."""
         assert self._names is not None
         if len(cells) != len(self._names):
             return [np.nan] * len(self._places), "", [
@@ -195,7 +191,7 @@ class RowReader:
         return row, "" if self._clock is None else cells[self._clock].strip(), wrong
 
     def _timed(self, rows: Rows) -> Rows:
-        """Check the time stamps; cut before the first that is wrong, or fill the gap there and go on."""
+        """Check the time stamps; cut before the first bad one, or fill the gap there."""
         marks = np.flatnonzero([bool(stamp) for stamp in rows.stamps])
         if not marks.size:
             self._since += len(rows.lines)
@@ -232,7 +228,7 @@ class RowReader:
             f"--time none.{advice}"))
 
     def _without_odd_stamps(self, rows: Rows) -> Rows:
-        """Take rows whose time stamp cannot be read as rows without one."""
+        """Treat rows with unreadable time stamps as rows without one."""
         kind = None if self._last is None else self._last.dtype
         kept, bad = list(rows.stamps), list(rows.bad)
         for row, stamp in enumerate(rows.stamps):
@@ -243,10 +239,10 @@ class RowReader:
             if np.isfinite(found).all() and found.dtype == (kind or found.dtype):
                 kind = found.dtype
             elif stamp:
-                kept[row] = ""  # the row is there, its time is not known
+                kept[row] = ""  # the row counts, without a time
                 line = int(rows.lines[row])
-                bad.append((line, f"{self._label}, line {line}: {stamp!r} is no time stamp like those before; the row "
-                            "counts as one without a stamp."))
+                bad.append((line, f"{self._label}, line {line}: {stamp!r} is not a time stamp like those before; the "
+                            "row counts as one without a stamp."))
         if kept == rows.stamps:
             raise DataError(f"{self._label}: the time stamps of lines {rows.lines[0]} to {rows.lines[-1]} do not fit "
                             "together.")

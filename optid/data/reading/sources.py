@@ -1,4 +1,4 @@
-"""Sources of records: named columns that are loaded whole, or read in blocks and in parts where they need not fit."""
+"""Sources of records: named columns, loaded whole, or read in blocks and parts."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -13,7 +13,7 @@ import numpy as np
 from optid.data.reading.columns import position_names
 from optid.data.reading.csvfile import open_csv
 from optid.data.reading.frames import frame_names, index_name, load_frame, only_clock, partition_blocks
-from optid.data.reading.npyfile import load_npy, npz_arrays, open_npy, side_by_side
+from optid.data.reading.npyfile import npz_arrays, open_npy, side_by_side
 from optid.data.reading.parts import Part, file_parts
 from optid.errors import DataError
 
@@ -26,8 +26,8 @@ class Table:
 
     label: str  # name of the source, for messages
     names: list[str]  # names of its columns or variables
-    # function of (columns wanted, the clock among them, the column of experiments among them) returning {name: array};
-    # numeric columns are (N,) or (N, channels) of a real type, clock and experiments may be text or dates
+    # function of columns, the clock and the column of experiments among them, returning {name: array}; numeric columns
+    # are (N,) or (N, channels) of a real type, clock and experiments may be text or dates
     load: Callable[[Sequence[str], str | None, str | None], dict[str, Any]]
     # name of a time index besides the columns, or of the only column of dates; None without one
     index: str | None = None
@@ -38,15 +38,15 @@ class Source:
     """A source of one experiment that need not fit into memory."""
 
     names: Sequence[str]  # names of its columns
-    n_samples: int | None  # number of samples, None where only a pass can tell
+    n_samples: int | None  # number of samples, None if only a pass gives it
     whole: Part | None  # all of it; None where it exists in parts only
-    # function of the columns that will be read; returns what can be read apart, in the order of time
+    # function of the columns to read, returning the independent parts in the order of time
     parts: Callable[[Sequence[str]], Iterable[Part]]
     label: str  # name of the source, for messages
 
 
 def existing(path: Path) -> Path:
-    """Return the path of a file that is there and not empty (else a `DataError`)."""
+    """Return the path of a file that exists and is not empty (else a `DataError`)."""
     size, near = -1, []
     with suppress(OSError, ValueError):  # a name too long, or with a null character
         size = path.stat().st_size if path.is_file() else -1
@@ -64,8 +64,7 @@ def existing(path: Path) -> Path:
 def open_table(source: Any, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
     """Open a file, a frame, a dictionary of arrays or an array; arguments as of `optid.data.readers.read`.
 
-    Raises:
-        DataError: no such file, unknown format, a file that cannot be read, or a missing extra with its pip line.
+    `DataError`: no such file, unknown format, an unreadable file, or a missing extra with its pip line.
     """
     if isinstance(source, str | Path):
         path = Path(source)
@@ -102,10 +101,11 @@ def _file_table(path: Path, kind: str, columns: Sequence[str] | None, delimiter:
     if kind == ".npz":
         return Table(path.name, list(npz_arrays(path)), lambda wanted, *_: npz_arrays(path, wanted))
     if kind == ".npy":
-        return _of_array(path.name, load_npy(path, path.name), columns)
-    from optid.data.reading.matlab import mat_names, mat_variables
+        opened = open_npy(path, columns)
+        return Table(path.name, list(opened.names), lambda wanted, *_: next(opened.blocks(opened.rows, wanted)))
+    from optid.data.reading.matlab import mat_variables
 
-    names = mat_names(path)
+    names = list(mat_variables(path))
     if not names:
         raise DataError(f"{path.name} holds no arrays of numbers.")
     return Table(path.name, names, lambda wanted, *_: mat_variables(path, wanted))
@@ -120,7 +120,7 @@ def _of_arrays(label: str, variables: Mapping[Any, Any]) -> Table:
 
 def _of_array(label: str, array: np.ndarray, columns: Sequence[str] | None) -> Table:
     if array.ndim not in (1, 2):
-        raise DataError(f"{label} has shape {array.shape}; (samples, channels) is needed.")
+        raise DataError(f"{label} has shape {array.shape}; it must be (samples, channels).")
     table = array[:, None] if array.ndim == 1 else array
     names = position_names(columns, table.shape[1], label)
     return Table(label, names, _of_arrays(label, dict(zip(names, table.T))).load)
@@ -130,17 +130,14 @@ def _of_array(label: str, array: np.ndarray, columns: Sequence[str] | None) -> T
 
 
 def is_dask(thing: Any) -> bool:
-    """Say whether something is a Dask collection, without importing Dask."""
+    """Whether something is a Dask collection, without importing Dask."""
     return hasattr(thing, "__dask_graph__") and hasattr(thing, "to_delayed")
 
 
 def open_source(source: Any, chunk: int, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Source:
     """Open a file, a folder of Parquet files, a mapping {channel: npy file or Dask array} or a Dask collection.
 
-    Arguments as of `optid.data.streams.open_stream`.
-
-    Raises:
-        DataError: no such file, unknown format, a file that cannot be read, or a missing extra with its pip line.
+    Arguments as of `optid.data.streams.open_stream`, errors as of `open_table`.
     """
     if is_dask(source):
         return _of_dask(source, chunk, columns)
@@ -185,7 +182,7 @@ def _of_npy(paths: Mapping[Any, Any], chunk: int) -> Source:
     files = {str(name): open_npy(existing(Path(path).absolute())) for name, path in paths.items()}
     for name, file in files.items():
         if len(file.names) != 1:
-            raise DataError(f"channel {name!r}: {file.path.name} has {len(file.names)} columns, one is needed.")
+            raise DataError(f"channel {name!r}: {file.path.name} has {len(file.names)} columns; it must have one.")
     rows = _one_length({name: file.rows for name, file in files.items()})
     first = next(iter(files.values())).path.name
     whole = Part(first, partial(side_by_side, files, chunk), rows)
@@ -227,7 +224,7 @@ def _stacked(arrays: Mapping[Any, Any]) -> Any:
 
     for name, array in arrays.items():
         if getattr(array, "ndim", None) != 1:
-            raise DataError(f"channel {str(name)!r}: a Dask array (N,) is needed, not of shape "
+            raise DataError(f"channel {str(name)!r}: must be a Dask array (N,), not of shape "
                             f"{getattr(array, 'shape', None)}.")
     _one_length({str(name): array.shape[0] for name, array in arrays.items()})
     return dask.array.stack(list(arrays.values()), axis=1)
@@ -240,7 +237,7 @@ def _of_dask(collection: Any, chunk: int, columns: Sequence[str] | None) -> Sour
     else:
         label = "the Dask array"
         if getattr(collection, "ndim", None) not in (1, 2):
-            raise DataError("a Dask data frame or array (N, channels) is needed; the array has "
+            raise DataError("must be a Dask data frame or an array (N, channels); the array has "
                             f"{getattr(collection, 'ndim', 'no')} dimensions.")
         array = collection[:, None] if collection.ndim == 1 else collection
         rows, width = array.shape

@@ -1,4 +1,4 @@
-"""What a study is made of: data, formulations and solvers with their labels, and what holds for every cell."""
+"""The description of a study: data, formulations and solvers with their labels, and the settings of every cell."""
 
 import tomllib
 from collections.abc import Mapping
@@ -10,7 +10,7 @@ from typing import Any
 from optid.data.record import Data
 from optid.errors import StudyError
 
-HINT = "a text stands in quotation marks, a path in single ones, several values in [ ]; a line holds one key = value"
+HINT = "write texts in quotation marks, paths in single ones, several values in [ ], and one key = value per line"
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class FormulationEntry:
     name: str  # its label
     formulation: str  # registered name
     constraints: tuple[str, ...] = ()  # named constraints as texts, such as "monotone:increasing"
-    options: Mapping[str, Any] = field(default_factory=dict)  # arguments in the words of the command line
+    options: Mapping[str, Any] = field(default_factory=dict)  # arguments as on the command line
     data: tuple[str, ...] = ()  # labels of the data entries it is for; empty for all
 
     def is_for(self, entry: DataEntry) -> bool:
@@ -46,7 +46,7 @@ class SolverEntry:
     """One entry of the solver axis."""
 
     name: str  # its label
-    solver: str  # word of the back end, or "auto"
+    solver: str  # name of the back end, or "auto"
     accuracy: tuple[float, ...] = ()  # requested accuracies in place of those of the study
     options: Mapping[str, Any] = field(default_factory=dict)  # native options of the solver
 
@@ -71,13 +71,13 @@ class Study:
         memory_limit: MB a cell may take.
         repetitions: how often a cell is run, for its times.
         warm: whether a cell is also solved a second time from its own solution.
-        seeds: of the simulated records; their number, or a list of them.
-        holdout: share of a record that the fit does not see.
+        seeds: of the simulated records; their number, or a list.
+        holdout: share of a record that is held out.
         folder: where relative file names start.
-        data_checked: whether `check_data` has found nothing wrong.
+        data_checked: whether `check_data` has passed.
 
     Raises:
-        StudyError: lists everything that is wrong. Whether the files can be read is found out by `check_data`.
+        StudyError: lists all problems. `check_data` checks the files.
     """
 
     name: str
@@ -108,10 +108,10 @@ class Study:
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Study":
-        """Read a study file; relative data files are looked for beside it.
+        """Read a study file; relative data files are relative to its folder.
 
         Raises:
-            StudyError: every problem with its key; data that cannot be read count as such.
+            StudyError: every problem with its key, unreadable data included.
         """
         path = Path(path)
         try:
@@ -119,7 +119,7 @@ class Study:
         except OSError as error:
             raise StudyError(f"study file {path} cannot be read: {error.strerror or error}") from None
         except UnicodeDecodeError as error:
-            raise StudyError(f"{path} has a problem:\n  not UTF-8, in which a study file is written: {error}") from None
+            raise StudyError(f"{path} has a problem:\n  a study file must be UTF-8: {error}") from None
         return cls.from_text(text.removeprefix("\ufeff"), path.parent, str(path), path.stem)
 
     @classmethod
@@ -127,10 +127,10 @@ class Study:
         """Read a study from TOML text.
 
         Args:
-            text: what a study file holds.
-            folder: where relative data files are looked for.
-            label: what the text is called in messages.
-            title: of a study that has none.
+            text: content of a study file.
+            folder: folder of relative data files.
+            label: name of the text in messages.
+            title: default title.
 
         Raises:
             StudyError: as for `from_toml`.
@@ -142,8 +142,8 @@ class Study:
         try:
             raw = tomllib.loads(text.replace("\r\n", "\n"))
         except RecursionError:
-            raise StudyError(f"{label} has a problem:\n  lists or tables are nested too deeply to be a study") from None
-        except ValueError as error:  # what is not TOML, and an integer of so many digits that Python does not read it
+            raise StudyError(f"{label} has a problem:\n  lists or tables are nested too deeply") from None
+        except ValueError as error:  # not TOML, or an integer with too many digits for Python
             raise StudyError(f"{label} has a problem:\n  {error}; {HINT}") from None
         problems, folder = Problems(), Path(folder)
         found = {"name": title, **read(raw, problems)}
@@ -155,7 +155,7 @@ class Study:
 
     @classmethod
     def example(cls) -> "Study":
-        """Return the built-in study, so that the command runs on nothing."""
+        """Return the built-in study."""
         text = files("optid.studies.definition").joinpath("example.toml").read_text(encoding="utf-8")
         return cls.from_text(text, label="the built-in study")
 
@@ -170,12 +170,11 @@ class Study:
         return as_toml(self)
 
     def check_data(self) -> None:
-        """Read every data file, pose every formulation and try options on a short record, unless that was done already.
+        """Read every data file, build every formulation and try solver options on a short record, once.
 
         Raises:
-            StudyError: lists the files and columns that are not there or cannot be read; where all can, the
-                formulations whose arguments or constraints fit none of their data, and the options with which a
-                solver fails where it succeeds without.
+            StudyError: lists missing or unreadable files and columns; if there are none, the formulations whose
+                arguments or constraints fit none of their data, and options with which a solver fails.
         """
         from optid.studies.definition.problems import Problems
         from optid.studies.definition.trial import note_all
@@ -187,7 +186,7 @@ class Study:
             object.__setattr__(self, "data_checked", True)
 
     def run(self, db: str | Path | None = None, **settings: Any) -> Any:
-        """Run what is left of the study and return its rows.
+        """Run the remaining cells of the study and return all rows.
 
         Args:
             db: database file, from which an interrupted study goes on; a temporary one when not given.

@@ -1,4 +1,4 @@
-"""From what a user writes, in a file or in Python, to the entries of a study; every problem is noted, none stops it."""
+"""Entries of a study from a file or from Python; all problems are collected."""
 
 import inspect
 import math
@@ -29,7 +29,7 @@ _DATA = ("name", "file", "system", "samples", "noise", *READING)
 _FORMULATION = ("name", "formulation", "constraints", "data")
 _SOLVER = ("name", "solver", "accuracy", "options")
 SETTINGS = tuple(p.name for p in inspect.signature(solve).parameters.values() if p.kind is not p.VAR_KEYWORD)
-"""What solving has arguments for: among the options of a solver, these would override what its rows say."""
+"""Arguments of `solve`: as options of a solver they would contradict the rows."""
 
 _KINDS: tuple[tuple[type | tuple[type, ...], str, str], ...] = (
     (bool, "bool", "true or false"),
@@ -38,16 +38,11 @@ _KINDS: tuple[tuple[type | tuple[type, ...], str, str], ...] = (
     (str, "str", "a text"),
     ((list, tuple), "Sequence list tuple", "a list"),
 )
-"""Types of a value, the words of an annotation that take it, and its words for people."""
+"""Types of a value, the words of an annotation that accept it, and its name in messages."""
 
 
 def read(raw: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
-    """Return the arguments of a `Study` for a raw description.
-
-    Args:
-        raw: keys and values as in a study file.
-        problems: collects what is wrong; what is returned is usable only if nothing is.
-    """
+    """Return the arguments of a `Study` for keys and values as in a study file; valid only if no problem was noted."""
     top = Place(raw, problems)
     top.check_keys(_TOP)
     checks: dict[str, Callable[[Place], Any]] = {
@@ -76,7 +71,7 @@ def _tables(key: str, top: Place) -> list[Place]:
             top.note(f"there is no [[{key}]]: a study needs at least one")
         return []
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
-        how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table of its own, [[{key}]]"
+        how = f"[[{key}]], with two brackets" if isinstance(entries, Mapping) else f"a table, [[{key}]]"
         listed = ", or at the top solvers = \"auto\"" if key == "solver" else ""
         top.note(f"{key} is written as {how}{listed}", key)
         return []
@@ -110,7 +105,6 @@ def _data(entry: Place) -> DataEntry:
 
 
 def _reading(at: Place) -> Any:
-    """Check one key that says how a file is read."""
     key, value = at.name, at.value
     if key == "dt":
         return at.number("a positive number", 0.0)
@@ -125,14 +119,14 @@ def _reading(at: Place) -> Any:
 
 
 def _formulations(entry: Place, data: Sequence[DataEntry]) -> list[FormulationEntry]:
-    """The formulations of one entry: one, or the grid over its arguments that are lists of values."""
+    """Return the formulations of an entry: one, or the grid over its arguments with several values."""
     known, name, raw = registered(FORMULATIONS), entry.value.get("formulation"), entry.value
     names = [one.name for one in data]
     axes: dict[str, list[Any]] = {}
     if isinstance(name, str) and name in known:
         try:
             parameters = inspect.signature(known[name].load(), eval_str=True).parameters
-        except Exception:  # told below
+        except Exception:  # reported below
             parameters = {}
         wanted = [at.value for at in entry["data"].items()] if "data" in entry else names
         used = [one for one in data if one.name in wanted]
@@ -140,7 +134,7 @@ def _formulations(entry: Place, data: Sequence[DataEntry]) -> list[FormulationEn
                 if key in parameters and isinstance(value, list | tuple) and value
                 and _is_axis(parameters[key].annotation, value, used)}
     if (count := math.prod(map(len, axes.values()))) > MOST_FORMULATIONS:
-        entry.note(f"{', '.join(axes)} form a grid of {count:,} formulations; at most {MOST_FORMULATIONS:,} are taken")
+        entry.note(f"{', '.join(axes)} form a grid of {count:,} formulations; the limit is {MOST_FORMULATIONS:,}")
         return []
     found = []
     for values in product(*axes.values()):
@@ -155,7 +149,7 @@ def _formulations(entry: Place, data: Sequence[DataEntry]) -> list[FormulationEn
 def _is_axis(annotation: Any, value: Sequence[Any], data: Sequence[DataEntry]) -> bool:
     """Whether a list holds several values of an argument: the argument takes no list, or a list of lists is given.
 
-    Arguments that take one value or one per input are per input where the data have several inputs.
+    An argument that takes one value or one per input is per input if the data have several inputs.
     """
     if all(isinstance(one, list | tuple) for one in value):
         return True
@@ -186,7 +180,7 @@ def _formulation(entry: Place, data: Sequence[str]) -> FormulationEntry:
     elif name is not None:
         try:
             _check_arguments(entry, name, known[name].load(), options)
-        except Exception as error:  # a broken plug-in is told like everything else
+        except Exception as error:  # a broken plug-in
             entry.note(f"formulation {name!r} cannot be loaded: {type(error).__name__}: {error}", "formulation")
     for key in options:
         entry[key].check_writable()
@@ -207,7 +201,7 @@ def _check_constraint(entry: Place, keys: Path, text: str) -> None:
         return
     try:
         named_constraint(text)
-    except Exception as error:  # whatever a builder of a third party raises
+    except Exception as error:  # any error of a third-party builder
         entry.note(f"{error}" if "constraint" in str(error) else f"constraint {text!r}: {error}", *keys)
 
 
@@ -234,13 +228,13 @@ def _check_arguments(entry: Place, name: str, function: Callable[..., Any], opti
 
 
 def _misfit(annotation: Any, value: Any) -> str | None:
-    """What a value of the annotation would be, where this one is none; None where it is or cannot be told."""
+    """Return what a value of the annotation must be if this one is invalid, else None."""
     words = set(re.findall(r"\w+", annotation if isinstance(annotation, str) else
                            annotation.__name__ if isinstance(annotation, type) else str(annotation)))
     if annotation is inspect.Parameter.empty or "Any" in words or not words & {"bool", "int", "float", "str"}:
         return None
     takers = next((takers for kind, takers, _ in _KINDS if isinstance(value, kind)), None)
-    if takers is None or words & set(takers.split()):  # of a table or a date the formulation says
+    if takers is None or words & set(takers.split()):  # tables and dates are checked by the formulation
         return None
     return " or ".join(word for _, takers, word in _KINDS if words & {takers.split()[0]})
 
@@ -291,7 +285,7 @@ def _solver_entry(entry: Place) -> SolverEntry:
 
 
 def _solver(place: Place, keys: Path, word: str, *more: str) -> str:
-    """Look a solver up; `more` are words that could be meant besides."""
+    """Look up a solver; `more` are other possible words."""
     known = [AUTO, *back_ends()]
     if word.lower() not in known:
         place.note(f"no solver is called {word!r}. {nearest(word.lower(), [*known, *more])}", *keys)
@@ -308,7 +302,7 @@ def _seeds(at: Place) -> tuple[int, ...]:
     if not isinstance(at.value, list | tuple | range):
         count = at.whole(1)
         if count is not None and count > MOST_SEEDS:
-            at.note(f"{count:,} seeds are too many: at most {MOST_SEEDS:,} are taken")
+            at.note(f"{count:,} seeds are too many: at most {MOST_SEEDS:,} are allowed")
             return ()
         return tuple(range(count or 1))
     if not at.items():
@@ -321,7 +315,7 @@ def _label(entry: Place, default: str) -> str:
 
 
 def _distinct(key: str, entries: Sequence[Any], top: Place) -> None:
-    """Refuse two entries with one label; solvers listed at the top come before the tables."""
+    """Note entries with the same label; solvers listed at the top come before the tables."""
     seen: set[str] = set()
     listed = len(entries) - len(top.value.get("solver", [])) if key == "solver" else 0
     for i, entry in enumerate(entries):

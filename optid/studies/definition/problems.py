@@ -1,10 +1,10 @@
-"""What is wrong with the description of a study, collected so that everything is told at once."""
+"""Problems in the description of a study, collected so that all are reported together."""
 
 import sys
 from collections.abc import Callable, Mapping
 from datetime import date
 from datetime import time as clock
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,42 +16,27 @@ class Label(str):
 
 
 Path = tuple[str | int, ...]
-"""Keys that lead to a value; positions in lists are counted from 0, entries may stand with their labels."""
+"""Keys that lead to a value; positions in lists are counted from 0, a label may replace the position of an entry."""
 
 T = TypeVar("T")
 
-LARGEST = 2**62  # whole numbers from here on have no place in the database
+LARGEST = 2**62  # limit of integers in the database
 
 
-class Problem(NamedTuple):
-    """One thing that is wrong: the keys that lead to it, and what would be right."""
-
-    path: Path
-    text: str
-
-
-class Problems(list[Problem]):
-    """All of them, in the order in which they are found."""
-
-    def add(self, path: Path, text: str) -> None:
-        """Note one problem."""
-        self.append(Problem(path, text))
+class Problems(list[tuple[Path, str]]):
+    """All problems in the order in which they are found: the keys that lead to each, and its description."""
 
     def concern(self, key: str) -> bool:
-        """Return whether something is wrong below a key at the top."""
-        return any(problem.path[:1] == (key,) for problem in self)
+        """Whether there is a problem below a key at the top."""
+        return any(path[:1] == (key,) for path, _ in self)
 
     def told(self, label: str) -> None:
-        """Raise what was found, what is wrong at several keys once with their number.
-
-        Raises:
-            StudyError: one line per problem.
-        """
+        """Raise a `StudyError` with one line per problem, if there are any; repeated problems count as one."""
         if not self:
             return
         places: dict[str, dict[str, None]] = {}
-        for problem in self:
-            places.setdefault(problem.text, {})[_written(problem.path)] = None
+        for path, text in self:
+            places.setdefault(text, {})[_written(path)] = None
         lines = []
         for text, (first, *others) in places.items():
             where = first + (f" and {len(others)} more" if others else "")
@@ -61,7 +46,7 @@ class Problems(list[Problem]):
 
 
 class Place:
-    """A value of the description, the keys that lead to it, and its checks: what they cannot return, they note."""
+    """A value of the description with its keys and checks; a check that fails notes a problem."""
 
     def __init__(self, value: Any, problems: Problems, path: Path = ()) -> None:
         self.value, self.problems, self.path = value, problems, path
@@ -79,19 +64,19 @@ class Place:
 
     def note(self, text: str, *keys: str | int) -> None:
         """Note a problem, here or at keys below."""
-        self.problems.add((*self.path, *keys), text)
+        self.problems.append(((*self.path, *keys), text))
 
     def take(self, key: str, check: "Callable[[Place], T]", default: Any = None) -> T:
         """Return what a check makes of the value at a key, or the default where there is none."""
         return check(self[key]) if key in self else default
 
     def items(self) -> "list[Place]":
-        """The entries of a list; of anything else the place itself."""
+        """Return the entries of a list, or the place itself."""
         several = isinstance(self.value, list | tuple | range | np.ndarray)
         return [self[i] for i in range(len(self.value))] if several else [self]
 
     def each(self, check: "Callable[[Place], T | None]") -> tuple[T, ...]:
-        """The entries that pass a check, each once; one that is there twice is noted."""
+        """Return the entries that pass a check; repeated ones are noted."""
         found = [check(item) for item in self.items()]
         for i, value in enumerate(found):
             if value is not None and value in found[:i]:
@@ -126,7 +111,7 @@ class Place:
         return float(value) if fits and (low < value < high or (closed and value == low)) else self.must_be(what)
 
     def whole(self, low: int) -> int | None:
-        """A whole number from low."""
+        """Return an integer of at least `low`."""
         value = self.value
         if isinstance(value, int | np.integer) and not isinstance(value, bool) and value >= low:
             return int(value) if value < LARGEST else self.must_be("below 2**62")
@@ -136,11 +121,11 @@ class Place:
         return self.must_be(what)
 
     def must_be(self, what: str) -> None:
-        """Note what the value would have to be."""
+        """Note the required kind of value."""
         self.note(f"must be {what}; {shown(self.value)} is not")
 
     def check_writable(self) -> None:
-        """Note what a study file cannot hold: it has no text from which the key of a cell could be made."""
+        """Note values that a study file cannot hold: no key of a cell could be computed from them."""
         if isinstance(self.value, Mapping):
             for key in self.value:
                 if isinstance(key, str):
@@ -158,7 +143,7 @@ class Place:
 
 
 def shown(value: Any) -> str:
-    """Write a value as people call it."""
+    """Write a value for messages."""
     if isinstance(value, str):
         return f"the text {value!r}"
     if isinstance(value, bool):

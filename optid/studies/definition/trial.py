@@ -1,4 +1,4 @@
-"""What can be found out before a study runs: data that cannot be read, models that cannot be posed, wrong options."""
+"""Checks before a study runs: unreadable data, impossible formulations, wrong options."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,17 +20,17 @@ from optid.studies.definition.problems import Path as Keys
 from optid.studies.sources.systems import simulate, system
 
 SHORT = 300  # samples on which a formulation, and the options of a solver, are tried
-TRIAL = 20.0  # seconds that a trial of options may take; whoever needs longer is left to the run
-LONGEST = 300  # characters of the words of a solver that fails
+TRIAL = 20.0  # seconds that a trial of options may take
+LONGEST = 300  # characters of the message of a solver that fails
 
 
 def note_all(folder: Path, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry],
              solvers: Sequence[SolverEntry], problems: Problems) -> None:
-    """Note data that cannot be read and, where nothing is wrong, impossible formulations and wrong options.
+    """Note unreadable data and, if there are no problems, impossible formulations and wrong options.
 
-    Relative files are in the folder; data at whose keys a problem is noted already are left alone.
+    Relative files are in the folder; data entries with problems are skipped.
     """
-    records, wrong = _Records(folder), {problem.path[:2] for problem in problems}
+    records, wrong = _Records(folder), {path[:2] for path, _ in problems}
     for i, entry in enumerate(data):
         if ("data", i) not in wrong:
             _note_unreadable(("data", i), entry, records, problems)
@@ -40,7 +40,6 @@ def note_all(folder: Path, data: Sequence[DataEntry], formulations: Sequence[For
 
 
 class _Records:
-    """The records of data entries, each read once."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -53,7 +52,7 @@ class _Records:
 
         if entry.name not in self._read:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", DataWarning)  # they are told when the record is used
+                warnings.simplefilter("ignore", DataWarning)  # repeated when the record is used
                 self._read[entry.name] = read_entry(located(entry, self.folder))
         return self._read[entry.name]
 
@@ -63,15 +62,12 @@ class _Records:
             longest = max(entry.samples or (system(entry.system).samples,))
             return simulate(entry.system, int(min(samples, longest)))[0]
         whole = self.read(entry)
-        first = whole.experiments[0]
-        if first.n_samples <= samples:
-            return whole
-        kept = int(samples)
-        return Data(first.u[:kept], first.y[:kept], whole.dt, inputs=whole.inputs, outputs=whole.outputs)
+        short = whole.experiments[0].n_samples <= samples
+        return whole if short else whole.select(experiments=0).window(0, int(samples))
 
 
 def _note_unreadable(path: Keys, entry: DataEntry, records: _Records, problems: Problems) -> None:
-    """Note what is wrong with the files of one entry, at the key that is to blame."""
+    """Note problems with the files of an entry, at the key that causes them."""
     from optid.data.reading.columns import choose
     from optid.data.reading.sources import open_table
 
@@ -88,36 +84,37 @@ def _note_unreadable(path: Keys, entry: DataEntry, records: _Records, problems: 
         if entry.files:
             records.read(entry)
     except DataError as error:
-        problems.add(at, str(error))
+        problems.append((at, str(error)))
 
 
 def note_impossible(data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: _Records,
                     problems: Problems) -> None:
     """Note the formulations whose arguments or constraints do not fit any of their data.
 
-    Each is posed on a short record; what only a longer one can tell is left to the run, where it becomes a row.
+    Each is built on a short record; what only a longer one can show becomes a row of the run.
     """
     for entry in formulations:
         its_data = [one for one in data if entry.is_for(one)]
         if all(_refused(entry, records.beginning(one)) for one in its_data):
             reasons = [_refused(entry, records.beginning(one, np.inf)) for one in its_data]  # was it too short?
             if reasons and all(reasons):
-                problems.add(("formulation", Label(entry.name)), f"the formulation cannot be posed: {reasons[0]}")
+                text = f"the formulation does not fit the data: {reasons[0]}"
+                problems.append((("formulation", Label(entry.name)), text))
 
 
 def _refused(entry: FormulationEntry, record: Data) -> str:
-    """Why a formulation does not accept its arguments on a record; empty where it does, or where that is not known."""
+    """Return why a formulation rejects its arguments on a record; empty if it does not, or if that is unknown."""
     try:
         _posed(entry, record)
     except (StructureError, LookupFailed) as error:
         return str(error)
-    except Exception:  # a record that is too short, a defect: the run will tell
+    except Exception:  # a short record or a defect: the row of the run has it
         pass
     return ""
 
 
 def _posed(entry: FormulationEntry, record: Data) -> Any:
-    """The programme of a formulation on a record, the first one of a procedure."""
+    """Return the programme of a formulation on a record, or the first one of a procedure."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         problem = posed(entry.formulation, record, entry.constraints, entry.options)
@@ -143,9 +140,9 @@ def note_wrong_options(data: Sequence[DataEntry], formulations: Sequence[Formula
         path, without = ("solver", Label(entry.name), "options"), f"{entry.solver} fail where it succeeds without"
         for key, why in alone.items():
             if why:
-                problems.add((*path, key), f"{key} makes {without}: {why}")
+                problems.append(((*path, key), f"{key} makes {without}: {why}"))
         if not any(alone.values()):
-            problems.add(path, f"these options make {without}: {all_fail}")
+            problems.append((path, f"these options make {without}: {all_fail}"))
 
 
 def _solved_without(solver: str, data: Sequence[DataEntry], formulations: Sequence[FormulationEntry], records: _Records
@@ -157,20 +154,20 @@ def _solved_without(solver: str, data: Sequence[DataEntry], formulations: Sequen
                 programme = _posed(entry, records.beginning(one))
                 if _solve(programme, solver, {}).status in (Status.OPTIMAL, Status.LOCAL):
                     yield programme
-            except Exception:  # not posed, not installed, not for this formulation
+            except Exception:  # not built, not installed, not for this formulation
                 continue
 
 
 def _failure(programme: Any, solver: str, options: Mapping[str, Any]) -> str:
-    """Why a solver ends without a point; empty where it has one, or ran out of time."""
+    """Return why a solver ends without a point; empty if it has one, or ran out of time."""
     found = _solve(programme, solver, options)
     if found.status is not Status.FAILED or found.has_point:
         return ""
-    return short(" ".join(found.reason.split()) or "it does not say why", LONGEST)
+    return short(" ".join(found.reason.split()) or "no reason given", LONGEST)
 
 
 def _solve(programme: Any, solver: str, options: Mapping[str, Any]) -> Any:
-    """Solve in a process of its own: options may crash a solver, or never let it end."""
+    """Solve in a separate process: options may crash a solver, or keep it from ending."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return solve(programme, solver, time_limit=TRIAL, prove=False, **options)

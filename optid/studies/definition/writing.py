@@ -1,4 +1,4 @@
-"""From a study back to the keys and values of a study file, and to its text."""
+"""A study as the keys and values of a study file, and as its text."""
 
 import json
 import re
@@ -23,7 +23,7 @@ _BARE = re.compile(r"[A-Za-z0-9_-]+")
 _ALONE = ("accuracy", "time_limit", "memory_limit", "repetitions", "warm", "seeds", "holdout")
 
 
-_AXES = {  # key in a file: argument of a Study, keys that tell an entry from labels, what is taken
+_AXES = {  # key in a file: argument of a Study, keys that distinguish an entry from labels, accepted values
     "data": ("data", ("file", "system", "name"), "a record, optid.Data(u, y, dt), the name of a file or of a simulated "
              "system"),
     "formulation": ("formulations", ("formulation",), "the name of a formulation"),
@@ -32,10 +32,7 @@ _AXES = {  # key in a file: argument of a Study, keys that tell an entry from la
 
 
 def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
-    """Return the keys and values of a study file for the arguments of a `Study`, however simply they were written.
-
-    What cannot be read at all is noted.
-    """
+    """Return the keys and values of a study file for the arguments of a `Study`; invalid axes are noted."""
     raw: dict[str, Any] = {"name": given["name"], **{key: plain(given[key]) for key in _ALONE}}
     for key, (axis, marks, takes) in _AXES.items():
         value = given[axis]
@@ -48,14 +45,13 @@ def as_raw(given: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
             entries = [_entry(key, entry) for entry in (value if isinstance(value, list | tuple) else [value])]
         for i, entry in enumerate(entries):
             if not isinstance(entry, Mapping):
-                problems.add((key, i), f"{shown(entry)} is none of what is taken here: {takes}, or a mapping with the "
-                             f"keys of [[{key}]]")
+                problems.append(((key, i), f"{shown(entry)} is invalid: must be {takes}, or a mapping with the keys of "
+                                 f"[[{key}]]"))
         raw[key] = [plain(entry) for entry in entries if isinstance(entry, Mapping)]
     return raw
 
 
 def _entry(key: str, entry: Any, label: str | None = None) -> Any:
-    """One entry of an axis as a mapping, where it is something that is taken there."""
     if isinstance(entry, Data):
         entry = {"record": entry} if key == "data" else entry
     elif isinstance(entry, str) and key != "data":
@@ -69,7 +65,6 @@ def _entry(key: str, entry: Any, label: str | None = None) -> Any:
 
 
 def _entry_keys(entry: DataEntry | FormulationEntry | SolverEntry) -> dict[str, Any]:
-    """The keys and values of an entry; what is empty is left out."""
     found = {f.name: getattr(entry, f.name) for f in fields(entry)}
     options = dict(found.pop("options"))
     if "files" in found:

@@ -1,7 +1,7 @@
-"""Run one cell of a study: load its record, fit, judge the model on what the fit did not see, and return the row.
+"""Run one cell of a study: load its record, fit, validate the model on the hold-out samples, and return the row.
 
-Nothing that a fit does is an exception here. What even a row cannot survive (an endless loop, a segmentation fault) is
-for whoever runs the worker: `lost_row` makes the row of a cell that could not make its own.
+No failure of a fit raises an exception here. An endless loop or a segmentation fault is handled by the parent of the
+worker: `lost_row` makes the row of a cell that returned none.
 """
 
 import json
@@ -23,10 +23,20 @@ from optid.studies.execution.machine import Peak, machine
 from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash, determining
 from optid.studies.sources.records import Record, load
-from optid.studies.storage.rows import DONE, ERROR, MEMORY_LIMIT, NON_FINITE, REFUSED, SUCCESS, as_json, complete
+from optid.studies.storage.rows import (
+    DONE,
+    ERROR,
+    MEMORY_LIMIT,
+    NAMES,
+    NON_FINITE,
+    REFUSED,
+    SUCCESS,
+    as_json,
+    complete,
+)
 
 KEPT = 3  # records that a worker keeps, so that cells of one data set load it once
-SHORTEST = 0.01  # seconds of a time limit that a solver always has: some take none at all for no limit
+SHORTEST = 0.01  # smallest time limit of a solver in seconds: some take 0 as no limit
 REHEARSED = 0.25  # share of the time limit up to which the first cell of its kind in a process is run twice
 
 _records: OrderedDict[tuple[Any, ...], Record] = OrderedDict()
@@ -36,11 +46,10 @@ _rehearsed: set[tuple[str, str, bool]] = set()
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Run a cell and return its row, whatever the fit does.
 
-    The first cell of a formulation and solver in a process is run twice when it is quick, and the second run counts:
-    importing a solver and loading compiled kernels are not in the times.
-
-    The solver's own clock is set to what loading the record left of the time limit, and it runs in this process:
-    whoever calls this stops a process that does not keep its limits.
+    The first cell of a formulation and solver in a process is run twice if it is quick, and the second run counts: the
+    times exclude importing a solver and loading compiled kernels.
+    The solver's time limit is what loading the record left
+    of the limit of the cell; the caller stops a process that exceeds it.
     """
     clock = time.perf_counter()
     row = _run(cell, clock)
@@ -70,7 +79,7 @@ def _run(cell: Cell, given: float) -> dict[str, Any]:
     except (Exception, SystemExit) as error:
         found = {"outcome": ERROR, "reason": f"{type(error).__name__}: {error}"}
 
-    if held := _too_much(peak, cell):  # unseen by who watches: what is above the limit is no answer
+    if held := _too_much(peak, cell):  # unseen by the parent; above the limit there is no result
         found, fitted = {"outcome": MEMORY_LIMIT, "reason": held}, None
     row = complete({**known(cell), **found, "started": started.isoformat(), "peak_mb": peak.mb(),
                     "base_mb": peak.start, "total_s": time.perf_counter() - clock})
@@ -88,7 +97,7 @@ def _too_much(peak: Peak, cell: Cell) -> str:
 
 
 def prepare() -> None:
-    """Import what every fit needs and load compiled kernels, so that no cell of this process pays for it."""
+    """Import what every fit needs and load compiled kernels, so that no cell includes that time."""
     from optid.examples import dead_zone
     from optid.identify.validation.predictions import one_step, simulated
 
@@ -102,13 +111,13 @@ def prepare() -> None:
 
 def lost_row(cell: Cell, outcome: str, reason: str, *, started: datetime | None = None, total_s: float | None = None
              ) -> dict[str, Any]:
-    """Return the row of a cell that made none itself: why, when it was started (by default now) and stopped."""
+    """Return the row of a cell that returned none: the reason, its start (by default now) and its duration."""
     return complete({**known(cell), "outcome": outcome, "reason": reason, "total_s": total_s,
                      "started": (started or datetime.now(UTC)).isoformat()})
 
 
 def without_warm(row: Mapping[str, Any], reason: str) -> dict[str, Any]:
-    """Return the row of a cold solve that stands alone; the reason is what became of the second solve."""
+    """Return the row of the cold solve alone; the reason is why the second solve has no result."""
     words = "; ".join(filter(None, [row["reason"], f"no warm solve: {reason}"]))
     return {**row, **dict.fromkeys(("warm_s", "warm_status", "warm_iterations")), "reason": words}
 
@@ -116,22 +125,15 @@ def without_warm(row: Mapping[str, Any], reason: str) -> dict[str, Any]:
 def known(cell: Cell) -> dict[str, Any]:
     """Return the columns of a cell that are known before it runs."""
     entry = cell.data_source
-    versions = determining(cell.formulation_name, cell.solver_name, entry.system is not None)
-    return {
-        "key": cell.key, "repetition": cell.repetition, "study": cell.study,
-        "data": cell.data, "formulation": cell.formulation, "solver": cell.solver, "system": entry.system,
-        "file": ", ".join(map(str, entry.files)) or None, "data_hash": cell.data_hash or None,
-        "samples": cell.samples, "n_estimation": cell.samples, "noise": cell.noise, "seed": cell.seed,
-        "formulation_name": cell.formulation_name,
-        "options": as_json(cell.options), "constraints": as_json(cell.constraints), "solver_name": cell.solver_name,
-        "solver_options": as_json(cell.solver_options), "accuracy": cell.accuracy, "warm": cell.warm,
-        "holdout": cell.holdout, "time_limit": cell.time_limit, "memory_limit": cell.memory_limit,
-        "machine": machine(), "versions": as_json(versions),
-    }
+    found = {name: getattr(cell, name) for name in NAMES if hasattr(cell, name)}
+    found["versions"] = determining(cell.formulation_name, cell.solver_name, entry.system is not None)
+    found |= {name: as_json(found[name]) for name in ("options", "constraints", "solver_options", "versions")}
+    return found | {"system": entry.system, "file": ", ".join(map(str, entry.files)) or None, "machine": machine(),
+                    "data_hash": cell.data_hash or None, "n_estimation": cell.samples}
 
 
 def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit | None]:
-    """What a fit comes to, and the fit where it is to be solved once more; ``limit``: seconds for each programme."""
+    """Return the columns of a fit, and the fit if it is to be solved again; `limit`: seconds for each programme."""
     data = record.data
     held = 0 if record.holdout is None else record.holdout.n_samples
     row: dict[str, Any] = {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
@@ -150,7 +152,7 @@ def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit
 
 
 def _loaded(cell: Cell) -> Record:
-    """The record of a cell, from the last few that this worker loaded where it is among them."""
+    """Return the record of a cell, kept from the last few that this worker loaded."""
     entry = cell.data_source
     identity = (cell.data_hash, entry.system, cell.samples, cell.noise, cell.seed, cell.holdout, as_json(entry.options))
     if identity not in _records:
@@ -165,12 +167,11 @@ def _loaded(cell: Cell) -> Record:
 
 
 def _verdict(fitted: Fit) -> dict[str, Any]:
-    """Why it stopped, whether there is a point, whether it is proved, the residuals and the times."""
     solution, program = fitted.solution, fitted.program
     bound, residuals = solution.bound, solution.residuals
     steps = [step for _, step in fitted.steps]
     counts, times = [step.iterations for step in steps], [step.times for step in steps]
-    told = [t.compile for t in times if np.isfinite(t.compile)]  # apart, in these programmes
+    compiled = [t.compile for t in times if np.isfinite(t.compile)]  # where the back end reports it
     row = {
         "outcome": DONE, "status_claimed": solution.claimed, "status_verified": str(solution.status),
         "reason": solution.reason, "reached": str(solution.status) in SUCCESS, "proved": solution.proof,
@@ -178,8 +179,8 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
         "program_class": program.kind, "unknowns": program.size, "n_programs": len(steps),
         "objective": solution.objective, "scale": solution.scale, "bound": bound.value if bound else None,
         "gap": solution.gap, "iterations": sum(counts) if min(counts, default=-1) >= 0 else None,
-        "build_s": solution.times.build, "compile_s": sum(told) if told else None,
-        "solve_s": sum(t.solve for t in times) - sum(told), "judge_s": sum(t.judge for t in times),
+        "build_s": solution.times.build, "compile_s": sum(compiled) if compiled else None,
+        "solve_s": sum(t.solve for t in times) - sum(compiled), "judge_s": sum(t.judge for t in times),
         "prove_s": sum(t.prove for t in times), "fit_s": fitted.seconds,
     }
     if residuals is not None:
@@ -188,10 +189,10 @@ def _verdict(fitted: Fit) -> dict[str, Any]:
 
 
 def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: float) -> dict[str, Any]:
-    """Solve once more from the solution; the programme and what was compiled of it are at hand.
+    """Solve again from the solution, with the compiled programme.
 
-    The row of the cold solve stands whatever becomes of this: where it kills the process, the parent has that row. The
-    limit is that of the cold solve; with another number some back ends would compile again.
+    The row of the cold solve is valid whatever happens here: if the process dies, the parent has that row. The limit is
+    that of the cold solve; with another one some back ends would compile again.
     """
     left = cell.time_limit - (time.perf_counter() - given)
     if left < fitted.solution.times.solve:
@@ -210,7 +211,7 @@ def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: flo
 
 
 def _figures(model: Any, record: Record, remarks: list[str | None]) -> dict[str, Any]:
-    """The figures of a model; one that cannot be had is left out, with a remark where that is a failure."""
+    """Return the figures of a model; one that fails is left out, with a remark."""
     from optid.identify.validation import fit_percent
     from optid.identify.validation.predictions import one_step, simulated
 
@@ -252,9 +253,9 @@ def _parameters(model: Any) -> Mapping[str, Any]:
 
 
 def _finiteness(fitted: Fit, row: Mapping[str, Any]) -> dict[str, Any]:
-    """The outcome of a fit whose point, objective or model holds numbers that are not finite; else nothing.
+    """Return the outcome of a fit whose point, objective or model has numbers that are not finite, else nothing.
 
-    A procedure that has a model although a step on its way was not finite is judged by that model.
+    A procedure with a model is judged by that model, also where an earlier step was not finite.
     """
     solution, wrong = fitted.solution, []
     if solution.has_point and not np.isfinite(solution.objective):

@@ -1,7 +1,7 @@
-"""Run cells on a Dask cluster: the same function in the same kind of worker process, one per thread of a Dask worker.
+"""Run cells on a Dask cluster, in the same worker processes as on one machine, one per thread of a Dask worker.
 
-A cell runs in a local worker process next to the Dask worker, so that its limits hold and its crash is a row, as on one
-machine. When a Dask worker dies, Dask gives its cells to another one; a row is handed out once whatever happens.
+The limits of a cell hold and its crash is a row as on one machine. If a Dask worker dies, Dask gives its cells to
+another one; every row is yielded once.
 """
 
 import json
@@ -23,11 +23,11 @@ from optid.studies.execution.cell import lost_row, run_cell
 from optid.studies.grid import Cell, content_hash, determining
 from optid.studies.storage.rows import CRASHED, ERROR
 
-TICK = 1.0  # seconds between looks at the cluster while no cell ends
-AHEAD = 2  # cells that are under way per thread of the cluster: one runs, one is there when it ends
-DESERTED = 300.0  # seconds without any worker until that is an error; batch systems replace workers within minutes
-AGAIN = 5.0  # seconds to fetch a row; it is gone when its worker died just after the cell, and then the cell runs again
-TURNS = 3  # times a cell is given to the cluster, which gives up each time when some of its workers have died over it
+TICK = 1.0  # seconds between checks of the cluster
+AHEAD = 2  # cells submitted per thread of the cluster: one runs, one waits
+DESERTED = 300.0  # seconds without workers until that is an error; batch systems replace workers within minutes
+AGAIN = 5.0  # seconds to fetch a row; it is lost if its worker died just after the cell, which then runs again
+TURNS = 3  # times a cell is submitted; each time the cluster gives it up when several of its workers have died
 SHIPPED = 1 << 30  # bytes of data files that are sent to a worker that does not have them
 
 Row = dict[str, Any]
@@ -37,13 +37,13 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
             scheduler: Any) -> Iterator[Row]:
     """Run every cell on the cluster of a scheduler and yield its row, as `workers.execute`.
 
-    Data files are read where they are when a worker sees the same content under the same path; else they are sent to it
-    once. The scheduler is given as for `optid.data.clusters.connected`.
+    Data files are read in place where a worker has the same content under the same path, else they are sent to it once.
+    The scheduler is given as for `optid.data.clusters.connected`.
 
     Raises:
-        ClusterError: no scheduler, no worker, workers with other versions (also those that join later), or a scheduler
-            that goes away.
-        StudyError: a function that has no name to import, or worker processes that do not start on some machine.
+        ClusterError: no scheduler, no worker, workers with other versions (also those that join later), or a lost
+            scheduler.
+        StudyError: a function that cannot be imported by name, or worker processes that do not start.
     """
     todo = deque(cells)
     try:
@@ -58,12 +58,6 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
             flight.end()
 
 
-def check(cells: Iterable[Cell], scheduler: Any) -> None:
-    """Raise ClusterError, as `execute`, for a cluster that cannot run the cells."""
-    with connected(scheduler, packages(cells)):
-        pass
-
-
 def packages(cells: Iterable[Cell]) -> list[str]:
     """Return the distributions that determine the results of the cells."""
     found = (name for cell in cells for name in _versions(cell) if not name.startswith("source of "))
@@ -75,7 +69,7 @@ def _versions(cell: Cell) -> dict[str, str]:
 
 
 class _Flight:
-    """The cells that are under way on a cluster."""
+    """The submitted cells of a cluster."""
 
     def __init__(self, client: Any, function: bytes) -> None:
         self._client, self._function = client, function
@@ -103,7 +97,7 @@ class _Flight:
             self._look()
 
     def end(self) -> None:
-        """Forget what is under way, and end the worker processes of this study."""
+        """Cancel the submitted cells and end the worker processes of this study."""
         with suppress(Exception):  # the cluster may be gone
             if self._client.status == "running":
                 self._client.cancel(list(self._cells), force=True)
@@ -123,7 +117,7 @@ class _Flight:
         future.add_done_callback(self._landed.put)
 
     def _taken(self, future: Any) -> Row | None:
-        """The row of a cell that has ended; None where it is sent, or runs, once more."""
+        """Return the row of a completed cell; None where it is sent or runs again."""
         from distributed import KilledWorker
 
         cell = self._cells[future]
@@ -150,8 +144,8 @@ class _Flight:
                 raise ClusterError(f"the scheduler went away or gave the study up ({type(error).__name__}).") from error
             if not isinstance(error, Exception):
                 raise
-            if future.status != "error":  # the cell ended; that its row did not come says nothing of it
-                raise ClusterError(f"a row did not come back ({type(error).__name__}: {error}). Rows so far are kept; "
+            if future.status != "error":  # the cell ended, but its row was lost
+                raise ClusterError(f"a row was not received ({type(error).__name__}: {error}). Rows so far are kept; "
                                    "run the study again.") from error
             answer = lost_row(cell, ERROR, f"the Dask worker could not run it: {type(error).__name__}: {error}")
         self._forget(future)
@@ -184,7 +178,6 @@ class _Flight:
         return None
 
     def _look(self) -> None:
-        """See how many threads there are now, and whether there is a cluster at all."""
         now = monotonic()
         if now - self._looked < TICK:
             return

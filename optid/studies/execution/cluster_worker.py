@@ -1,4 +1,4 @@
-"""What a Dask worker does for a study: keep local worker processes, one per thread, and give them cells and data."""
+"""The part of a study on a Dask worker: local worker processes, one per thread, and their data files."""
 
 import pickle
 import platform
@@ -31,13 +31,10 @@ _studies: dict[str, _Hands] = {}
 
 
 def run(study: str, function: bytes, packed: bytes, contents: Sequence[bytes] | None) -> dict[str, Any] | None:
-    """Run a pickled cell in a local worker process, kept for a run of a study, and return its row.
+    """Run a pickled cell in a local worker process, which is kept for the run of a study, and return its row.
 
-    The function makes a row of a cell, pickled; the contents are what is in the cell's data files, or None. None is
-    returned when this machine does not have the content of the data files.
-
-    Raises:
-        StudyError: worker processes do not start.
+    `function` makes the row of a cell, pickled; `contents` are those of the cell's data files, or None. It returns None
+    if this machine lacks the data files; `StudyError` if worker processes do not start.
     """
     cell: Cell = pickle.loads(packed)
     here = _with_files(cell, contents)
@@ -54,7 +51,7 @@ def run(study: str, function: bytes, packed: bytes, contents: Sequence[bytes] | 
 
 
 def end(study: str) -> None:
-    """End the worker processes of a run of a study, also in the middle of a cell, and all that other runs left idle."""
+    """End the worker processes of a run, also while they run a cell, and all idle ones of other runs."""
     with _lock:
         hands = _studies.setdefault(study, _Hands())
         hands.ended = True
@@ -69,7 +66,7 @@ def end(study: str) -> None:
 
 @contextmanager
 def _pool(study: str, function: bytes) -> Iterator[Pool]:
-    """A pool of a study that nobody else uses."""
+    """Give a pool of a study for exclusive use."""
     with _lock:
         hands = _studies.setdefault(study, _Hands())
         if hands.ended:
@@ -88,7 +85,7 @@ def _pool(study: str, function: bytes) -> Iterator[Pool]:
 
 
 def _with_files(cell: Cell, contents: Sequence[bytes] | None) -> Cell | None:
-    """The cell with data files that are here and have its content, or None where there are none."""
+    """Return the cell with data files on this machine, None if there are none with its content."""
     entry = cell.data_source
     if not entry.files or _content(entry.files) == cell.data_hash:
         return cell
@@ -105,7 +102,7 @@ def _with_files(cell: Cell, contents: Sequence[bytes] | None) -> Cell | None:
 
 
 def _folder() -> Path:
-    """Folder for data files that were sent here; it goes with the Dask worker."""
+    """Return the folder for received data files, which is removed with the Dask worker."""
     from distributed import get_worker
 
     folder = Path(get_worker().local_directory) / "optid-data"

@@ -1,4 +1,4 @@
-"""The machine a cell runs on, in words, and the resident memory of this process."""
+"""The description of this machine, and the resident memory of this process."""
 
 import os
 import platform
@@ -14,17 +14,14 @@ _STATUS, _CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 @cache
 def machine() -> str:
     """Return name, processor, cores, system and Python of this machine in one line."""
-    return (f"{platform.node()}, {_processor()}, {os.cpu_count()} cores, {platform.system()} {platform.release()}, "
-            f"Python {platform.python_version()}")
-
-
-def _processor() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         lines = []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor() or platform.machine()
+    processor = names[0] if names else platform.processor() or platform.machine()
+    return (f"{platform.node()}, {processor}, {os.cpu_count()} cores, {platform.system()} {platform.release()}, "
+            f"Python {platform.python_version()}")
 
 
 def resident_mb() -> float:
@@ -37,8 +34,8 @@ def resident_mb() -> float:
 class Peak:
     """Largest resident memory of this process since the object was made.
 
-    Linux keeps the figure and lets a process reset it. Where it does not, it is the largest of the whole life of the
-    process where that grew meanwhile, and the larger of start and end where it did not.
+    Linux lets a process reset the figure. Elsewhere it is the largest of the whole life of the process if that has
+    grown, else the larger of start and end.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Run a study into its database: what has a row already is not run again, and what is finished is never lost."""
+"""Run a study into its database: cells with a row are not run again, and finished rows are never lost."""
 
 import tempfile
 from collections import Counter
@@ -18,7 +18,7 @@ from optid.studies.storage.store import LABELS, Store
 
 Row = dict[str, Any]
 Executor = Callable[[Sequence[Cell]], Iterator[Row]]
-"""Takes cells and yields one row for each, in any order; closing the generator ends whatever it started."""
+"""Yields one row for each cell, in any order; closing the generator ends all that it started."""
 Progress = Callable[[int, int, Row | None], None]
 
 
@@ -60,12 +60,12 @@ def run(study: Study, db: str | Path, *, workers: int | None = None, scheduler: 
 
 def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, retry: str | Sequence[str] = ()
          ) -> tuple[list[Cell], list[Cell], str]:
-    """Return what a run would do, without changing the database, which need not be there.
+    """Return what a run would do, without changing the database, which need not exist.
 
     Arguments and errors are those of `run`.
 
     Returns:
-        All cells, those that a run would run, and which rows it would set aside, in words.
+        All cells, those that a run would run, and a text on the rows that it would set aside.
     """
     retry, grid = _checked(retry), cells(study)
     if not Path(db).exists():
@@ -76,7 +76,7 @@ def plan(study: Study, db: str | Path, *, accept_changed_data: bool = False, ret
 
 
 def told_former(store: Store, study: Study) -> str:
-    """Return in words which rows of a study are set aside, and why; empty where none is."""
+    """Return a text on the superseded rows of a study and the reasons; empty if there are none."""
     axes = {"data": study.data, "formulation": study.formulations, "solver": study.solvers}
     known_labels = [{entry.name for entry in entries} for entries in axes.values()]
     counts: Counter[str] = Counter()
@@ -101,7 +101,7 @@ def _checked(retry: str | Sequence[str]) -> Sequence[str]:
 
 def _prepared(store: Store, study: Study, grid: list[Cell], accept_changed_data: bool, retry: Sequence[str]
               ) -> list[Cell]:
-    """Make the rows of a database those of the grid, and return the cells that have none."""
+    """Make the rows of a database those of the grid, and return the cells without a row."""
     if not accept_changed_data:
         check_unchanged(grid, store.data_hashes())
     store.keep(study.name, [cell.identity for cell in grid])
@@ -113,10 +113,7 @@ def _prepared(store: Store, study: Study, grid: list[Cell], accept_changed_data:
 
 
 def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) -> Any:
-    """Run a study and return its rows as a pandas frame, or as a list of dictionaries where pandas is not installed.
-
-    Without a database its rows are kept in one that is thrown away; the settings are those of `run`.
-    """
+    """Run a study, by default in a temporary database; return a pandas frame, or dicts where pandas is missing."""
     with tempfile.TemporaryDirectory() as folder:
         rows = run(study, db or Path(folder) / "study.sqlite", **settings)
     try:
@@ -133,11 +130,12 @@ def run_to_frame(study: Study, db: str | Path | None = None, **settings: Any) ->
 
 def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Executor:
     if workers is not None and scheduler is not None:
-        raise StudyError("workers are processes of this machine; a cluster has its own. Leave workers or scheduler out")
+        raise StudyError("workers are processes of this machine, a cluster has its own: leave workers or scheduler out")
     if scheduler is not None:
         from optid.studies.execution import cluster
 
-        cluster.check(grid, scheduler)
+        with cluster.connected(scheduler, cluster.packages(grid)):  # refused before the database is made
+            pass
         return lambda todo: cluster.execute(todo, scheduler=scheduler)
     from optid.studies.execution import workers as processes
 
@@ -146,7 +144,6 @@ def _executor(grid: Sequence[Cell], workers: int | None, scheduler: Any) -> Exec
 
 
 def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progress: Progress | None) -> None:
-    """Run cells and write their rows as they come, until all are there or something stops it."""
     done = total - len(todo)
     if progress is not None:
         progress(done, total, None)
@@ -160,17 +157,17 @@ def _work(todo: list[Cell], total: int, execute: Executor, store: Store, progres
                 store.append([row])
             except DatabaseError as error:
                 raise DatabaseError(f"{error}. {done:,} of {total:,} cells are kept. Where the disk is full, free "
-                                    "space; the same run goes on from there") from error
+                                    "space; the same run resumes from there") from error
             expected.remove(identity)
             done += 1
             if progress is not None:
                 progress(done, total, row)
     if expected:
-        raise StudyError(f"{len(expected)} cells of {total} came back without a row; run the study again")
+        raise StudyError(f"{len(expected)} cells of {total} returned no row; run the study again")
 
 
 def _all_rows(todo: Sequence[Cell], execute: Executor) -> Generator[Row, None, None]:
-    """Rows of the cells that nobody needs to run, then those of the others."""
+    """Yield the rows of refused cells, then those of the others."""
     yield from (lost_row(cell, REFUSED, cell.refusal) for cell in todo if cell.refusal)
     yield from execute([cell for cell in todo if not cell.refusal])
 
@@ -183,10 +180,7 @@ def _description(study: Study) -> str:
 
 
 def _relabelled(store: Store, grid: Iterable[Cell], retry: Sequence[str]) -> list[Row]:
-    """Rows for cells that were run under other labels or for another study: what determines them is the same.
-
-    Those with an outcome that is to be run again are left out.
-    """
+    """Return rows of cells that were run under other labels or in another study, except outcomes to be retried."""
     there, wanted = store.labels(), {}
     any_study = {identity[1:] for identity in there}
     for cell in grid:

@@ -1,9 +1,9 @@
-"""What a worker process does beside running cells.
+"""The code of a worker process.
 
-The processes are pebble's: it gives them cells, ends those beyond their time, and replaces those that die. Loky has no
-time limit for a task, and one crash breaks all of an executor. What neither does is here: a limit of memory for each
-cell, the last words of a process that crashed, a row that stands where the rest of its cell comes to no end, and the
-end of a process, its children included, together with its parent.
+pebble manages the processes: it gives them cells, ends those beyond their time limit and replaces those that die (loky
+has no time limit for a task, and one crash breaks its executor). Added here are a memory limit for each cell, the last
+error message of a crashed process, a row kept before the second solve of a cell, and the end of a process and its
+children together with its parent.
 """
 
 import ctypes
@@ -22,9 +22,9 @@ from optid.processes import limit_memory
 from optid.studies.execution.machine import MB, resident_mb
 from optid.studies.storage.rows import ERROR, MEMORY_LIMIT
 
-RETIRED = 77  # exit code of a worker that holds so much memory of earlier cells that another one takes its cell
+RETIRED = 77  # exit code of a worker that holds too much memory of earlier cells; another one takes its cell
 KEPT, KEPT_MB = 0.5, 150.0  # share of the limit, and MB, that a worker may hold of earlier cells
-TOLD, LONGEST = 100_000, 300  # bytes of the words of a worker that are looked at, and characters of them in a reason
+TOLD, LONGEST = 100_000, 300  # bytes of the standard error that are searched, characters of it in a reason
 
 _function: Callable[[Any], Mapping[str, Any]]
 _folder: Path | None = None
@@ -33,16 +33,17 @@ _fresh_mb = 0.0
 
 
 def start(folder: str, packed: bytes, parent: int) -> None:
-    """Prepare a new process of a parent; its words and notes go to the folder.
+    """Prepare a new process of a parent; `packed` are the pickled function of a cell and its preparation, or None.
 
-    Packed is what makes a row of a cell, and what prepares for it (or None), pickled.
+    The folder takes the standard error as PROCESS.words, by the token of a cell a file with the process id, as old as
+    the run of the cell, and as TOKEN.row the row that `keep` was given.
     """
     global _function, _folder, _fresh_mb
     _folder = Path(folder)
     os.setsid()  # a kill of its group takes its children along, and Ctrl-C in the terminal does not reach it
     _die_with(parent)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)  # ends a solver that never returns from its own code, too
-    with open(words(_folder, os.getpid()), "wb") as file, open(os.devnull, "wb") as null:
+    with open(_folder / f"{os.getpid()}.words", "wb") as file, open(os.devnull, "wb") as null:
         os.dup2(file.fileno(), 2)
         os.dup2(null.fileno(), 1)
     faulthandler.enable()  # a segmentation fault then says where
@@ -54,10 +55,10 @@ def start(folder: str, packed: bytes, parent: int) -> None:
 
 
 def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] | None, str, str]:
-    """Run a pickled cell, which the token names in the notes, within so many MB.
+    """Run the pickled cell of a token within so many MB.
 
     Returns:
-        The row; or None, an outcome and a reason where the function itself raised something.
+        The row; or None, an outcome and a reason if the function raised an exception.
     """
     global _kept
     held = resident_mb()
@@ -66,8 +67,8 @@ def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] 
     if _folder is not None:
         os.ftruncate(2, 0)
         os.lseek(2, 0, os.SEEK_SET)
-        note(_folder, token).write_text(str(os.getpid()))
-        _kept = kept(_folder, token)
+        (_folder / token).write_text(str(os.getpid()))
+        _kept = _folder / f"{token}.row"
     before = resource.getrlimit(resource.RLIMIT_AS)
     try:
         limit_memory(int((memory_limit - held) * MB))  # what is reserved and not used is free
@@ -81,31 +82,13 @@ def run(token: str, packed: bytes, memory_limit: float) -> tuple[dict[str, Any] 
 
 
 def keep(row: Mapping[str, Any]) -> None:
-    """Keep the whole row of the cell under way, which stands where the rest of that cell comes to no end.
-
-    Outside of a worker nothing is done.
-    """
+    """Keep the row of the current cell, valid if the rest of the cell fails; does nothing outside a worker."""
     if _kept is not None:
         _kept.write_text(json.dumps(dict(row)))
 
 
-def note(folder: Path, token: str) -> Path:
-    """Return the file that holds the process id of the worker that has a cell; it is as old as the run of the cell."""
-    return folder / token
-
-
-def kept(folder: Path, token: str) -> Path:
-    """Return the file of the row that was kept for a cell."""
-    return folder / f"{token}.row"
-
-
-def words(folder: Path, process: int) -> Path:
-    """Return the file of the standard error of a worker."""
-    return folder / f"{process}.words"
-
-
 def last_words(path: Path) -> str:
-    """Return where Python says that a process crashed, or the last line that it wrote; empty where there is none."""
+    """Return where Python reports a crash, else the last line written; empty if there is none."""
     try:
         with path.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - TOLD))
@@ -121,7 +104,7 @@ def last_words(path: Path) -> str:
 
 
 def _die_with(parent: int) -> None:
-    """Let the system kill this process when its parent ends, even in the middle of a solver's loop."""
+    """Let the system kill this process when its parent ends, even inside a solver."""
     if sys.platform == "linux":
         die = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
         ctypes.CDLL(None).prctl(die, signal.SIGKILL)

@@ -1,6 +1,6 @@
-"""Run cells in worker processes, one per core: reused over cells, replaced when a cell does not behave.
+"""Run cells in worker processes, one per core: reused for several cells, replaced after a crash or a timeout.
 
-pebble keeps the processes; `worker` says what it does not do. Whatever happens to a worker, its cell becomes a row.
+pebble manages the processes, `worker` has the rest. Whatever happens to a worker, its cell becomes a row.
 """
 
 import json
@@ -26,13 +26,13 @@ from optid.errors import StudyError
 from optid.processes import death
 from optid.solving.isolated import GRACE
 from optid.studies.execution.cell import lost_row, prepare, run_cell, without_warm
-from optid.studies.execution.worker import RETIRED, kept, last_words, note, run, start, words
+from optid.studies.execution.worker import RETIRED, last_words, run, start
 from optid.studies.grid import Cell
 from optid.studies.storage.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
 
-TICK = 0.2  # seconds between looks at the words of the workers
-TALK = 10_000_000  # bytes of them that are kept on the disk
-STILLBORN = 3  # pools whose workers end before they are ready, one after another, until that is an error
+TICK = 0.2  # seconds between checks of the standard error of the workers
+TALK = 10_000_000  # bytes of it that are kept on the disk
+STILLBORN = 3  # successive pools whose workers end before they are ready, until that is an error
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 Row = dict[str, Any]
@@ -40,17 +40,17 @@ Row = dict[str, Any]
 
 def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]] = run_cell, *,
             workers: int | None = None) -> Iterator[Row]:
-    """Run every cell in a worker and yield its row, in the order in which they end.
+    """Run every cell in a worker and yield its row, in the order of completion.
 
     Closing the generator, or an exception in it such as KeyboardInterrupt, ends all workers at once.
 
     Args:
-        cells: what to run; their own limits hold.
-        function: what makes a row of a cell; workers import it by its name.
-        workers: number of processes; one per core when not given.
+        cells: what to run, within their own limits.
+        function: makes a row of a cell; workers import it by its name.
+        workers: number of processes; by default one per core.
 
     Raises:
-        StudyError: no positive number, or workers that do not start (with their last words); as for `Pool`.
+        StudyError: no positive number, workers that do not start (with their error message), or as of `Pool`.
     """
     todo = deque(cells)
     pool = Pool(function, min(available_cores(workers, "workers", StudyError), max(len(todo), 1)))
@@ -61,10 +61,9 @@ def execute(cells: Iterable[Cell], function: Callable[[Cell], Mapping[str, Any]]
 
 
 class Pool:
-    """Worker processes for a function of cells; they are kept over several calls of `run`, one at a time.
+    """Worker processes for a function of cells, kept for several calls of `run`, one at a time.
 
-    Raises:
-        StudyError: pebble is missing (with the pip line), or a function that has no name to import.
+    `StudyError` if pebble is missing, or for a function that cannot be imported by name.
     """
 
     def __init__(self, function: Callable[..., Any], size: int) -> None:
@@ -73,7 +72,7 @@ class Pool:
         except ModuleNotFoundError as error:
             if error.name != "pebble":
                 raise
-            raise StudyError("the processes of a study are kept by pebble: pip install 'optid[study]'") from None
+            raise StudyError("worker processes of a study need pebble: pip install 'optid[study]'") from None
         try:
             self._function = pickle.dumps((function, prepare if function is run_cell else None))
         except Exception as error:
@@ -108,7 +107,7 @@ class Pool:
                         os.truncate(path, 0)
 
     def kill(self) -> None:
-        """End all workers from another thread; `run` ends with the rows there are, and `close` is still to come."""
+        """End all workers, from another thread; `run` ends with the rows so far, `close` must follow."""
         self._killed = True
         self._end_workers()
 
@@ -132,10 +131,10 @@ class Pool:
             return future
 
     def _row(self, cell: Cell, token: str, future: "Future[Any]") -> Row | None:
-        """The row of a cell that has ended; None where it is to be given to another worker."""
+        """Return the row of a completed cell; None if another worker must run it."""
         begun = None  # process that has, or had, the cell, and when it began
         with suppress(OSError, ValueError):
-            path = note(self._folder, token)
+            path = self._folder / token
             begun = int(path.read_text()), path.stat().st_mtime
         try:
             row, outcome, reason = future.result()
@@ -155,7 +154,7 @@ class Pool:
             elif code == RETIRED or begun is None:
                 return None
             else:
-                said = last_words(words(self._folder, begun[0]))
+                said = last_words(self._folder / f"{begun[0]}.words")
                 how = ", ".join(filter(None, [death(code), said]))
                 fate = CRASHED, f"the worker died: {how}"
                 if "bad_alloc" in said or "memory allocation" in said or "MemoryError" in said:
@@ -163,21 +162,21 @@ class Pool:
                 found = self._lost(cell, token, begun, *fate)
         if begun is not None and future.exception() is not None:
             _kill_group(begun[0])
-            words(self._folder, begun[0]).unlink(missing_ok=True)
-        for path in (note(self._folder, token), kept(self._folder, token)):
-            path.unlink(missing_ok=True)
+            (self._folder / f"{begun[0]}.words").unlink(missing_ok=True)
+        for name in (token, f"{token}.row"):
+            (self._folder / name).unlink(missing_ok=True)
         return found
 
     def _lost(self, cell: Cell, token: str, begun: tuple[int, float] | None, outcome: str, reason: str) -> Row:
-        """The row of a cell whose worker did not make one: the one that was kept, where there is one."""
+        """Return the row that was kept for a cell, else one with the outcome and the reason."""
         with suppress(OSError, ValueError):
-            return without_warm(complete(json.loads(kept(self._folder, token).read_text())), reason)
+            return without_warm(complete(json.loads((self._folder / f"{token}.row").read_text())), reason)
         times: dict[str, Any] = {} if begun is None else {"started": datetime.fromtimestamp(begun[1], UTC),
                                                           "total_s": time.time() - begun[1]}
         return lost_row(cell, outcome, reason, **times)
 
     def _renew(self) -> None:
-        """Replace a pool that is broken; pebble breaks one when a worker ends that has no cell."""
+        """Replace a broken pool; pebble breaks one when a worker without a cell ends."""
         if self._pool is None or self._pool.active:
             return  # replaced by another cell of the same pool
         self._pool.stop()
@@ -186,11 +185,11 @@ class Pool:
         self._failed += 1
         if self._failed >= STILLBORN:
             files = sorted(self._folder.glob("*.words"), key=lambda path: path.stat().st_mtime)
-            said = next(filter(None, (last_words(path) for path in reversed(files))), "they do not say why")
-            raise StudyError(f"workers ended before they could work, {STILLBORN} times in a row: {said}")
+            said = next(filter(None, (last_words(path) for path in reversed(files))), "no error message")
+            raise StudyError(f"workers ended before they were ready, {STILLBORN} times in a row: {said}")
 
     def _end_workers(self) -> None:
-        """Kill every worker with its children; pebble itself waits seconds for one that does not listen."""
+        """Kill all workers with their children; pebble itself waits seconds for those that do not respond."""
         if self._pool is not None:
             self._pool.stop()  # else it replaces them
         for path in self._folder.glob("*.words"):
@@ -198,19 +197,18 @@ class Pool:
 
 
 def _kill_group(process: int) -> None:
-    """Kill a worker with its children, which are of its group."""
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(process, signal.SIGKILL)
 
 
 def _checked(cell: Cell, content: Mapping[str, Any]) -> Row:
-    """The row a function returned, or one that says why it is none."""
+    """Return the row that a function returned, or one with the reason why it is invalid."""
     try:
         row = complete(content)
         if (row["key"], row["repetition"]) != (cell.key, cell.repetition):
             raise ValueError(f"it is of another cell, {row['key'][:12]} {row['repetition']}")
     except ValueError as error:
-        return lost_row(cell, ERROR, f"what the function returned is no row: {error}")
+        return lost_row(cell, ERROR, f"the function did not return a row: {error}")
     return row
 
 
@@ -225,9 +223,9 @@ def _without_main(name: str) -> dict[str, Any]:
 
 
 class _Process(SpawnProcess):
-    """A fresh interpreter with one thread for linear algebra, that imports nothing of the caller's main module.
+    """A fresh interpreter with one thread for linear algebra, which imports nothing of the caller's main module.
 
-    A daemon may start it, such as a Dask worker: it ends with its parent by itself.
+    A daemon may start it, such as a Dask worker: it ends with its parent.
     """
 
     def start(self) -> None:

@@ -1,4 +1,4 @@
-"""The record of a cell: read, or simulated, with what the fit does not see kept apart."""
+"""The record of a cell, read or simulated, with its hold-out samples."""
 
 from dataclasses import dataclass
 
@@ -11,26 +11,23 @@ from optid.studies.grid import Cell
 from optid.studies.sources.systems import simulate
 from optid.studies.sources.truth import Truth
 
-ANOTHER = 2**31  # added to the seed of a simulated record for the hold-out, which is a record of its own
+ANOTHER = 2**31  # added to the seed of a simulated record for the hold-out record
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What a cell works on."""
+    """The record of a cell."""
 
     data: Data  # what the fit sees
-    holdout: Data | None  # what it is judged on; None where nothing is held out
+    holdout: Data | None  # for validation; None where nothing is held out
     truth: Truth | None  # the system behind a simulated record; None for a file
 
 
 def load(cell: Cell) -> Record:
     """Read or simulate the record of a cell.
 
-    A file is cut: its last samples, of every experiment, are held out. A simulated record keeps the samples asked for,
-    and a second one with another seed is held out, as long as the share of the whole demands.
-
-    Raises:
-        DataError: what `optid.read` refuses.
+    Of a file the last samples of every experiment are held out. A simulated record keeps its length, and a second one
+    with another seed is held out, of the length that gives the share. `DataError` as of `optid.read`.
     """
     entry = cell.data_source
     if entry.system is None:
@@ -46,11 +43,7 @@ def load(cell: Cell) -> Record:
 
 
 def read_entry(entry: DataEntry) -> Data:
-    """Return the record of an entry that is not simulated.
-
-    Raises:
-        DataError: what `optid.read` refuses.
-    """
+    """Return the record of an entry that is not simulated; `DataError` as of `optid.read`."""
     if entry.record is not None:
         return entry.record
     from optid.data.readers import read

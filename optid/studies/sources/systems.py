@@ -29,23 +29,19 @@ class System:
 
 
 def system(name: str) -> System:
-    """Return a system by name.
-
-    Raises:
-        LookupFailed: no such system; the message has the nearest.
-    """
+    """Return a system by name (`LookupFailed` with the nearest name)."""
     if name not in SYSTEMS:
         raise LookupFailed(f"no system is called {name!r}. {nearest(name, SYSTEMS)}")
     return SYSTEMS[name]
 
 
 def simulate(name: str, samples: int | None = None, noise: float | None = None, seed: int = 0) -> tuple[Data, Truth]:
-    """Simulate a system.
+    """Simulate a system: its record and its truth.
 
     Args:
         name: of the system.
-        samples: length of the record; the system's own when not given.
-        noise: standard deviation of the noise relative to that of the noise-free output; likewise.
+        samples: length of the record; by default that of the system.
+        noise: standard deviation relative to that of the noise-free output; by default that of the system.
         seed: of input and noise.
 
     Raises:
@@ -102,22 +98,6 @@ def _dead_zone_in_span(u: np.ndarray) -> np.ndarray:
     return np.interp(u, _NODES, _AT_NODES)
 
 
-def _saturation(u: np.ndarray) -> np.ndarray:
-    return np.tanh(1.5 * u)
-
-
-def _identity(u: np.ndarray) -> np.ndarray:
-    return u
-
-
-def _cubic(u: np.ndarray) -> np.ndarray:
-    return u + 0.5 * u**2 + 0.25 * u**3
-
-
-def _with_sign(u: np.ndarray) -> np.ndarray:
-    return u + 0.5 * u * np.abs(u)
-
-
 _A, _B = np.array([-1.5, 0.7]), np.array([0.8, 0.6])
 _IN_SPAN_POWER = float(np.var(_dead_zone_in_span(np.linspace(-1.0, 1.0, 20001))) * np.sum(_impulse(_B, _A) ** 2))
 _DING_A, _DING_B, _DING_D = np.array([-1.60, 0.80]), np.array([0.0, 0.85, 0.65]), np.array([1.0, -0.64])
@@ -130,7 +110,7 @@ _DING_NOISE = 0.5 * float(np.sqrt(np.sum(_impulse(_DING_D, _DING_A) ** 2) / _DIN
 
 
 def _fed_back(plant: FeedbackSystem, bound: float, samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
-    """White uniform inputs within the bound; the noise relative to the root mean square of the outputs' deviations."""
+    """Simulate with white uniform inputs within the bound, and noise relative to the RMS deviation of the outputs."""
     u = np.random.default_rng([seed, 1]).uniform(-bound, bound, (samples, 2))
     size = float(np.sqrt(np.mean(np.var(plant.record(u).y, axis=0))))
     data = plant.record(u, seed, measurement=noise * size)
@@ -145,7 +125,7 @@ def _van_der_pol(samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
     u = np.random.default_rng([seed, 1]).uniform(-2.0, 2.0, samples)
     size = noise * float(np.std(plants.van_der_pol(u).y))
     data = plants.van_der_pol(u, seed, process=size / 4, measurement=size)
-    return data, Truth((_with_sign,), ((-2.0, 2.0),))
+    return data, Truth((lambda u: u + 0.5 * u * np.abs(u),), ((-2.0, 2.0),))
 
 
 def _pendulum(samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
@@ -179,15 +159,16 @@ SYSTEMS: dict[str, System] = {
         {"na": 2, "nb": 2, "basis": "triangular:8", "nx": 2}),
     "linear": System(
         "second-order dynamics without a nonlinearity, white noise on the output",
-        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], _identity), {"na": 2, "nb": 2, "nx": 2}),
+        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], lambda u: u), {"na": 2, "nb": 2, "nx": 2}),
     "saturation": System(
         "f(u) = tanh(1.5 u) before second-order dynamics, white noise on the output",
-        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], _saturation),
+        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], lambda u: np.tanh(1.5 * u)),
         {"na": 2, "nb": 2, "basis": "polynomial:5", "nx": 2}),
     "ding_chen": System(
         "the Hammerstein ARMAX example of Ding and Chen (Automatica 41, 2005), a cubic and coloured noise",
         3000, _DING_NOISE,
-        partial(_equation, _DING_A, _DING_B, _DING_D, _cubic, most=2.0, dt=1.0, gaussian=True, power=_DING_POWER),
+        partial(_equation, _DING_A, _DING_B, _DING_D, lambda u: u + 0.5 * u**2 + 0.25 * u**3, most=2.0, dt=1.0,
+                gaussian=True, power=_DING_POWER),
         {"na": 2, "nb": 2, "nk": 1, "nc": 1, "basis": "polynomial:3", "nx": 2}),
     "vanderpol": System(
         "a driven Van der Pol oscillator: its cubic damping is nonlinear feedback (optid.plants)",

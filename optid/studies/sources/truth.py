@@ -1,7 +1,7 @@
-"""How far a model is from the system that made the record, in a gauge that models of all classes share.
+"""Errors of a model against the true system of a simulated record, independent of the gauge of the model.
 
-Scale and offset of a nonlinearity cannot be told from the linear part and the constant of a model. So every f of the
-model is first brought to the true one by the best scale and offset; what then remains is the error of the
+Scale and offset of a nonlinearity are not identifiable separately from the linear part and the constant of a model.
+So every f of the model is first fitted to the true one by scale and offset; the residual is the error of the
 nonlinearity. The linear part is divided by the same scale and compared by its impulse response.
 """
 
@@ -36,8 +36,8 @@ class Truth:
     def parameter_error(self, model: Any) -> float:
         """Return the norm of the error of the impulse response over the norm of the true one.
 
-        NaN where either has nonlinear feedback, for a model with other channels or with several functions of one
-        input, and infinity where f of the model is not related to the true one at all.
+        NaN if either has nonlinear feedback, for a model with other channels or with several functions of one input;
+        infinite if f of the model is unrelated to the true one.
         """
         matched = self._matched(model)
         if matched is None or self.response is None or has_feedback(model):

@@ -1,4 +1,4 @@
-"""The row of a study: names, types, units and meaning of its columns; tables and documentation come from here."""
+"""The row of a study: names, types, units and meaning of its columns, from which tables and documentation are made."""
 
 import hashlib
 import json
@@ -19,14 +19,13 @@ DONE, TIME_LIMIT, MEMORY_LIMIT, CRASHED = "done", "time limit", "memory limit", 
 ERROR, REFUSED, NON_FINITE = "error", "refused", "non-finite"
 
 OUTCOMES = {
-    DONE: "the fit ran to its end and was judged; `status_verified` says with what result",
+    DONE: "the fit was completed and judged; the result is in `status_verified`",
     TIME_LIMIT: "the worker was killed because the cell took longer than its time limit",
-    MEMORY_LIMIT: "the worker held more memory than the limit, for which it was killed where that was seen in time, or "
-                  "the machine gave it no more",
-    CRASHED: "the worker died: segmentation fault, abort, kill by another hand",
+    MEMORY_LIMIT: "the worker exceeded its memory limit, or the machine had no more memory",
+    CRASHED: "the worker died: segmentation fault, abort, or killed from outside",
     ERROR: "the cell could not be run: unreadable record, wrong argument, an exception outside the solver",
     REFUSED: "the solver cannot take this formulation, or is not installed; nothing was run",
-    NON_FINITE: "the fit ended, but the solver's point, its objective or the model holds numbers that are not finite",
+    NON_FINITE: "the fit was completed, but the point, the objective or the model has numbers that are not finite",
 }
 """Every value of the column ``outcome`` and what it means."""
 
@@ -42,7 +41,7 @@ class Column:
     kind: str  # "text", "json" (text that parses), "number", "integer", "flag" or "time" (UTC, ISO 8601 in a row)
     meaning: str  # one sentence for people
     unit: str = ""  # of its numbers
-    always: bool = False  # whether every row has a value, whatever happened to the cell
+    always: bool = False  # whether every row has a value
 
     @property
     def sql(self) -> str:
@@ -69,10 +68,10 @@ COLUMNS: tuple[Column, ...] = (
     Column("formulation_name", "text", "registered name of the formulation", always=True),
     Column("options", "json", "arguments of the formulation", always=True),
     Column("constraints", "json", "named constraints, a list of texts", always=True),
-    Column("solver_name", "text", "word of the back end that was asked for, or auto", always=True),
+    Column("solver_name", "text", "requested back end, or auto", always=True),
     Column("solver_options", "json", "native options of the solver", always=True),
     Column("accuracy", "number", "requested relative accuracy", always=True),
-    Column("warm", "flag", "whether the cell was to be solved a second time from its own solution", always=True),
+    Column("warm", "flag", "whether a second solve from its own solution was requested", always=True),
     Column("holdout", "number", "share of the record that the fit did not see", always=True),
     Column("time_limit", "number", "longest time a cell may take", "s", always=True),
     Column("memory_limit", "number", "largest memory a cell may take", "MB", always=True),
@@ -83,14 +82,14 @@ COLUMNS: tuple[Column, ...] = (
     Column("n_outputs", "integer", "outputs of the record"),
     # how it ended
     Column("outcome", "text", "how the cell ended; see the table of outcomes", always=True),
-    Column("status_claimed", "text", "what the solver said, in its own word"),
+    Column("status_claimed", "text", "status as reported by the solver"),
     Column("status_verified", "text", "status after our own residuals have judged the claim; empty where nothing was "
                                       "judged"),
     Column("reason", "text", "one sentence where outcome or status needs one"),
     Column("reached", "flag", "whether the verified accuracy was reached: optimal or locally optimal", always=True),
     Column("proved", "flag", "whether global optimality is proved", always=True),
-    Column("false_claim", "flag", "whether the solver claimed a success or an infeasibility that our residuals "
-                                  "took back", always=True),
+    Column("false_claim", "flag", "whether the solver claimed a success or an infeasibility that the verified "
+                                  "residuals contradict", always=True),
     Column("solver_used", "text", "back end that ran, where auto chose it"),
     Column("program_class", "text", "class of the last programme: LP, QP, SOCP, SDP, conic or NLP"),
     Column("unknowns", "integer", "scalar variables of the last programme"),
@@ -105,12 +104,11 @@ COLUMNS: tuple[Column, ...] = (
     Column("complementarity", "number", "products of multipliers and slacks, relative to the objective"),
     Column("iterations", "integer", "iterations as counted by the solver, all programmes together"),
     # times and memory
-    Column("load_s", "number", "reading or simulating the record; near 0 where the worker had it from an earlier cell",
-           "s"),
-    Column("build_s", "number", "posing the problem: examination, statistics, programme", "s"),
+    Column("load_s", "number", "reading or simulating the record; near 0 if kept from an earlier cell", "s"),
+    Column("build_s", "number", "building the problem: checks, statistics, programme", "s"),
     Column("compile_s", "number", "translation of the programme for the solver, part of a cold solve; empty where the "
-                                  "back end does not tell it apart", "s"),
-    Column("solve_s", "number", "cold solve without the compilation that was told apart, all programmes together", "s"),
+                                  "back end does not report it", "s"),
+    Column("solve_s", "number", "cold solve without the reported compilation, all programmes together", "s"),
     Column("judge_s", "number", "measuring residuals at the point", "s"),
     Column("prove_s", "number", "the attempt to prove global optimality", "s"),
     Column("fit_s", "number", "the whole fit: build, compile, solve, judge, prove, prices", "s"),
@@ -118,7 +116,7 @@ COLUMNS: tuple[Column, ...] = (
            "s"),
     Column("warm_iterations", "integer", "iterations of the second solve"),
     Column("warm_status", "text", "verified status of the second solve"),
-    Column("total_s", "number", "the whole cell as the worker saw it, or until it was killed", "s"),
+    Column("total_s", "number", "the whole cell in the worker, or until it was killed", "s"),
     Column("peak_mb", "number", "largest resident memory of the worker during the cell", "MB"),
     Column("base_mb", "number", "resident memory of the worker before the cell", "MB"),
     # the model
@@ -144,24 +142,20 @@ BY_NAME: Mapping[str, Column] = {column.name: column for column in COLUMNS}
 LARGEST = 2**63  # what a whole number in the database is below
 LONGEST_LABEL = 80  # characters of the labels of data, formulations and solvers in a table
 REQUIRED = ("data", "formulation", "solver", "outcome", "status_verified", "objective", "solve_s")
-"""Columns without which rows say nothing."""
+"""Columns that rows must have."""
 
 _TYPES: Mapping[str, tuple[type, ...]] = {"text": (str,), "json": (str,), "number": (float, int), "integer": (int,),
                                           "flag": (bool,), "time": (str,)}
 
 
 def complete(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a whole row in the order of the columns; what is not given is empty (None), or False for a sure flag.
+    """Return a complete row in the order of the columns; missing values are None, or False for a flag in every row.
 
-    Numbers that are not finite become empty, so that one of them cannot poison a mean; whether that is an outcome of
-    its own is for the caller to say.
-
-    Args:
-        values: {column: value}; numpy scalars are taken as the numbers they are.
+    Numbers that are not finite become empty; numpy scalars become Python numbers.
 
     Raises:
-        ValueError: unknown column, value of another type, whole number that the database cannot hold, unknown outcome
-            or status, or no value where every row has one.
+        ValueError: unknown column, value of another type, integer beyond 64 bits, unknown outcome or status, or a
+            missing value where every row has one.
     """
     unknown = sorted(set(values) - set(NAMES))
     if unknown:
@@ -186,19 +180,19 @@ def _cell_value(column: Column, value: Any) -> Any:
         value = int(value)
     if value is None:
         if column.always:
-            raise ValueError(f"column {column.name!r} needs a value in every row")
+            raise ValueError(f"column {column.name!r} must have a value in every row")
         return None
     if isinstance(value, bool) != (column.kind == "flag") or not isinstance(value, _TYPES[column.kind]):
         raise ValueError(f"column {column.name!r} holds a {column.kind}, not {value!r}")
     if column.kind == "integer" and not -LARGEST <= value < LARGEST:
-        raise ValueError(f"column {column.name!r} holds whole numbers of 64 bits; this one has more")
-    if isinstance(value, str):  # a solver's words may hold bytes that are no text
+        raise ValueError(f"column {column.name!r} holds integers of 64 bits; this one is larger")
+    if isinstance(value, str):  # messages of solvers may be no valid text
         return value.encode(errors="replace").decode().replace("\0", "")
     return float(value) if column.kind == "number" else value
 
 
 def as_json(value: Any) -> str:
-    """Write a value as JSON text; numbers that are not finite become null, what JSON does not know its text."""
+    """Write a value as JSON; numbers that are not finite become null, objects unknown to JSON their text."""
     return json.dumps(_finite(value), sort_keys=True, default=str, allow_nan=False)
 
 
@@ -213,17 +207,17 @@ def _finite(value: Any) -> Any:
 
 
 def columns(rows: Any) -> dict[str, np.ndarray]:
-    """Return rows as one array per column of the schema; what is not given is empty.
+    """Return rows as one array per column of the schema; missing values are empty.
 
     Args:
         rows: a mapping of columns, a frame (pandas, polars), or dict rows.
 
     Returns:
-        {column: (rows,) array}: numbers and integers as floats (``nan`` where empty), flags as bools (False), texts,
-        JSON and times as str (""); labels longer than `LONGEST_LABEL` shortened.
+        {column: (rows,) array}: numbers and integers as floats (``nan`` if empty), flags as bools (False), texts, JSON
+        and times as str (""); labels longer than `LONGEST_LABEL` are shortened.
 
     Raises:
-        DataError: a column that every study has is missing, columns of unequal length, or a text in place of a number.
+        DataError: a required column is missing, columns differ in length, or a text in place of a number.
     """
     given = _by_column(rows)
     n = max(map(len, given.values()), default=0)
@@ -278,7 +272,7 @@ def _is_empty(value: Any) -> bool:
 
 
 def _label(text: str) -> str:
-    """Shorten a label that no sentence could hold, so that it stays different from others."""
+    """Shorten a long label such that it stays distinct."""
     if len(text) <= LONGEST_LABEL:
         return text or "(no name)"
     return f"{text[: LONGEST_LABEL - 8]}…{hashlib.sha256(text.encode(errors='replace')).hexdigest()[:6]}"

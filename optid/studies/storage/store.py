@@ -1,7 +1,7 @@
-"""The database of a study: one SQLite file in WAL mode, one row a cell and repetition.
+"""The database of a study: one SQLite file in WAL mode, one row per cell and repetition.
 
-Every row is committed when it comes, so that a killed run loses only the cells under way; readers see what is committed
-while a run goes on, and several processes may write. SQLite recovers an interrupted transaction by itself.
+Every row is committed on arrival, so that a killed run loses only the cells being run; others may read during a run,
+and several processes may write. SQLite recovers an interrupted transaction by itself.
 """
 
 import os
@@ -31,9 +31,7 @@ _OF_STUDY = "(:study IS NULL OR study = :study)"
 
 
 class Store:
-    """An open database; a context manager that closes it.
-
-    To write, it is made when it is not there.
+    """An open database; a context manager that closes it. To write, it is created if it does not exist.
 
     Raises:
         DatabaseError: no such file, not a database of studies, a damaged one or one of another version.
@@ -69,7 +67,7 @@ class Store:
 
     @contextmanager
     def _named(self, verb: str) -> Iterator[None]:
-        """Let errors of SQLite name the file."""
+        """Turn errors of SQLite into a DatabaseError that names the file."""
         try:
             yield
         except (sqlite3.Error, OSError, UnicodeError) as error:
@@ -78,7 +76,7 @@ class Store:
             raise DatabaseError(f"{self.path} cannot be {verb}: {error}{hint}") from error
 
     def _make(self) -> None:
-        """Make the file under another name first, so that readers and later runs find all of it or nothing."""
+        """Create the file under another name first, so that other processes find all of it or nothing."""
         from optid import __version__
 
         new = self.path.with_name(f"{self.path.name}.{platform.node()}.{os.getpid()}.new")
@@ -114,11 +112,10 @@ class Store:
             found = tuple(row[1] for row in self._connection.execute(f"PRAGMA table_info({table})"))
             if found != NAMES:
                 raise DatabaseError(f"{self.path}: table {table} does not have the columns of a study (`optid study "
-                                    "schema` lists them); take another copy")
+                                    "schema` lists them); use another copy")
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        """One transaction, which is undone when anything fails."""
         with self._named("written"):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
@@ -134,7 +131,7 @@ class Store:
             return self._connection.execute(statement, values).fetchall()
 
     def copy(self) -> "Store":
-        """Return a copy in memory: what is done to it leaves the file as it is."""
+        """Return a copy in memory, whose changes leave the file as it is."""
         other = object.__new__(Store)
         other.path, other._connection = self.path, sqlite3.connect(":memory:", isolation_level=None)
         try:
@@ -148,11 +145,11 @@ class Store:
     # -- rows ------------------------------------------------------------------------------------------------------
 
     def append(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Complete rows and write them in one transaction; those that were there for the same cells are replaced.
+        """Complete rows and write them in one transaction; they replace earlier rows of the same cells.
 
         Raises:
-            DatabaseError: they cannot be written, such as on a full disk: what was there before stays.
-            ValueError: a row that does not keep the schema.
+            DatabaseError: they cannot be written, as on a full disk; nothing is changed then.
+            ValueError: a row against the schema.
         """
         whole = [tuple(complete(row).values()) for row in rows]
         with self._transaction():
@@ -170,7 +167,7 @@ class Store:
         return {(values[0], key, repetition): values for key, repetition, *rest in found if (values := tuple(rest))}
 
     def rows_of(self, study: str | None, identified: Iterable[tuple[str, int]]) -> list[dict[str, Any]]:
-        """Return rows by (key, repetition) as they were written, in this order; those that are not there are left out.
+        """Return rows by (key, repetition) as written, in this order; missing ones are left out.
 
         Without a study there is one row of each, "done" before others, then the newest.
         """
@@ -190,11 +187,10 @@ class Store:
 
     @contextmanager
     def claim(self, study: str) -> Iterator[None]:
-        """Hold a study, so that no other run computes its cells meanwhile.
+        """Hold a study, so that no other run computes its cells.
 
-        Raises:
-            DatabaseError: another run holds it: a process that lives on this machine, or one on another machine that
-                wrote a row within the last `STALE` seconds.
+        `DatabaseError` if another run holds it: a live process on this machine, or one on another machine that wrote a
+        row within the last `STALE` seconds.
         """
         here = platform.node(), os.getpid()
         with self._transaction():
@@ -214,11 +210,10 @@ class Store:
                                          [study, *here])
 
     def keep(self, study: str, cells: Collection[tuple[str, int]]) -> None:
-        """Make the rows of a study those of its grid as it is now, given by (key, repetition).
+        """Make the rows of a study those of the current grid, given by (key, repetition).
 
-        Rows of other cells (entries taken out of the study, other data, options or versions) move to the table
-        ``superseded``, and rows of these cells that are there come back, the newest of each, so that an entry that is
-        taken out and put in again is not run again.
+        Rows of other cells (entries removed, other data, options or versions) move to the table ``superseded``, and the
+        newest superseded row of each cell without a row comes back: an entry removed and restored is not run again.
         """
         asked = "study = ? AND (key, repetition) {} (SELECT key, repetition FROM grid)"
         with self._transaction():
@@ -252,7 +247,7 @@ class Store:
         return {(data, formulation, solver): count for data, formulation, solver, count in found}
 
     def describe(self, study: str, description: str) -> None:
-        """Keep the text of a study file with its rows; the newest replaces the one before."""
+        """Store the text of a study file, which replaces the earlier one."""
         with self._transaction():
             self._connection.execute("INSERT OR REPLACE INTO studies VALUES (?, ?)", [study, description])
 
@@ -270,10 +265,10 @@ class Store:
 
 
 def _check_kind(path: Path) -> None:
-    """Refuse a file of another kind in words, where SQLite has refused it.
+    """Explain why SQLite refused a file: another kind of file, or one that cannot be opened.
 
-    A database that is open in this process must not be opened as a file beside SQLite: to close that would give up the
-    locks of the whole process (POSIX), and another process would remove the writes that are pending.
+    Not for a database that is open in this process: closing a second handle would release the locks of the process
+    (POSIX), and another process would remove pending writes.
     """
     try:
         head = b""
@@ -352,7 +347,7 @@ def read_rows(path: str | Path, study: str | None = None) -> dict[str, np.ndarra
         return columns(values) | {"started": np.array(starts, dtype="datetime64[us]"),
                                   "repetition": np.array(values.get("repetition", ()), dtype=np.int64)}
     except (DataError, AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise DatabaseError(f"{path} holds values that no run writes ({error}): take another copy") from None
+        raise DatabaseError(f"{path} holds invalid values ({error}): use another copy") from None
 
 
 def finished(path: str | Path, study: str | None = None) -> set[tuple[str, int]]:

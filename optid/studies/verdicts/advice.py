@@ -1,9 +1,9 @@
-"""The verdict in words: recommendations with the numbers they rest on, warnings, and what cannot be told."""
+"""The verdict in words: recommendations with their evidence, warnings, and undecided questions."""
 
 from collections import Counter
 
 from optid.show.wording import seconds
-from optid.studies.verdicts.averages import Paired, paired
+from optid.studies.verdicts.averages import paired
 from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE
 from optid.studies.verdicts.model_advice import choice_of_formulation
 from optid.studies.verdicts.quality import Quality
@@ -11,19 +11,19 @@ from optid.studies.verdicts.ranks import Ranking
 from optid.studies.verdicts.standings import Section, Standing
 from optid.studies.verdicts.statement import BAD, FAIR, GOOD, NO_DIFFERENCE, Statement, counting, listed, of, plural
 
-RARE = 0.01  # share of the problems that a solver may refuse, or lie on, and still be called the one to use
+RARE = 0.01  # share of refused problems, or of false claims, up to which a solver is recommended
 LONGEST = 90  # characters of a headline
 NO_SOLVER = "No solver can be recommended"
 
 
 def choice_of_solver(section: Section) -> Statement:
-    """Say which solver to use on the problems of a section, or why that cannot be told."""
+    """Recommend a solver for the problems of a section, or say why none can be recommended."""
     choice, n, at = section.choice, len(section.found.data), section.found.accuracy
     if not n:
         text = no_solution(section) if section.infeasible else "There is no run of a solver."
         return Statement(FAIR, "Nothing to compare", text, "solver")
     if not section.standings and section.found.measure == "warm":
-        text = "No run has a warm time to compare: it needs a study with warm = true, and a procedure of several "
+        text = "No run has a warm time: it needs a study with warm = true, and a procedure of several "
         return Statement(FAIR, "Cannot tell", text + "programmes never has one.", "solver")
     if not section.standings:
         text = f"Every solver ({listed(section.idle)}) refuses every problem, or was not run."
@@ -52,12 +52,12 @@ def choice_of_solver(section: Section) -> Statement:
         word = f"Solves most: {lead.solver}" if most else f"{word} where it runs"
     for name in choice.leaders:
         if k := section.standing(name).false_claims:
-            text += f" Mind that {k:,} claim{'s' if k > 1 else ''} of {name} {'were' if k > 1 else 'was'} false."
+            text += f" Note that {k:,} claim{'s' if k > 1 else ''} of {name} {'were' if k > 1 else 'was'} false."
     return Statement(_tone(lead, n), word if section.recommended else NO_SOLVER, text, "solver")
 
 
 def evidence(section: Section) -> str:
-    """Say what the choice rests on: how far the others are from the first, or what is missing."""
+    """Give the evidence for the choice: the distance of the others from the first, or the missing data."""
     choice, first = section.choice, section.choice.first
     if choice.kind != FIRST:
         each = "; ".join(f"{name} {_count(section, name)}{_against(section, name)}" for name in choice.tied[:3])
@@ -67,13 +67,14 @@ def evidence(section: Section) -> str:
     if rivals:
         name = min(rivals, key=lambda rival: choice.against[rival].value)
         text = f"The next, {name}, {_count(section, name)}{_against(section, name)}"
-        whole = _whole_fit(section, name)
-        text += f"; for the whole fit {_times_as(whole.value)}." if whole else "."
+        found = section.found
+        whole = paired(found.fit[:, found.solvers.index(name)], found.fit[:, found.solvers.index(first)])
+        text += f"; for the whole fit {_times_as(whole.value)}." if whole.enough and found.measure == "solve" else "."
         most = max(rivals, key=lambda rival: choice.solved[rival])
         if choice.solved[most] > max(choice.solved[first], choice.solved[name]):
             text += f" {most} {_count(section, most)}{_against(section, most)}."
     elif not any(choice.solved[name] for name in others):
-        return f"Nobody else solved any: {listed(others)}."
+        return f"No other solver solved any problem: {listed(others)}."
     else:
         name = max(others, key=lambda other: choice.solved[other])
         pair = choice.against[name]
@@ -93,10 +94,10 @@ def evidence(section: Section) -> str:
 
 
 def no_solution(section: Section) -> str:
-    """Say how many problems have no solution, and who says so."""
+    """State how many problems are infeasible, and how many solvers agree."""
     k, (said, asked) = section.infeasible, section.deniers
-    return (f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no solution: {said} of {asked} solvers say so, and "
-            "none found one. That counts neither for nor against them.")
+    return (f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no solution according to {said} of {asked} solvers; "
+            "none found one. This counts neither for nor against them.")
 
 
 def _tone(lead: Standing, n: int) -> str:
@@ -106,7 +107,6 @@ def _tone(lead: Standing, n: int) -> str:
 
 
 def _times_as(value: float) -> str:
-    """Write a ratio of times in words."""
     if 0.995 <= value <= 1.005:
         return "the same time"
     return f"{value:.3g} times the time" if value < 10 else f"{value:.0f} times the time"
@@ -118,40 +118,33 @@ def _against(section: Section, name: str) -> str:
 
 
 def _count(section: Section, name: str) -> str:
-    """Say how many problems a candidate solved where it is not as many as the first."""
+    """State how many problems a candidate solved where the first solved more."""
     solved = section.choice.solved
     if solved[name] == solved[section.choice.first]:
         return ""
     return f"solved {solved[name]:,}, no difference beyond chance or 1 %, and "
 
 
-def _whole_fit(section: Section, name: str) -> Paired | None:
-    """What is left of the ratio of times in the whole fit, where the solver's share of it is compared."""
-    found = section.found
-    pair = paired(found.fit[:, found.solvers.index(name)], found.fit[:, found.solvers.index(section.choice.first)])
-    return pair if pair.enough and found.measure == "solve" else None
-
-
 def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
-    """Say whether an order carries over to other data sets; the noun is what is ranked."""
+    """State whether the order of solvers or formulations (the noun) holds on other data sets."""
     if ranking.missing:
-        text = f"Whether the order holds on other data sets cannot be told: the test {ranking.missing}."
+        text = f"Whether the order holds on other data sets is unknown: the test {ranking.missing}."
         return Statement(FAIR, "Other data: cannot tell", text, "data sets")
     best, *others = ranking.names
     least = min(ranking.probabilities.values())
     p = "below 0.001" if least < 0.001 else f"{least:.2g}"
     text = f"{best} has the best mean rank, {ranking.ranks[0]:.2f} (sign tests, {ranking.n} data sets, probability {p})"
     if not ranking.behind:
-        text += f"; no other {noun} is behind it beyond chance."
+        text += f"; no other {noun} is significantly behind it."
         return Statement(FAIR, "Other data: no difference", text, "data sets")
     same = [name for name in others if name not in ranking.behind]
-    text += f"; {listed(same)} cannot be told apart from it." if same else "; all others are behind beyond chance."
+    text += f"; {listed(same)} do not differ significantly." if same else "; all others are significantly behind."
     word = f"Other data: {listed([best, *same])} {'lead' if same else 'leads'}"
     return Statement(GOOD, word, text, "data sets")
 
 
 def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) -> Statement:
-    """Say the verdict in one line: one solver for everything, or that it depends on the formulation.
+    """Return the verdict in one line: one solver for everything, or one per formulation.
 
     A study of a single solver is about the formulations by their models.
     """
@@ -176,7 +169,7 @@ def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) 
     if len(used[main]) > 1:
         text += f" {main} comes first, or ties for it, in {of(len(used[main]), count, 'formulation')}."
     if not all_told:
-        text += f" For {count - len(decided)} of {count} formulations it cannot be told."
+        text += f" For {count - len(decided)} of {count} formulations it is undecided."
     tones = [_tone(one.standing(name), len(one.found.data)) for name, theirs in used.items() for one in theirs]
     tone = max(tones if all_told else [*tones, FAIR], key=(GOOD, FAIR, BAD).index)
     depends = "It depends on the formulation"
@@ -186,9 +179,9 @@ def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) 
 
 
 def _used(overall: Section, decided: list[Section]) -> dict[str, list[Section]]:
-    """Few solvers that come first, or tie for it, in all these sections: {solver: sections}, whoever covers most first.
+    """Return few solvers that lead all these sections: {solver: sections}, the one that leads most first.
 
-    Of solvers that cover as many, the one that stands better on all problems.
+    Of solvers that lead as many, the one with the better standing on all problems.
     """
     order, left, used = [s.solver for s in overall.standings], list(decided), {}
     while left:

@@ -1,4 +1,4 @@
-"""Do solvers that reached the same verified accuracy agree on the objective, and on the model?"""
+"""Agreement of solvers with the same verified accuracy on the objective and on the model."""
 
 import json
 from dataclasses import dataclass
@@ -38,10 +38,10 @@ def agreement_matrix(found: Results, table: Table) -> Agreement:
 
 
 def model_distance(table: Table, i: int, j: int, read: dict[int, np.ndarray | None] | None = None) -> float:
-    """Return the larger of the distance between poles (best matching) and between fits (as a share of 100 points).
+    """Return the distance of the models of rows i and j of a table; `read` caches the poles by row.
 
-    It is that of the rows i and j of a table, ``nan`` where neither poles nor fits are known on both sides and ``inf``
-    for different orders; poles that were read are kept by row.
+    It is the larger of the distance between poles (best matching) and between fits (as a share of 100 points), ``nan``
+    if both are unknown and ``inf`` for different orders.
     """
     read = {} if read is None else read
     for k in (i, j):

@@ -12,18 +12,16 @@ from scipy.stats import t as student
 
 SHIFT = 0.01  # s; times far below it count alike, so that a microsecond saved does not outweigh a second
 MINIMUM_PAIRS = 6  # with five, even a unanimous comparison has a two-sided sign-test probability of 1/16 > 0.05
-MINOR = 0.1  # 10 % of a time or an error, 0.1 points of fit: of no practical meaning
-VAGUE = 10.0  # with 10 % of practical meaning, a tie is known to within a factor of 2
-MINIMUM_LENGTHS = 3  # two lengths give a slope but nothing to judge it by
+MINOR = 0.1  # 10 % of a time or an error, 0.1 points of fit: without practical meaning
+VAGUE = 10.0  # with `MINOR` of 10 %, the interval of a tie is within a factor of 2
+MINIMUM_LENGTHS = 3  # two lengths give a slope but no standard error
 MINIMUM_SPREAD = 4.0  # between the longest and the shortest record
 
 
 def shifted_geometric_mean(times: np.ndarray, shift: float = SHIFT) -> float:
-    """Return ``exp(mean(log(t + shift))) - shift``; ``nan`` of nothing.
+    """Return ``exp(mean(log(t + shift))) - shift`` of positive times, ``nan`` left out; ``nan`` without times.
 
-    Args:
-        times: positive, in the unit of the shift; ``nan`` entries are left out.
-        shift: the larger, the less small times weigh (H. Mittelmann's benchmarks; T. Achterberg, 2007, appendix A).
+    The larger the shift, the less small times weigh (H. Mittelmann's benchmarks; T. Achterberg, 2007, appendix A).
     """
     known = times[~np.isnan(times)]
     return float(np.exp(np.mean(np.log(known + shift))) - shift) if known.size else float("nan")
@@ -31,7 +29,7 @@ def shifted_geometric_mean(times: np.ndarray, shift: float = SHIFT) -> float:
 
 @dataclass(frozen=True)
 class Paired:
-    """One against another, problem by problem: lower is better."""
+    """A paired comparison, problem by problem: lower is better."""
 
     value: float  # geometric mean of the ratios, or mean of the differences; nan without a common problem
     low: float  # its 95 % interval; infinite with fewer than two problems
@@ -41,32 +39,32 @@ class Paired:
 
     @property
     def enough(self) -> bool:
-        """Whether there are enough common problems to tell anything."""
+        """Whether there are enough common problems for a conclusion."""
         return self.n >= MINIMUM_PAIRS
 
     @property
     def notable(self) -> bool:
-        """Whether one is worse than the other by more than a trifle, for sure or not."""
+        """Whether the estimate is worse by more than `MINOR`, significant or not."""
         return self.value > self._around(MINOR)[1]
 
     @property
     def behind(self) -> bool:
-        """Whether one is worse than the other, for sure and by more than a trifle."""
+        """Whether it is significantly worse, and by more than `MINOR`."""
         return self.enough and self.low > self._around(0.0)[1] and self.notable
 
     @property
     def ahead(self) -> bool:
-        """Whether one is better than the other, for sure and by more than a trifle."""
+        """Whether it is significantly better, and by more than `MINOR`."""
         return self.enough and self.high < self._around(0.0)[0] and self.value < self._around(MINOR)[0]
 
     @property
     def vague(self) -> bool:
-        """Whether the interval holds differences `VAGUE` times a trifle: that is ignorance, not a tie."""
+        """Whether the interval contains differences `VAGUE` times `MINOR`: too wide for a tie."""
         low, high = self._around(VAGUE * MINOR)
         return self.low < low or self.high > high
 
     def _around(self, slack: float) -> tuple[float, float]:
-        """Values so close to equality, to both sides."""
+        """Return the bounds of values this close to equality."""
         return (1 / (1 + slack), 1 + slack) if self.ratio else (-slack, slack)
 
 
@@ -76,8 +74,8 @@ def paired(values: np.ndarray, reference: np.ndarray, ratio: bool = True, groups
     Args:
         values: (P,), positive for ratios, ``nan`` where not solved; only problems that both solved count.
         reference: (P,), alike.
-        ratio: whether to take the geometric mean of ratios; else the mean of differences.
-        groups: (P,) labels; where given, the mean of each group counts as one.
+        ratio: whether to take the geometric mean of ratios, else the mean of differences.
+        groups: (P,) labels; if given, the mean of each group counts as one.
     """
     if ratio:
         logs = paired(np.log(values), np.log(reference), False, groups)
@@ -101,13 +99,13 @@ def means_of_groups(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Profile:
-    """The share of the problems solved within a factor of the fastest: a step function, continuous from the right."""
+    """The share of problems solved within a factor of the fastest time: a right-continuous step function."""
 
     factors: np.ndarray  # where it steps, ascending, the first at least 1
     shares: np.ndarray  # its value from there on, in (0, 1]
 
     def __call__(self, factor: float) -> float:
-        """Return the share of the problems solved within this factor of the fastest."""
+        """Return the share of problems solved within this factor of the fastest time."""
         at = int(np.searchsorted(self.factors, factor, side="right"))
         return float(self.shares[at - 1]) if at else 0.0
 
@@ -120,11 +118,7 @@ def time_ratios(times: np.ndarray) -> np.ndarray:
 
 
 def performance_profiles(times: np.ndarray) -> list[Profile]:
-    """Return one profile per solver.
-
-    Args:
-        times: (P, S), ``nan`` where the problem was not solved. Problems that nobody solved stay in the denominator.
-    """
+    """Return a profile per solver for times (P, S), ``nan`` where not solved; unsolved problems count in the shares."""
     profiles = []
     for ratios in time_ratios(times).T:
         factors, counts = np.unique(ratios[np.isfinite(ratios)], return_counts=True)
@@ -134,28 +128,26 @@ def performance_profiles(times: np.ndarray) -> list[Profile]:
 
 @dataclass(frozen=True)
 class Growth:
-    """Time proportional to the record length to the power of the slope."""
+    """A power law: time proportional to the record length to the power of the slope."""
 
-    slope: float  # nan where it cannot be told
+    slope: float  # nan where it cannot be estimated
     low: float  # its 95 % interval
     high: float
     lengths: np.ndarray  # ascending, of data with two or more
     times: np.ndarray  # geometric mean time at each of them
-    missing: str = ""  # what is missing to tell
+    missing: str = ""  # the missing data
 
 
 def time_growth(times: np.ndarray, n: np.ndarray, groups: np.ndarray) -> Growth:
     """Fit ``log t = c_group + slope log N`` by least squares.
 
-    Seeds of one group and length are averaged first: their number must not narrow the interval, because what is
-    uncertain is whether a power law holds, not the mean time. At least one group must have `MINIMUM_LENGTHS` lengths
-    and `MINIMUM_SPREAD` between them: a power law over short spans at different lengths is none over the whole.
+    Seeds of one group and length are averaged first: the interval is about the power law, not about the mean time. At
+    least one group must have `MINIMUM_LENGTHS` lengths with a ratio of `MINIMUM_SPREAD` between them.
 
     Args:
         times: (P,) seconds, ``nan`` where not solved.
         n: (P,) record lengths.
-        groups: (P,) numbers of whatever else makes a problem slow: formulation, data set, noise. Only groups with two
-            lengths count.
+        groups: (P,) numbers of formulation, data set and noise. Only groups with two lengths count.
     """
     usable = np.isfinite(times) & np.isfinite(n) & (n > 0) & (times > 0)
     logs = np.log(times[usable])

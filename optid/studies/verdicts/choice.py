@@ -1,4 +1,4 @@
-"""Who comes first: reliability before speed, and a tie is called a tie."""
+"""The choice of the best: reliability before speed, with ties and undecided comparisons."""
 
 from dataclasses import dataclass, field
 from itertools import combinations
@@ -18,32 +18,31 @@ RELIABLE = 0.01  # share of the problems by which the number solved may stay beh
 class Choice:
     """The outcome of a comparison.
 
-    Its kind is "first" (one is ahead), "tie" (those named are known to be close), "cannot tell" (too few data, or an
-    order that depends on the problems), "only one" (nothing to compare with), "nobody" (not one problem solved) or
-    "depends" (everybody is behind on one of the data sets).
+    Its kind is "first" (one is ahead), "tie" (those named are close), "cannot tell" (too few data, or a contradictory
+    order), "only one" (nothing to compare), "nobody" (no problem solved) or "depends" (each is behind on a data set).
     """
 
     kind: str
-    first: str = ""  # who is ahead; of a tie the one that solved most, then the one with the best mean
-    tied: tuple[str, ...] = ()  # the others that cannot be told apart from it
-    candidates: tuple[str, ...] = ()  # who solved as many problems as the most reliable, up to the slack and chance
+    first: str = ""  # the best; of a tie the one that solved most, then the one with the best mean
+    tied: tuple[str, ...] = ()  # the others not significantly behind it
+    candidates: tuple[str, ...] = ()  # as reliable as the best, up to slack and chance
     against: dict[str, Paired] = field(default_factory=dict)  # each against the first, where both solved
     solved: dict[str, int] = field(default_factory=dict)  # problems solved
-    missing: str = ""  # what is missing to tell
+    missing: str = ""  # the missing data
 
     @property
     def leaders(self) -> tuple[str, ...]:
-        """Who is the best, or cannot be told apart from it."""
+        """The best and those that are not significantly behind it."""
         return (self.first, *self.tied)
 
     @property
     def decided(self) -> bool:
-        """Whether one is known to be ahead, or some to be equal."""
+        """Whether one is ahead or several are equal."""
         return self.kind in (FIRST, TIE)
 
     @property
     def shortfall(self) -> str:
-        """A sentence on what is missing; empty where the choice is decided."""
+        """A sentence on the missing data; empty where the choice is decided."""
         if self.kind == ONLY_ONE:
             return "There is nothing to compare it with."
         return "" if self.decided else f"The comparison {self.missing}."
@@ -57,16 +56,16 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
         costs: (P, S), lower is better, ``nan`` where the problem was not solved.
         names: the S names.
         ratio: whether costs compare by their ratios, else by their differences.
-        slack: share of the problems by which the number solved may stay behind the most reliable.
-        noun: what the comparison counts as one is called.
-        groups: (P,) labels, where the comparison counts every group as one.
+        slack: share of the problems by which the number solved may be below that of the most reliable.
+        noun: name of the unit of the comparison.
+        groups: (P,) labels, if every group counts as one.
 
     Returns:
-        The choice. Somebody is no candidate where the number solved is behind that of the most reliable by more than
-        the slack and beyond chance (exact one-sided sign test on the problems that one of the two solved, at `LEVEL`).
-        Two candidates are told apart where they solved `MINIMUM_PAIRS` problems in common, the interval of their
-        comparison excludes equality and the difference is of practical meaning; they tie where that interval is narrow,
-        and cannot be told where it is not. The first is one that no other candidate is ahead of.
+        The choice. The candidates are those whose number solved is not below that of the most reliable by more than the
+        slack and beyond chance (exact one-sided sign test on the problems that one of the two solved, at `LEVEL`). Two
+        candidates differ where they solved `MINIMUM_PAIRS` problems in common, the interval of their comparison
+        excludes equality and the difference has practical meaning; they tie where that interval is narrow, and are
+        undecided where it is not. No other candidate is ahead of the first.
     """
     known = np.isfinite(costs)
     counts = known.sum(axis=0)
@@ -78,7 +77,10 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
         return paired(one, other, ratio, groups)
 
     allowed = int(slack * len(costs))
-    reliable = _reliable(known, allowed)
+    best = known[:, [int(np.argmax(counts))]]
+    lost, won = (best & ~known).sum(axis=0), (known & ~best).sum(axis=0)
+    reliable = [int(s) for s in np.flatnonzero(counts)
+                if lost[s] - won[s] <= allowed or sign_test(int(lost[s]), int(won[s]), "greater") >= LEVEL]
     candidates = tuple(names[s] for s in reliable)
     beaten = set()
     for one, other in combinations(reliable, 2):
@@ -108,15 +110,3 @@ def choose(costs: np.ndarray, names: tuple[str, ...], ratio: bool = True, slack:
         missing = (f"needs more than {pair.n} {noun}s to tell {names[lead]} and {vague[0]} apart: the interval of "
                    f"their comparison, {pair.low:.3g} to {pair.high:.3g}, is too wide")
     return Choice(kind, names[lead], tied, candidates, against, solved, missing)
-
-
-def _reliable(known: np.ndarray, allowed: int) -> list[int]:
-    """Who solved something, and no fewer than the most reliable by more than what is allowed and chance explains."""
-    counts = known.sum(axis=0)
-    best = known[:, int(np.argmax(counts))]
-
-    def behind(one: np.ndarray) -> bool:
-        lost, won = int((best & ~one).sum()), int((one & ~best).sum())
-        return lost - won > allowed and sign_test(lost, won, "greater") < LEVEL
-
-    return [int(s) for s in np.flatnonzero(counts) if not behind(known[:, s])]

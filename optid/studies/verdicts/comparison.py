@@ -1,4 +1,4 @@
-"""Solvers side by side on one record and one formulation: a line for each, and one sentence that says which to use."""
+"""Comparison of solvers on one record and one formulation, with a recommendation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ class Line:
     """One solver."""
 
     solver: str
-    state: str  # "solved", or the word for why not
+    state: str  # "solved", or the reason
     status: str  # after our own residuals have judged the claim; the outcome where nothing was judged
     proved: bool  # globally optimal
     above: float  # objective above the best verified one, relative; NaN without a point
@@ -42,12 +42,12 @@ class Comparison:
 
     @property
     def reasons(self) -> dict[str, list[str]]:
-        """Solvers that did not solve it by the sentence that says why."""
+        """Solvers that did not solve it, by reason."""
         return grouped((line.reason, line.solver) for line in self.lines if line.state != SOLVED and line.reason)
 
     @property
     def common_error(self) -> str | None:
-        """What kept every solver from being run, such as a record without excitation; None where one was run."""
+        """The error of every solver, such as a record without excitation; None if one was run."""
         if self.lines and len(self.reasons) == 1 and all(line.state == ERROR for line in self.lines):
             (reason,) = self.reasons
             return reason.partition(": ")[2] or reason
@@ -99,25 +99,25 @@ def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
     best = np.min(found.objective[0][found.solved[0]], initial=np.inf)
     lines, refused = [], {}
     for solver, state, row, residual in zip(found.solvers, found.state[0], found.row[0], found.residual[0]):
-        speaks = {name: values[row] for name, values in table.items()}
+        shown = {name: values[row] for name, values in table.items()}
         if state == REFUSED:
-            refused[solver] = str(speaks["reason"])
+            refused[solver] = str(shown["reason"])
             continue
-        mine = (table["solver"] == solver) & (table["outcome"] == speaks["outcome"])
+        mine = (table["solver"] == solver) & (table["outcome"] == shown["outcome"])
         cold = np.nan_to_num(table["compile_s"][mine]) + table["solve_s"][mine]
         lines.append(Line(
-            solver, str(state), str(speaks["status_verified"] or speaks["outcome"]), bool(speaks["proved"]),
-            float((speaks["objective"] - best) / found.size[0] if np.isfinite(best) else np.nan), float(residual),
-            _median(cold), _median(table["warm_s"][mine]), float(speaks["one_step_fit"]),
-            float(speaks["simulation_fit"]), str(speaks["reason"])))
+            solver, str(state), str(shown["status_verified"] or shown["outcome"]), bool(shown["proved"]),
+            float((shown["objective"] - best) / found.size[0] if np.isfinite(best) else np.nan), float(residual),
+            _median(cold), _median(table["warm_s"][mine]), float(shown["one_step_fit"]),
+            float(shown["simulation_fit"]), str(shown["reason"])))
     return Comparison(tuple(sorted(lines, key=_order)), refused, float(table["accuracy"][0]))
 
 
 def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
-    """Return the verdict on the rows that `compare` takes, headed by what the comparison says; it raises the same."""
+    """Return the verdict on the rows of `compare`, with the headline of the comparison; it raises the same."""
     head, verdict = compare(rows).headline, conclude(rows)
-    caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. Which solver to prefer on others is "
-                       "told by a study of at least 6 problems (optid study run).", "data sets")
+    caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. A study of at least 6 problems "
+                       "(optid study run) shows which solver to prefer on others.", "data sets")
     said = [statement for statement in verdict.statements if statement.about != "data sets"]
     head = replace(head, text=head.text[:1].upper() + head.text[1:])  # a sentence of its own on the page
     return replace(verdict, headline=head, statements=(caveat, *said))

@@ -1,4 +1,4 @@
-"""Formulations compared by their models, in words: which to use, on which data, and by how much."""
+"""The comparison of formulations by their models, in words."""
 
 from optid.studies.verdicts.averages import Paired
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, NOBODY, TIE, Choice
@@ -10,7 +10,7 @@ LISTED = 4  # data sets in a sentence
 
 
 def choice_of_formulation(quality: Quality) -> Statement | None:
-    """Say which formulation gives the best models, or why that cannot be told; None for a single formulation."""
+    """Recommend the formulation with the best models, or say why none is recommended; None for a single formulation."""
     choice, sets = quality.choice, len(quality.sets)
     if len(quality.formulations) < 2 or not any(quality.solved.values()):
         return None
@@ -46,14 +46,13 @@ def choice_of_formulation(quality: Quality) -> Statement | None:
 
 
 def model_evidence(quality: Quality, name: str) -> str:
-    """Say in a few words how far the models of a formulation stay behind the best, by data set where there are few."""
+    """State how far the models of a formulation are behind the best, by data set if there are few."""
     if 1 < len(quality.sets) < FEW:
         return "; ".join(f"{one.name}: {_place(quality, one.choice, name, 'record')}" for one in quality.sets)
     return _place(quality, quality.choice, name, quality.unit)
 
 
 def _place(quality: Quality, choice: Choice, name: str, unit: str) -> str:
-    """Where a formulation stands in one choice."""
     if name == choice.first:
         return {FIRST: "best", TIE: "tied for the best"}.get(choice.kind, "best so far")
     pair = choice.against.get(name)
@@ -63,7 +62,6 @@ def _place(quality: Quality, choice: Choice, name: str, unit: str) -> str:
 
 
 def _figure(quality: Quality) -> str:
-    """The mean figure of the first choice, and what it is a mean of."""
     first, several = quality.choice.first, len(quality.sets) > 1
     mean, total = quality.figures[quality.measure][first], of(quality.choice.solved[first], quality.records, "record")
     where = f"{plural(len(quality.sets), 'data set')} ({total})" if several else f"{total} of {quality.sets[0].name}"
@@ -73,7 +71,6 @@ def _figure(quality: Quality) -> str:
 
 
 def _behind(quality: Quality, pair: Paired, unit: str = "") -> str:
-    """How far a formulation is behind the best, with the interval where there is one."""
     low, high, n = pair.low, pair.high, plural(pair.n, unit or quality.unit)
     if quality.errors:
         interval = f" (95 %: {low:.3g} to {high:.3g}, {n})" if pair.n > 1 else ""
@@ -85,7 +82,6 @@ def _behind(quality: Quality, pair: Paired, unit: str = "") -> str:
 
 
 def _each(quality: Quality) -> str:
-    """The best on every data set, with the next."""
     more = len(quality.sets) - LISTED
     said = [_one(quality, one) for one in quality.sets[:LISTED]]
     return "; ".join(said + ([f"and {plural(more, 'data set')} more"] if more > 0 else []))

@@ -1,10 +1,11 @@
-"""Which runs count: a table of problems and solvers, every entry with a time or with the reason why it has none."""
+"""A table of problems and solvers: every entry has a time, or the reason why it has none."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import mode
 
 from optid.errors import DataError
 from optid.program.solution import GRADIENT, Status, tolerance
@@ -16,26 +17,26 @@ LESS_ACCURATE, WORSE_MINIMUM, OTHER_ACCURACY = "less accurate", "worse minimum",
 WARM_FAILED, UNTIMED = "warm solve failed", "no time"
 VALUE = 1e-6  # relative difference of objectives up to which two runs found the same minimum
 TIMES = {"solve": ("compile_s", "solve_s"), "fit": ("fit_s",), "warm": ("warm_s",)}  # measures: sums of columns
-VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, whatever is known of the time
+VERIFIED = (SOLVED, WARM_FAILED, UNTIMED)  # the accuracy was reached, with or without a time
 UNANSWERED = (TIME_LIMIT, MEMORY_LIMIT, CRASHED, ERROR, str(Status.LIMIT))  # ended before the solver had an answer
 MEANINGS = {
     SOLVED: "the verified accuracy was reached, at the best objective that any solver verified",
-    FALSE_CLAIM: "success or infeasibility was claimed, and our residuals took it back",
-    CONTRADICTED: "infeasible or unbounded, it said; another solver has a verified point",
-    LESS_ACCURATE: "verified to a looser accuracy of its own, not to the one compared at",
+    FALSE_CLAIM: "the solver claimed success or infeasibility, which the verified residuals contradict",
+    CONTRADICTED: "the solver claimed infeasible or unbounded; another solver has a verified point",
+    LESS_ACCURATE: "verified at its own looser accuracy, not at the compared one",
     WORSE_MINIMUM: "a verified minimum above the best one that another solver verified; of a procedure the minimum of "
                    "its last programme, which depends on the steps before it",
-    OTHER_ACCURACY: "asked for another accuracy than the one compared at, and the same solver has runs that suit it",
-    WARM_FAILED: "the cold solve was verified, the warm one, whose time is compared, was not",
-    UNTIMED: "solved, but without the time that is compared: not solved warm, or a procedure, which never is",
+    OTHER_ACCURACY: "asked for another accuracy than the compared one, at which the same solver has runs",
+    WARM_FAILED: "the cold solve was verified, the warm solve, whose time is compared, was not",
+    UNTIMED: "solved, but without the compared time: not solved warm; a procedure never is",
     NOT_RUN: "no run in the database",
-    INFEASIBLE: "the solver says that no point satisfies the constraints; that claim comes without a point to verify",
-    str(Status.UNBOUNDED): "the solver says that the objective has no lower bound",
-    str(Status.LIMIT): "the solver stopped at a limit of its own, of iterations or time",
-    str(Status.INACCURATE): "the point misses the tolerance of its own accuracy, by too little to call the claim a lie",
-    str(Status.FAILED): "no point that could be judged, or one far from what was claimed",
+    INFEASIBLE: "the solver claims that no point satisfies the constraints; the claim has no point to verify",
+    str(Status.UNBOUNDED): "the solver claims that the objective has no lower bound",
+    str(Status.LIMIT): "the solver stopped at its own limit of iterations or time",
+    str(Status.INACCURATE): "the point misses the tolerance of its own accuracy, but not by enough for a false claim",
+    str(Status.FAILED): "no point to judge, or a point far from the claim",
 }
-"""What the words of the failure table mean beyond the outcomes of a row."""
+"""The meaning of the states in the failure table, beyond the outcomes of a row."""
 
 Table = Mapping[str, np.ndarray]
 _RECORD = ("study", "data", "samples", "noise", "seed")
@@ -55,7 +56,7 @@ class Results:
     group: np.ndarray  # number of formulation, data set and noise, (P,): what makes a problem slow but its length
     n: np.ndarray  # samples that the fits see, those held out left out, (P,); nan where no run got that far
     solvers: tuple[str, ...]  # labels, in alphabetical order
-    state: np.ndarray  # `SOLVED` or the word for why not, (P, S)
+    state: np.ndarray  # `SOLVED` or the reason, (P, S)
     reason: np.ndarray  # sentence of the first run that did not solve it, (P, S)
     false: np.ndarray  # whether a claim was false, of any repetition at any accuracy, or contradicted, (P, S)
     time: np.ndarray  # median over the repetitions in seconds, (P, S); nan unless solved
@@ -65,7 +66,7 @@ class Results:
     size: np.ndarray  # yardstick of differences of objectives, (P,)
     residual: np.ndarray  # worst verified residual as `worst_residual` counts it, (P, S), wherever there is a point
     limit: np.ndarray  # time limit in seconds, (P,)
-    row: np.ndarray  # number of the row that speaks for the entry, (P, S); -1 where there is none
+    row: np.ndarray  # number of the row that represents the entry, (P, S); -1 without one
     accuracy: float  # requested relative accuracy that is compared at
     measure: str  # of time: "solve", "fit" or "warm"
 
@@ -81,12 +82,12 @@ class Results:
 
     @property
     def verified(self) -> np.ndarray:
-        """Which entries are solved, or would be but for the time that is compared, (P, S)."""
+        """Which entries are solved, apart from the compared time, (P, S)."""
         return np.isin(self.state, VERIFIED)
 
     @property
     def ran(self) -> np.ndarray:
-        """Where the solver was run at all: not refused, left out, or without a time, (P, S)."""
+        """Where the solver was run: not refused, not left out, not without a time, (P, S)."""
         return ~np.isin(self.state, (REFUSED, NOT_RUN, UNTIMED))
 
     @property
@@ -102,34 +103,27 @@ class Results:
         return replace(self, **kept, solvers=tuple(np.array(self.solvers, dtype=object)[solvers]))
 
 
-def usual_accuracy(table: Table) -> float:
-    """Return the accuracy that most runs asked for, of equally frequent ones the strictest."""
-    known = table["accuracy"][np.isfinite(table["accuracy"]) & (table["accuracy"] > 0)]
-    if not known.size:
-        return 1e-8
-    values, counts = np.unique(known, return_counts=True)
-    return float(values[np.argmax(counts)])
-
-
 def tabulate(table: Table, accuracy: float | None = None, time: str = "solve") -> Results:
     """Sort rows into problems and solvers, and decide which entries are solved.
 
     Args:
-        table: what `optid.studies.storage.rows.columns` returned.
-        accuracy: relative accuracy to compare at; unless given, the one most runs asked for.
+        table: as returned by `optid.studies.storage.rows.columns`.
+        accuracy: relative accuracy to compare at; by default the one most runs asked for.
         time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
 
     Returns:
-        The table. An entry is solved where every repetition ran to its end, was verified, has residuals within the
-        tolerance of the common accuracy, the time that is compared, and an objective within `VALUE` of the best
-        verified one. Of runs at several requested accuracies those count that suit the common one best.
+        The table. An entry is solved where every repetition was completed and verified, has residuals within the
+        tolerance of the common accuracy, the compared time, and an objective within `VALUE` of the best verified one.
+        Of runs at several requested accuracies those closest to the common one count.
 
     Raises:
         DataError: unknown measure of time.
     """
     if time not in TIMES:
         raise DataError(f"time is one of {', '.join(TIMES)}, not {time!r}")
-    accuracy = usual_accuracy(table) if accuracy is None else accuracy
+    if accuracy is None:
+        asked = table["accuracy"][np.isfinite(table["accuracy"]) & (table["accuracy"] > 0)]
+        accuracy = float(mode(asked).mode) if asked.size else 1e-8  # of equally frequent values the smallest
     residual, seconds = worst_residual(table), seconds_of(table, time)
     states = _row_states(table, accuracy, time)
     verified = np.isin(states, VERIFIED)
@@ -183,9 +177,9 @@ def _numbered(table: Table, *names: str) -> np.ndarray:
 
 
 def _other_accuracy(table: Table, accuracy: float) -> np.ndarray:
-    """Which runs asked for an accuracy that another run of the same solver on the same problem suits better, (rows,).
+    """Return which runs asked for a less suitable accuracy than another run of the same solver and problem, (rows,).
 
-    What suits best is the loosest that is not looser than the common one; where all are looser, the strictest.
+    The most suitable is the loosest that is not looser than the common one, else the strictest.
     """
     asked = table["accuracy"]
     steps = np.log(np.where(np.isfinite(asked) & (asked > 0), asked, accuracy) / accuracy)
@@ -198,15 +192,13 @@ def _other_accuracy(table: Table, accuracy: float) -> np.ndarray:
 
 
 def _largest(*choices: np.ndarray) -> float:
-    """Largest finite number of the first choice that has one."""
     return next((float(np.max(c[np.isfinite(c)])) for c in choices if np.isfinite(c).any()), float("nan"))
 
 
 def worst_residual(table: Table) -> np.ndarray:
-    """Return what is held against the tolerance, (rows,); ``nan`` without a point.
+    """Return the residual that is compared with the tolerance, (rows,); ``nan`` without a point.
 
-    It is the largest of violation, complementarity and stationarity, the last one divided by `GRADIENT`: solving allows
-    gradients that much more.
+    It is the largest of violation, complementarity, and stationarity / `GRADIENT`, the factor that solving allows.
     """
     return np.fmax(np.fmax(table["violation"], table["complementarity"]), table["stationarity"] / GRADIENT)
 
@@ -219,7 +211,6 @@ def seconds_of(table: Table, time: str) -> np.ndarray:
 
 
 def _row_states(table: Table, accuracy: float, time: str) -> np.ndarray:
-    """`SOLVED` or why not, for every row by itself."""
     warm_failed = (time == "warm") & (table["warm_status"] != "") & ~np.isin(table["warm_status"], SUCCESS)
     status, outcome = table["status_verified"], table["outcome"]
     choices = [
@@ -239,7 +230,7 @@ def _row_states(table: Table, accuracy: float, time: str) -> np.ndarray:
 
 
 def _against_the_best(found: Results) -> Results:
-    """Take out minima above the best one, and claims of infeasibility that a verified point contradicts."""
+    """Mark minima above the best one, and claims of infeasibility that a verified point contradicts."""
     verified = np.isfinite(found.objective)
     best = np.min(np.where(verified, found.objective, np.inf), axis=1, initial=np.inf)
     best = np.where(np.isfinite(best), best, 0.0)
@@ -254,7 +245,7 @@ def _against_the_best(found: Results) -> Results:
 
 
 def states_of_rows(table: Table, found: Results) -> np.ndarray:
-    """Return `SOLVED` or the word for why not for every row, (rows,), once `tabulate` has made results of the table."""
+    """Return `SOLVED` or the reason for every row of the table of some results, (rows,)."""
     states = _row_states(table, found.accuracy, found.measure)
     for word in (WORSE_MINIMUM, CONTRADICTED):
         states[found.row[found.state == word]] = word
@@ -262,10 +253,9 @@ def states_of_rows(table: Table, found: Results) -> np.ndarray:
 
 
 def agreed_infeasible(found: Results) -> np.ndarray:
-    """Return the problems without a solution by common consent, (P,).
+    """Return the problems that are infeasible by agreement, (P,): all solvers with an answer, and at least two, say so.
 
-    At least two solvers say so, and so does every other one that came to an answer. One claim is not enough: it comes
-    without a point, so nothing about it can be verified.
+    One claim is not enough: it comes without a point, so it cannot be verified.
     """
     says = found.state == INFEASIBLE
     answered = found.ran & ~np.isin(found.state, UNANSWERED)

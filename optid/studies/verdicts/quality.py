@@ -11,7 +11,7 @@ from optid.studies.verdicts.ranks import Ranking, rank
 
 SMALLEST = 1e-12  # parameter errors below are roundoff
 WORST = -100.0  # %; a simulation that runs away must not decide a mean over all records
-FEW = MINIMUM_PAIRS  # data sets, from which on they are compared as one sample; of fewer each speaks for itself
+FEW = MINIMUM_PAIRS  # data sets, from which on they are compared as one sample; fewer are compared one by one
 SLACK = 0.5  # share of the records by which a formulation may stay behind: fits compare on common records anyway
 FIGURES = ("simulation_fit", "one_step_fit", "parameter_error", "nonlinearity_error")
 
@@ -31,7 +31,7 @@ class DataSet:
 
     @property
     def decided(self) -> bool:
-        """Whether its records tell which of two or more formulations is the best here, or that they are equal."""
+        """Whether its records decide which of several formulations is the best, or that they are equal."""
         return self.choice.decided and bool(self.choice.against)
 
 
@@ -39,10 +39,9 @@ class DataSet:
 class Quality(DataSet):
     """Records against formulations; on every record the model of the solver with the best verified objective.
 
-    The choice is in points of fit or as a ratio of errors. One data set is judged by its records. Of fewer than `FEW`
-    each is judged by its own: first is who leads on all of them, and "depends" says that nobody does. From `FEW` on the
-    data sets are the sample, each with the mean over its records: records of one system do not say what holds on
-    another.
+    The choice is in points of fit or as a ratio of errors. One data set is compared by its records. Of fewer than `FEW`
+    each is compared by its own records: first is the one that leads on all of them, and "depends" means that none does.
+    From `FEW` on the data sets are the sample, each with the mean over its records.
     """
 
     formulations: tuple[str, ...]
@@ -110,9 +109,9 @@ def _mean(values: np.ndarray, data: np.ndarray) -> float:
 
 def _of_few(sets: tuple[DataSet, ...], choice: Choice, losses: np.ndarray, names: tuple[str, ...], data: np.ndarray,
             errors: bool) -> Choice:
-    """Choose between formulations on two to five data sets, too few to be a sample: who leads on every one of them.
+    """Choose between formulations on two to five data sets, too few for a sample: the one that leads on every one.
 
-    A data set that cannot tell says nothing against a formulation that is behind by a trifle at most.
+    An undecided data set excludes no formulation that is behind by less than a notable difference.
     """
     decided = [one for one in sets if one.decided]
     if not decided:

@@ -1,9 +1,9 @@
-"""Ranks over data sets: does an order carry over to other data sets?
+"""Ranks over data sets: whether an order holds on other data sets.
 
-The unit is the data set, never the seed: seeds of one data set say how sure its own result is, not whether it holds
-elsewhere (J. Demšar, Statistical comparisons of classifiers over multiple data sets, Journal of Machine Learning
-Research 7 (2006) 1-30). Each is compared with the best by the exact sign test, which needs no other one: differences of
-mean ranks depend on who else takes part (A. Benavoli, G. Corani, F. Mangili, the same journal, 17 (2016) 1-10).
+The unit is the data set, not the seed: seeds of one data set give the uncertainty of its own result only (J. Demšar,
+Statistical comparisons of classifiers over multiple data sets, Journal of Machine Learning Research 7 (2006) 1-30).
+Each is compared with the best by the exact sign test, which depends on no other one, as differences of mean ranks do
+(A. Benavoli, G. Corani, F. Mangili, the same journal, 17 (2016) 1-10).
 """
 
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ LEVEL = 0.05  # of all tests
 
 @dataclass(frozen=True)
 class Ranking:
-    """Mean ranks of k solvers over data sets, 1 the best, and who is behind the best."""
+    """Mean ranks of k solvers over data sets, 1 the best, and those behind the best."""
 
     names: tuple[str, ...]  # the solvers, best mean rank first
     ranks: np.ndarray  # their mean ranks
     n: int  # data sets
     probabilities: dict[str, float]  # {other: of signs as unequal as these between two alike, for all pairs at once}
     left_out: tuple[str, ...] = ()  # solvers that did not run on every data set
-    missing: str = ""  # what is missing to tell
+    missing: str = ""  # the missing data
 
     @property
     def behind(self) -> tuple[str, ...]:
-        """Who is behind the best beyond chance."""
+        """Those significantly behind the best."""
         return tuple(name for name, p in self.probabilities.items() if p < LEVEL and not self.missing)
 
 
 def sign_test(lost: int, won: int, sides: str = "two-sided") -> float:
-    """Return the exact probability of so many losses and wins, or more unequal ones, between two that are alike.
+    """Return the exact probability of at least as unequal losses and wins between two equals; 1 without any.
 
-    One-sided ("greater") it is that of so many losses or more; it is 1 where nothing is lost or won.
+    With sides "greater" it is the one-sided probability of at least as many losses.
     """
     return float(binomtest(lost, lost + won, alternative=sides).pvalue) if lost + won else 1.0
 
@@ -51,9 +51,9 @@ def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.
          ) -> Ranking:
     """Rank those that were tried on every data set; a failure on a problem ranks last there, failures tied.
 
-    Costs (lower is better, ``nan`` where not solved) and where somebody was tried are (P, k), the labels of the data
-    sets (P,). The probabilities are multiplied by the number of pairs, since the best is known only afterwards; with
-    fewer data sets than let a unanimous comparison be told, `Ranking.missing` says how many it takes.
+    Costs (lower is better, ``nan`` where not solved) and `tried` are (P, k), the labels of the data sets (P,). The
+    probabilities are multiplied by the number of pairs, since the best is known only afterwards; with too few data sets
+    for a significant unanimous comparison, `Ranking.missing` says how many are needed.
     """
     everywhere = [bool(len(data)) and all(column[data == label].any() for label in dict.fromkeys(data))
                   for column in tried.T]

@@ -1,4 +1,4 @@
-"""How every solver stands on a set of problems: all of a study, or those of one formulation."""
+"""The standing of every solver on a set of problems: all of a study, or those of one formulation."""
 
 from dataclasses import dataclass
 
@@ -27,7 +27,7 @@ class Standing:
     solved: int  # where it reached the verified accuracy at the best verified objective
     refused: int  # problems it does not take
     false_claims: int  # problems on which a claim of it was false
-    fastest: int  # problems on which nobody was faster
+    fastest: int  # problems on which no solver was faster
     time: float  # shifted geometric mean of the seconds on what it solved; others may have solved other problems
     fit: float  # the same of the whole fit; building, judging and proving take their time, too
     proved: int  # problems on which what it solved is proved globally optimal
@@ -47,18 +47,18 @@ class Section:
     """The comparison on one set of problems."""
 
     name: str  # label of the formulation, or "" for all problems
-    found: Results  # its problems and solvers; problems without a solution, by common consent, are taken out
-    infeasible: int  # how many were taken out
-    deniers: tuple[int, int]  # solvers that say so of some of them, and solvers that were run on some
+    found: Results  # its problems and solvers, without problems that are infeasible by agreement
+    infeasible: int  # number of those
+    deniers: tuple[int, int]  # solvers that claim it for some of them, and solvers that were run on some
     standings: tuple[Standing, ...]  # of the solvers that were run, best first
     idle: tuple[str, ...]  # solvers that were run on none of these problems
-    choice: Choice  # who comes first
+    choice: Choice  # the best solver
     ranking: Ranking  # over data sets
     profiles: dict[str, Profile]  # performance profiles
 
     @property
     def recommended(self) -> tuple[str, ...]:
-        """Who comes first or ties for it; empty where that cannot be told, or where it fails more often than not."""
+        """The first and those that tie; empty where undecided, or where it fails more often than not."""
         good = self.choice.decided and self.standing(self.choice.first).share >= 0.5
         return self.choice.leaders if good else ()
 
@@ -76,7 +76,7 @@ def compare_solvers(found: Results, name: str = "") -> Section:
     kept = found.where(~gone)
     choice = choose(kept.time, kept.solvers)
     says = (found.state == INFEASIBLE) & gone[:, None]
-    counted = found.ran & ~says  # who crashed on a problem without a solution has failed on it all the same
+    counted = found.ran & ~says  # a crash on an infeasible problem is a failure
 
     def order(standing: Standing) -> tuple:
         """First choice, candidates by their time against it, then by what was solved."""
@@ -85,16 +85,16 @@ def compare_solvers(found: Results, name: str = "") -> Section:
         return (standing.solver != choice.first, not candidate, ratio if candidate else -standing.solved,
                 standing.penalised if np.isfinite(standing.penalised) else np.inf, standing.solver)
 
-    tried = kept.ran & kept.solved.any(axis=0)  # who never solved anything is last without a test
+    tried = kept.ran & kept.solved.any(axis=0)  # a solver without a solved problem is last without a test
     return Section(
         name, kept, int(gone.sum()), (int(says.any(axis=0).sum()), int(found.ran[gone].any(axis=0).sum())),
-        tuple(sorted(_standings(found, counted, choice), key=order)), idle, choice,
+        tuple(sorted(_standings(found, counted), key=order)), idle, choice,
         rank(kept.time, tried, kept.solvers, kept.data_set),
         dict(zip(kept.solvers, performance_profiles(kept.time))))
 
 
-def _standings(found: Results, counted: np.ndarray, choice: Choice) -> list[Standing]:
-    """Standings in the order of the solvers; counted are the entries that count for or against the solver, (P, S)."""
+def _standings(found: Results, counted: np.ndarray) -> list[Standing]:
+    """Return the standings in the order of the solvers; `counted` are the entries that count for or against, (P, S)."""
     times, fastest = found.time, time_ratios(found.time) == 1.0
     slowest = np.nanmax(times, axis=1, initial=0.0) if times.size else 0.0
     limits = np.where(np.isfinite(found.limit), np.fmax(found.limit, slowest), np.inf)

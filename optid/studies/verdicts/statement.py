@@ -37,7 +37,7 @@ def plural(n: int, noun: str) -> str:
 
 
 def counting(accuracy: float) -> str:
-    """Say which residuals count as a requested accuracy reached, and that a stricter request changes nothing below."""
+    """State which residuals count as a requested accuracy, and below which request nothing changes."""
     most = f"verified residuals up to {tolerance(accuracy):.0e} count"
     return f"{most}; asking for less than {FINEST:.0e} changes nothing" if accuracy < FINEST else most
 
@@ -55,7 +55,7 @@ def there_are(n: int) -> str:
 
 
 def listed(names: Sequence[str], most: int = 4) -> str:
-    """Write names as "a, b and c", in quotes where a name has a comma; of many the first ones and how many more."""
+    """Write names as "a, b and c", quoted if one has a comma; of many the first ones and the number of the others."""
     names = list(names)
     if any("," in name or " and " in name for name in names):
         names = [f"\u201c{name}\u201d" for name in names]

@@ -1,4 +1,4 @@
-"""The verdict of a study: who solves what, how fast, at equal verified accuracy, and what the data cannot tell."""
+"""The verdict of a study: problems solved, times at equal verified accuracy, and undecided questions."""
 
 import re
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class FalseClaim:
     solver: str
     formulation: str
     count: int  # runs
-    claimed: str  # what the solver said
+    claimed: str  # status reported by the solver
     reason: str  # why it is false, of one of them
 
 
@@ -52,7 +52,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a study says."""
+    """The verdict of a study."""
 
     table: Table  # the rows, one array per column
     found: Results  # problems and solvers, the accuracy and the measure of time
@@ -63,11 +63,11 @@ class Verdict:
     false_claims: tuple[FalseClaim, ...]  # most frequent first
     failures: tuple[Failure, ...]  # most frequent first, refusals at the end
     headline: Statement  # the verdict in one line
-    statements: tuple[Statement, ...]  # further recommendations, warnings, and what cannot be told
+    statements: tuple[Statement, ...]  # further recommendations, warnings and open questions
 
     @property
     def recommended(self) -> tuple[str, ...]:
-        """Solvers that come first or tie for it on all problems; empty where nobody can be recommended."""
+        """Solvers that come first or tie for it on all problems; empty if none is recommended."""
         return self.overall.recommended
 
     def __str__(self) -> str:
@@ -85,7 +85,7 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
         time: "solve" (compile and solve, cold), "fit" (the whole fit) or "warm" (the second solve).
 
     Returns:
-        The verdict. A solver counts only where our residuals verified the accuracy; what the data cannot tell is said.
+        The verdict. A solver counts only where our residuals verified the accuracy; undecided questions are stated.
 
     Raises:
         DataError: these are no rows of a study, an unknown measure of time, or an accuracy that is none.
@@ -123,8 +123,8 @@ def _statements(overall: Section, sections: tuple[Section, ...], quality: Qualit
             said.append(carries_over(overall.ranking))
     said += [_failed_data(found), _never(overall), _refuted(found, table)]
     if not quality.truth and any(quality.solved.values()):
-        said.append(Statement(FAIR, "Truth unknown", "Errors of parameters and nonlinearity cannot be told: the truth "
-                              "is not known for any record.", "formulation"))
+        said.append(Statement(FAIR, "Truth unknown", "Errors of parameters and nonlinearity are unknown: no record has "
+                              "a known truth.", "formulation"))
     other = states_of_rows(table, found) == OTHER_ACCURACY
     if other.any():
         asked = ", ".join(f"{value:.0e}" for value in np.unique(table["accuracy"][other]))
@@ -158,7 +158,7 @@ def _never(overall: Section) -> Statement | None:
 
 
 def _refuted(found: Results, table: Table) -> Statement | None:
-    """Warn where a proved lower bound lies above an objective that another run verified: then a proof is wrong."""
+    """Warn where a proved lower bound lies above a verified objective of another run: a proof is wrong."""
     if not found.row.size:
         return None
     there = np.isfinite(found.objective)
@@ -196,5 +196,5 @@ def _failures(found: Results) -> tuple[Failure, ...]:
 
 
 def without_numbers(reason: str) -> str:
-    """Return a sentence without its numbers, so that sentences of one kind count together."""
+    """Replace the numbers in a sentence, so that sentences of one kind count together."""
     return re.sub(r"(?<![A-Za-z_])[-+]?\d[\d.,]*(?:e[-+]?\d+)?", "…", reason)
