@@ -1,9 +1,9 @@
-"""Are wild readings found, and what do they cost a fit with loss="huber"?
+"""Are outliers found, and what do they cost a fit with loss="huber"?
 
     python benchmarks/outliers.py [--problems 20] [--records 400]
 
-Three tables. First, of how many records of 500 samples every wild reading is named and no other, per signal, number of
-wild readings and size in standard deviations of the signal; the column of 0 counts false alarms. Second, fits of random
+Three tables. First, of how many records of 500 samples every outlier is named and no other, per signal, number of
+outliers and size in standard deviations of the signal; the column of 0 counts false alarms. Second, fits of random
 second-order Hammerstein systems whose outputs are read wrong by 50 (standard deviation of the output 1 to 3): fit in
 points, on new data without noise, of least squares on the sound record less that of the loss on the record read wrong;
 largest over the problems. The last column is what marking the wrong readings as missing costs least squares. Third, the
@@ -33,7 +33,7 @@ CASES = ((0, 0), (1, 30), (8, 20), (20, 20), (50, 20), (20, 8))
 
 
 def named(make, count: int, size: float, runs: int = 100) -> int:
-    """Count the records in which the wild readings are named and no others."""
+    """Count the records in which the outliers are named and no others."""
     hits = 0
     for seed in range(runs):
         rng = np.random.default_rng(seed)

@@ -289,7 +289,7 @@ def test_results_by_name():
                          ("hammerstein_bj.exact", {"nc": 1, "nd": 1, "basis": BASIS})):
         fit = quiet(data, name, na=1, nb=2, nk=1, **orders)
         assert isinstance(fit.model, HammersteinTF)
-        assert "starts arrive there" in fit.figures["starts"] and not fit.solution.bound.proved
+        assert "starts converge to it" in fit.figures["starts"] and not fit.solution.bound.proved
         assert "prediction errors are not convex" in fit.solution.reason
         assert fit.model.title in str(fit)
 

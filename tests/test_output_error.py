@@ -205,7 +205,7 @@ def test_objective_is_the_sum_of_squared_simulation_errors():
     assert fit.one_step_fit[0] == pytest.approx(fit.simulation_fit[0], abs=1e-6)
     assert fit.solution.bound.value == -np.inf and not fit.solution.proof
     assert "simulation errors are not convex" in fit.solution.reason and "no lower bound" in fit.solution.reason
-    assert "starts arrive there" in fit.figures["starts"]
+    assert "starts converge to it" in fit.figures["starts"]
     assert fit.figures["programmes"] == 1
     assert "output-error" in str(fit)
 

@@ -242,6 +242,6 @@ def agreement(found: Sequence[Descent], floor: float) -> tuple[int, str]:
     """Return how many descents share the best value, and a sentence that says so."""
     best = found[0]
     same = [one for one in found if abs(one.value - best.value) <= AGREE * best.value + floor]
-    sentence = f"{len(same)} of {len(found)} starts arrive there ({', '.join(one.start for one in same)})"
+    sentence = f"{len(same)} of {len(found)} starts converge to it ({', '.join(one.start for one in same)})"
     out = [one for one in found if one.border and one not in same and one.value < best.value]
     return len(same), sentence + (f"; {len(out)} with a smaller error end at the border of stability" if out else "")
