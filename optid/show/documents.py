@@ -108,12 +108,8 @@ def _fit_charts(fit: "Fit") -> list[Any]:
     parts: list[Any] = []
     if isinstance(fit.data, Data):
         parts.append(Charts(charts.record_charts({"": fit.model}, fit.data), wide=True))
-    several = [*charts.nonlinearity_charts(fit), *charts.dynamics_charts({"": fit.model}, fit)]
-    for name, values in summary.theta_singular_values(fit).items():
-        several.append(charts.spectrum_chart(f"Singular values of Theta, {name}", values, 1))
-    order = fit.model.orders.get("nx", 0)
-    several += [charts.spectrum_chart(name[:1].upper() + name[1:], values, int(order) or 1)
-                for name, values in summary.spectra(fit).items()]
+    several = [*charts.nonlinearity_charts(fit), *charts.dynamics_charts({"": fit.model}, fit),
+               *charts.theta_charts(fit), *charts.spectrum_charts(fit)]
     if summary.has_noise(fit.model):
         several.append(charts.noise_chart(fit.model))
     return [*parts, Charts(several)]

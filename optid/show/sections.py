@@ -167,15 +167,13 @@ class Document:
 
 def extremes(values: Array, bins: int) -> NDArray[np.intp]:
     """Return the places of the smallest and the largest of each of so many stretches of values (N,), and of gaps."""
-    kept = set()
-    edges = np.linspace(0, values.size, bins + 1).astype(int)
-    for a, b in zip(edges[:-1], edges[1:]):
-        part = values[a:b]
-        here = np.isfinite(part)
-        kept |= {a} if not here.all() else set()
-        if here.any():
-            kept |= {a + int(np.nanargmin(part)), a + int(np.nanargmax(part))}
-    return np.array(sorted(kept))
+    width = -(-values.size // bins)
+    stretches = np.pad(values, (0, -values.size % width), constant_values=np.nan).reshape(-1, width)
+    missing, first = ~np.isfinite(stretches), np.arange(0, values.size, width)
+    places = np.concatenate([first + np.argmin(np.where(missing, np.inf, stretches), axis=1),
+                             first + np.argmax(np.where(missing, -np.inf, stretches), axis=1),
+                             (first + np.argmax(missing, axis=1))[missing.any(axis=1)]])
+    return np.unique(places[places < values.size])
 
 
 def decibels(magnitude: Array) -> Array:

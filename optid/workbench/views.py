@@ -15,8 +15,8 @@ from optid.show import charts, summary
 from optid.show.page import coded
 from optid.show.sections import TONES, Axis, Chart, Series
 
-BINS = 700
-"""Stretches of the time axis, of each of which the extremes are drawn."""
+SHOWN = 1400
+"""Samples of a curve that are drawn; of a longer one the extremes of half as many stretches."""
 
 POINTS, STEPS, DRAWS = 41, 60, 1000
 """Places of the band of a characteristic; samples of a step response at most; draws for a band under constraints."""
@@ -42,34 +42,9 @@ def quick(fit: Any, run: list[Array] | None) -> dict[str, Any]:
 
 def time_chart(record: Data, run: list[Array] | None, first: int, last: int) -> list[dict[str, Any]]:
     """Return outputs, measured and simulated, and inputs between two samples of the first experiment."""
-    e, found = record.experiments[0], []
-    several = f", experiment 1 of {record.n_experiments}" if record.n_experiments > 1 else ""
-    first, last = max(first, 0), min(last, e.n_samples)
-    t = e.start + record.dt * np.arange(first, last, dtype=float)
-    for o, name in enumerate(record.outputs):
-        series = [("measured", e.y[first:last, o], "ink", 1.1)]
-        if run is not None:
-            series.append(("simulated", run[0][first:last, o], "c0", 1.8))
-        found.append((f"Output {name}", name, record.output_units[o], series, 250))
-    for c, name in enumerate(record.inputs):
-        found.append((f"Input {name}", name, record.input_units[c], [(name, e.u[first:last, c], "muted", 1.1)], 150))
-    return [coded(Chart(title + several, "", Axis("time"), Axis(f"{name} ({unit})" if unit else name, unit=unit),
-                        [Series(label, *reduced(t, values), colour=colour, width=width)
-                         for label, values, colour, width in series], "time", height=height)) | {"tool": "time"}
-            for title, name, unit, series, height in found]
-
-
-def reduced(t: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
-    """Return the smallest and the largest value of every stretch, in order of time."""
-    width = len(values) // bins
-    if width <= 2:
-        return t, values
-    whole = values[: bins * width].reshape(bins, width)
-    low = np.argmin(np.where(np.isfinite(whole), whole, np.inf), axis=1)
-    high = np.argmax(np.where(np.isfinite(whole), whole, -np.inf), axis=1)
-    kept = np.unique(np.concatenate([np.arange(bins) * width + low, np.arange(bins) * width + high,
-                                     [len(values) - 1]]))
-    return t[kept], values[kept]
+    part = slice(max(first, 0), last)
+    shown = charts.time_charts(record, 0, [("simulated", run, {"width": 1.9})], "time", part=part, heights=(250, 150))
+    return [coded(chart, SHOWN) | {"tool": "time"} for chart in shown]
 
 
 def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
@@ -93,17 +68,15 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
 
         value = shown(model)
         band = None if known is None else known.of(shown)
-        density, edges = np.histogram(samples[np.isfinite(samples)], bins=40, range=(low, high))
-        bars = Series("density of the samples", edges[:-1], density / max(density.max(), 1), "bars", "muted",
-                      aside=True)
+        bars = charts.density(samples[np.isfinite(samples)], low, high)
         for what, at, x, extra in (
-                ("static", points, Axis(_named(channel, record.input_units[c])), [bars]),
+                ("static", points, charts.channel_axis(channel, record.input_units[c]), [bars]),
                 ("step", model.dt * np.arange(count), Axis("time"), [])):
             part = slice(0, points.size) if what == "static" else slice(points.size, None)
             series = [] if band is None else [Series("95 % band", at, band.upper[part], "area", lows=band.lower[part])]
             title = f"Static characteristic of {channel}" if what == "static" else (
                 f"Step response to {channel} from {low:.3g} to {high:.3g}")
-            y = Axis(_named(record.outputs[0], record.output_units[0]))
+            y = charts.channel_axis(record.outputs[0], record.output_units[0])
             found.append(coded(Chart(title, "", x, y, [*series, Series("fit", at, value[part], width=2.2), *extra],
                                      height=300)) | {"tool": what, "channel": channel if model.m > 1 else None,
                                                      "dt": model.dt, "interval": [low, high]})
@@ -132,10 +105,6 @@ def judged(fit: Any) -> dict[str, Any]:
     return {"word": found.word, "tone": TONES[found.word], "sentence": says, "parts": [
         [part.name, part.value, "PASS" if part.passed else "FAIL"] for part in found.parts],
         "charts": [coded(one) for one in charts.correlation_charts(charts.validated(fit.model, fit.data.raw()))]}
-
-
-def _named(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name
 
 
 def _finite(value: float) -> float | None:
