@@ -57,6 +57,7 @@ class Model(Ports):
     offset_note: Any
     equation: Callable[..., str]
     impulse_response: Callable[..., Array]
+    static_curve: Callable[[int, Array], Array]
     _static_gain: Callable[[Array], Array]
     _state_shape: Any
     _predicted: Callable[[Array, Array, int, Array, str], Array]

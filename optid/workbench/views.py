@@ -64,7 +64,7 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
         def shown(model: Any, c: int = c, points: Array = points, span: Array = span) -> Array:
             f = model.nonlinearities[c]
             step = model.step_response(count).reshape(count, model.l, -1)[:, 0, c] * np.diff(f(span))
-            return np.concatenate([static(model, c, points), step])
+            return np.concatenate([model.static_curve(c, points)[:, 0], step])
 
         value = shown(model)
         band = None if known is None else known.of(shown)
@@ -81,18 +81,6 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
                                      height=300)) | {"tool": what, "channel": channel if model.m > 1 else None,
                                                      "dt": model.dt, "interval": [low, high]})
     return found
-
-
-def static(model: Any, c: int, points: Array) -> Array:
-    """Return the first output at rest with an input held at points (k,), the functions of the others at zero."""
-    if model.structure == "ss":
-        rest = np.eye(model.nx) - model.A
-        gain = model.C[0] @ np.linalg.solve(rest, model.B[:, c]) + model.D[0, c]
-        level = model.C[0] @ np.linalg.solve(rest, model.offset_x) + model.offset_y[0]
-        return level + gain * model.nonlinearities[c](points)
-    rest = np.eye(model.l) + model.matrices.sum(axis=0)
-    gain = np.linalg.solve(rest, np.atleast_1d(np.sum(model.b[c], axis=0)))[0]
-    return np.linalg.solve(rest, np.atleast_1d(model.offset))[0] + gain * model.nonlinearities[c](points)
 
 
 def judged(fit: Any) -> dict[str, Any]:
