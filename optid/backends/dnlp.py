@@ -32,19 +32,13 @@ CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
 @dataclass(frozen=True)
 class Smooth:
-    """A programme after CVXPY's smooth chain, with the way back.
+    """A programme after CVXPY's smooth chain, with the way back."""
 
-    Attributes:
-        original: the problem it was made from.
-        problem: the smooth problem; its constraints are read through ``rows``.
-        attributes, kinks: the two reductions, with their inverse data in ``inverse``.
-    """
-
-    original: cp.Problem
-    problem: cp.Problem
-    attributes: CvxAttr2Constr
-    kinks: Dnlp2Smooth
-    inverse: tuple[Any, Any]
+    original: cp.Problem  # the problem it was made from
+    problem: cp.Problem  # the smooth problem; its constraints are read through ``rows``
+    attributes: CvxAttr2Constr  # the first of the two reductions
+    kinks: Dnlp2Smooth  # the second
+    inverse: tuple[Any, Any]  # their inverse data
 
     @cached_property
     def variables(self) -> list[cp.Variable]:

@@ -51,22 +51,16 @@ class Bound:
 
 @dataclass(frozen=True)
 class Residuals:
-    """Our own measurements at a solver's point; all relative, zero at an exact solution.
+    """Our own measurements at a solver's point; all relative, zero at an exact solution."""
 
-    Attributes:
-        violation: largest constraint violation, relative to the size of the constraint's terms.
-        worst: name of the constraint that is violated most.
-        stationarity: largest component of the gradient of the Lagrangian, relative to the terms it is a sum of plus
-            the objective per size of the variable (so that units do not matter); multipliers of the wrong sign count
-            as missing. ``nan`` where it cannot be formed (no multipliers, or an objective with kinks: the bound
-            judges there).
-        complementarity: sum of the products of multiplier and slack, relative to the objective (where it vanishes, to a
-            hundredth of its scale).
-    """
-
-    violation: float
-    worst: str
+    violation: float  # largest constraint violation, relative to the size of the constraint's terms
+    worst: str  # name of the constraint that is violated most
+    # largest component of the gradient of the Lagrangian, relative to the terms it is a sum of plus the objective per
+    # size of the variable (so that units do not matter); multipliers of the wrong sign count as missing. ``nan`` where
+    # it cannot be formed (no multipliers, or an objective with kinks: the bound judges there)
     stationarity: float
+    # sum of the products of multiplier and slack, relative to the objective (where it vanishes, to a hundredth of its
+    # scale)
     complementarity: float
 
 

@@ -254,28 +254,21 @@ def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Setti
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a procedure returns when its objective is not that of its last programme.
+    """What a procedure returns when its objective is not that of its last programme."""
 
-    Attributes:
-        model: the model.
-        objective: value of the procedure's own objective.
-        bound: bound on that objective, with the reason where there can be none; or a function that returns it, called
-            when the solution of the fit is first asked for.
-        status: status of the procedure as a whole.
-        reason: one sentence for people.
-        figures: what the procedure measured on its way, by the words under which people read it ("condition of R11",
-            "starts", "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first,
-            which the report draws. The fit prints them in this order.
-        extend: returns the model completed by what only some uses need, such as a noise model, and further figures; it
-            is called when the model of the fit is first asked for.
-    """
-
-    model: Any
-    objective: float
+    model: Any  # the model
+    objective: float  # value of the procedure's own objective
+    # bound on that objective, with the reason where there can be none; or a function that returns it, called when the
+    # solution of the fit is first asked for
     bound: Bound | Callable[[], Bound]
-    status: Status
-    reason: str = ""
+    status: Status  # status of the procedure as a whole
+    reason: str = ""  # one sentence for people
+    # what the procedure measured on its way, by the words under which people read it ("condition of R11", "starts",
+    # "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first, which the report
+    # draws. The fit prints them in this order
     figures: Mapping[str, Any] = field(default_factory=dict)
+    # returns the model completed by what only some uses need, such as a noise model, and further figures; it is called
+    # when the model of the fit is first asked for
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
 
     def extended(self) -> tuple[Any, dict[str, Any]]:
@@ -290,26 +283,19 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a formulation ended with.
+    """What a formulation ended with."""
 
-    Attributes:
-        model: the model, or None where no programme had a point.
-        solution: the last solution.
-        program: the last programme.
-        steps: every (name, solution) on the way; one entry for a plain programme.
-        figures: those of the evidence, and which solvers stood in for others.
-        constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
-            constraints to the steps they are about.
-        evidence: with which a procedure judged the whole, so that solution and program are no pair of their own; the
-            solution has no bound where the evidence has a function that returns it.
-    """
-
-    model: Any
-    solution: Solution
-    program: Program
-    steps: tuple[tuple[str, Solution], ...]
+    model: Any  # the model, or None where no programme had a point
+    solution: Solution  # the last solution
+    program: Program  # the last programme
+    steps: tuple[tuple[str, Solution], ...]  # every (name, solution) on the way; one entry for a plain programme
+    # those of the evidence, and which solvers stood in for others
     figures: Mapping[str, Any] = field(default_factory=dict)
+    # the last programme, with its solution, in which each user constraint stood: a procedure hands its constraints to
+    # the steps they are about
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
+    # with which a procedure judged the whole, so that solution and program are no pair of their own; the solution has
+    # no bound where the evidence has a function that returns it
     evidence: Evidence | None = None
 
 

@@ -34,25 +34,15 @@ class Constraint:
 
 @dataclass(frozen=True)
 class Request:
-    """One state of the page.
+    """One state of the page."""
 
-    Attributes:
-        inputs: names of the inputs.
-        outputs: names of the outputs.
-        window: first sample and the one after the last.
-        formulation: its name.
-        arguments: of the formulation.
-        constraints: set by hand.
-        draft: whether a hand is moving it, so that one pass for bands of the step response is enough.
-    """
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    window: tuple[int, int]
-    formulation: str
-    arguments: Mapping[str, Any]
-    constraints: tuple[Constraint, ...] = ()
-    draft: bool = False
+    inputs: tuple[str, ...]  # names of the inputs
+    outputs: tuple[str, ...]  # names of the outputs
+    window: tuple[int, int]  # first sample and the one after the last
+    formulation: str  # its name
+    arguments: Mapping[str, Any]  # of the formulation
+    constraints: tuple[Constraint, ...] = ()  # set by hand
+    draft: bool = False  # whether a hand is moving it, so that one pass for bands of the step response is enough
 
     @classmethod
     def parse(cls, state: Any, draft: bool = False) -> "Request":
