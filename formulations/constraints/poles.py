@@ -231,7 +231,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         largest = float(np.max(np.abs(model.poles), initial=0.0))
         if largest <= radius * (1 + MARGIN):
             return ""
-        return f"constraint {name!r}: the largest pole has modulus {largest:.6g}; ask for a smaller radius"
+        return f"constraint {name!r}: the largest pole has modulus {largest:.6g}; use a smaller radius"
 
     def stand_in(arguments: Mapping[str, Any]) -> str:
         na = arguments.get("na", 0)

@@ -23,7 +23,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked of a solver, in words that do not depend on the solver."""
+    """Requests to a solver, in words that do not depend on the solver."""
 
     accuracy: float = 1e-8  # requested relative accuracy; every back end translates it into its own tolerances
     time_limit: float | None = None  # seconds, or None
@@ -47,7 +47,7 @@ class Answer:
     values: Mapping[str, np.ndarray] = field(default_factory=dict)  # {variable: array}, empty without a point
     duals: Mapping[str, np.ndarray] = field(default_factory=dict)  # {constraint: flat multipliers}; may be incomplete
     iterations: int = -1  # -1 where unknown
-    # seconds of the call that translated the programme for the solver; nan where they are not told apart
+    # seconds of the call that translated the programme for the solver; nan where they are not measured separately
     compile: float = float("nan")
 
 
@@ -82,7 +82,7 @@ class BackEnd:
     run: Callable[["Program", Settings], Answer] = field(repr=False)  # (program, settings) -> Answer
     installed: bool = True  # whether it can run here
     pip: str = ""  # what to install where it cannot
-    structures: tuple[type[Structure], ...] = ()  # types of structure it accepts, whatever the class of the programme
+    structures: tuple[type[Structure], ...] = ()  # types of structure it accepts in any class of programme
     duals: bool = True  # whether it returns multipliers
     warm: bool = False  # whether it can start from a given point
     # options with which it searches further for a better local optimum, for where the proof fails

@@ -60,7 +60,7 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
                   weights: Array | None = None) -> HankelBounds:
     """Bound the simulation error of every model of order 0 to ``largest``.
 
-    Windows that touch a missing sample are left out, which keeps the bound valid: it then speaks about fewer samples.
+    Windows that touch a missing sample are left out, which keeps the bound valid for the remaining samples.
 
     Args:
         records: one array (N, c) of raw channels per experiment, NaN = missing.

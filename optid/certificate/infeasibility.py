@@ -84,7 +84,7 @@ def _feasible(members: Sequence[Any]) -> bool:
         try:
             solve_quietly(problem, solver)
             break
-        except cp.SolverError:  # it gave up; where both do, nothing is known, so nothing can be blamed
+        except cp.SolverError:  # it failed; where both fail, the constraints count as satisfiable
             continue
     else:
         return True
@@ -99,7 +99,7 @@ def _has_length(b: cp.Variable, members: Sequence[Any]) -> bool:
 
 def _linearised(member: Any) -> Any:
     expression, slopes = member.expr, jacobians(member.expr)
-    if slopes is None:  # nothing is known of it, so it cannot be blamed
+    if slopes is None:  # without a gradient it counts as satisfiable
         return cp.Constant(0.0) <= 0
     linear: Any = flat_value(expression)
     for variable, slope in slopes.items():

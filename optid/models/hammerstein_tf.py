@@ -26,7 +26,7 @@ from optid.models.recursions import autoregression, predict_regression
 
 # share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured
 TINY_SUM = 1e-6
-FORGOTTEN = 1e-12  # a free response below this share of its start no longer informs about the initial state
+FORGOTTEN = 1e-12  # a free response below this share of its start carries no information about the initial state
 
 
 @dataclass(frozen=True, eq=False, repr=False)

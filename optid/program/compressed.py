@@ -1,4 +1,4 @@
-"""What prices, fits and intervals ask of the compressed data behind a programme."""
+"""The interface of compressed data that prices, fits and intervals use."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

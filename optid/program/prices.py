@@ -32,7 +32,7 @@ class Price:
     slack: float  # smallest slack over the rows in units of the constraint (0 for equalities)
     multiplier: float  # change of the objective per unit of the bound; ``nan`` where the solver gives no multipliers
     # points of one-step fit (%, all outputs together) gained per unit of the bound; ``nan`` where the constraint
-    # belongs to a step with an objective of its own
+    # belongs to a step with another objective
     fit_points: float
     step: float = float("nan")  # what 1 % is in units of the bound
     words: str = ""  # of what: of the range of f where the bound is about f, else of the size of what it bounds
@@ -80,7 +80,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
 def price_earlier_steps(steps: Mapping[str, tuple[Program, Solution]], last: Program) -> tuple[Price, ...]:
     """Return the prices of the constraints that are not in the last programme, from the step in which each stood.
 
-    Their multipliers are in units of the objective of their own step, so they have no price in points of fit.
+    Their multipliers are in units of the objective of that step, so they have no price in points of fit.
     """
     found = []
     for name, (program, solution) in steps.items():

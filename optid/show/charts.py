@@ -35,7 +35,7 @@ def channel_axis(name: str, unit: str) -> Axis:
 
 
 def validated(model: Any, record: Data) -> "Validation":
-    """Validate a model without the warnings, which stand in the notes."""
+    """Validate a model without the warnings, which the notes repeat."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         return validate(model, record)

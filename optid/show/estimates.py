@@ -19,7 +19,7 @@ MOST_NODES, EVEN = 20, 11
 """A piecewise linear f with fewer cells than the first is listed at its nodes, any other at so many points."""
 
 MOST_ROWS, ABREAST = 12, 3
-"""More coefficients than the first, without errors to show, stand in so many columns beside each other."""
+"""More coefficients than the first, without errors to show, are set in so many columns."""
 
 
 def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:

@@ -1,4 +1,4 @@
-"""Drawings on matplotlib axes: each function draws one panel, and knows nothing of the figure around it."""
+"""Drawings on matplotlib axes: each function draws one panel, independent of its figure."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -63,7 +63,7 @@ MARKERS = {"stems": "o", "diamonds": "D", "dots": "o", "poles": "x"}
 """Signs of the series of a chart that are no lines."""
 
 CLOSEUP = 200
-"""Samples of a long record that are drawn where single ones are to be told apart."""
+"""Samples of the close-up of a long record, in which single samples are visible."""
 
 POINTS = 2000
 """Samples of a line; of a longer one the extremes and the gaps of a third as many stretches are drawn."""

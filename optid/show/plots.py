@@ -210,7 +210,7 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
         ax.label_outer()
     several = f", experiments 1-{len(shown)} of {record.n_experiments}" if record.n_experiments > 1 else ""
     axes[0, 0].set_title(f"Fit over time: {title}{several}")
-    # outside the layout, where it would widen the column it stands in
+    # outside the layout, where it would widen its column
     place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 3, "borderaxespad": 0.2}
     axes[0, -1].legend(**place, handlelength=1.6).set_in_layout(False)
 
@@ -247,7 +247,7 @@ def _residual_panels(figure: Any, checked: Validation, record: Data, outputs: in
 
 
 def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
-    """Poles, the magnitude of every input-output pair and, where it is asked for, the step responses."""
+    """Poles, the magnitude of every input-output pair and, on request, the step responses."""
     magnitude, _, steps, poles = charts.dynamics_charts({"": fit.model}, fit)
     shown = [poles, magnitude, steps] if step else [poles, magnitude]
     axes = figure.subplots(1, len(shown), width_ratios=[1.0, 1.45, 1.25] if step else [1.0, 1.7])

@@ -1,4 +1,4 @@
-"""What a result has to say: sections of banners, facts, tables, charts and notes, for every renderer."""
+"""Documents of results: sections of banners, facts, tables, charts and notes, for every renderer."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class Axis:
 class Series:
     """One curve of a chart."""
 
-    name: str  # of the legend; "" stands in none
+    name: str  # of the legend; "" for none
     xs: Any  # (n,) places, ascending but for "line-only"
     ys: Any  # (n,) values, NaN where there are none; (n,) upper ends of an area
     # "curve", "line-only" (any order), "area", "stems", "diamonds", "dots", "poles" or "bars" (heights 0 to 1)

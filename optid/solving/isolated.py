@@ -1,4 +1,4 @@
-"""Run a back end in a process of its own: a crash or an endless loop is an outcome, not the end of the program."""
+"""Run a back end in a separate process: a crash or an endless loop is an outcome, not the end of the program."""
 
 import os
 import time
@@ -9,7 +9,7 @@ from optid.processes import run_forked
 from optid.program.program import Program
 from optid.program.solution import Status
 
-GRACE = 0.5  # seconds a solver has to notice its own time limit before it is killed
+GRACE = 0.5  # seconds after its time limit at which a solver is killed
 
 
 def run_isolated(back_end: BackEnd, program: Program, settings: Settings) -> Answer:

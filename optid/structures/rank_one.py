@@ -62,7 +62,7 @@ class RankOne:
 
     @cached_property
     def proofs(self) -> list[tuple[float, Any]]:
-        """The objective that was proved to be the least one, with its certification, so that nobody proves it again."""
+        """The objective that was proved to be the smallest, with its certification, so that it is proved once."""
         return []
 
     def value(self, z: Array) -> float:

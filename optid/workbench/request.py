@@ -42,11 +42,11 @@ class Request:
     formulation: str  # its name
     arguments: Mapping[str, Any]  # of the formulation
     constraints: tuple[Constraint, ...] = ()  # set by hand
-    draft: bool = False  # whether a hand is moving it, so that one pass for bands of the step response is enough
+    draft: bool = False  # whether it is part of a drag: one pass for bands of the step response is then enough
 
     @classmethod
     def parse(cls, state: Any, draft: bool = False) -> "Request":
-        """Read a state as the page sends it, a `draft` while a hand moves; anything else is a `DataError`."""
+        """Read a state as the page sends it, a `draft` during a drag; anything else is a `DataError`."""
         try:
             constraints = tuple(Constraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
                                 for c in state["constraints"])
@@ -64,7 +64,7 @@ class Request:
 
     @property
     def key(self) -> str:
-        """A text that two states share where they ask for the same fit."""
+        """A text that is equal for states with the same fit."""
         constraints = [(c.word, dict(c.arguments), c.name) for c in self.constraints]
         return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints,
                            self.draft and BAND in [c.word for c in self.constraints]], sort_keys=True)

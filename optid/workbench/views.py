@@ -1,4 +1,4 @@
-"""What the page shows of a fit: at once what a hand moves, and later what takes time, the verdict and the tests."""
+"""The content of the page for a fit: at once what follows a drag, later the verdict and the tests."""
 
 from contextlib import suppress
 from typing import Any
