@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 
 from optid.bases import BSpline, Linear, PiecewiseConstant, Polynomial, Triangular, Trigonometric, UserFunctions
 from optid.data.record import Data
@@ -346,8 +347,7 @@ def test_user_functions_are_asked_for_again(tmp_path):
     cube, settings = lambda x: x**3, {"na": 1, "nb": 1}
     recursion = RecursiveARX(basis=UserFunctions((cube,), ("cube",), interval=INSIDE), **settings)
     path = recursion.save(tmp_path / "state")
-    with pytest.raises(StructureError, match="cube"):
-        RecursiveARX.load(path)
+    refuses(StructureError, "cube", RecursiveARX.load, path)
     assert RecursiveARX.load(path, {"cube": cube}).layout.bases[0].size == 1
 
 
@@ -358,8 +358,7 @@ def test_files_that_are_not_states(tmp_path):
     for name, broken in {"cut": content[: len(content) // 2], "empty": b"", "text": b"{}"}.items():
         bad = tmp_path / name
         bad.write_bytes(broken)
-        with pytest.raises(ModelFileError, match=name):
-            RecursiveARX.load(bad)
+        refuses(ModelFileError, name, RecursiveARX.load, bad)
     with np.load(path) as file:
         parts = dict(file)
     for change, message in (
@@ -369,8 +368,7 @@ def test_files_that_are_not_states(tmp_path):
         ({"root": np.eye(3)}, "root"),
     ):
         np.savez(path, **{**parts, **change})
-        with pytest.raises(ModelFileError, match=message):
-            RecursiveARX.load(path)
+        refuses(ModelFileError, message, RecursiveARX.load, path)
     with pytest.raises(FileNotFoundError):
         RecursiveARX.load(tmp_path / "none.npz")
 
@@ -382,23 +380,18 @@ def test_bad_settings():
         ({"P0": -np.eye(15)}, "P0"), ({"P0": np.ones(3)}, "P0 has shape"), ({"theta0": np.ones(3)}, "theta0"),
         ({"basis": Triangular(6)}, "interval"), ({"nb": (2, 2)}, "nb"), ({"na": -1}, "na"),
     ):
-        with pytest.raises(StructureError, match=message):
-            RecursiveARX(**{**good, **change})
-    with pytest.raises(DataError, match="dt"):
-        RecursiveARX(**good, dt=0.0)
-    with pytest.raises(DataError, match="two channels"):
-        RecursiveARX(**good, outputs="u")
+        refuses(StructureError, message, RecursiveARX, **{**good, **change})
+    refuses(DataError, "dt", RecursiveARX, **good, dt=0.0)
+    refuses(DataError, "two channels", RecursiveARX, **good, outputs="u")
     recursion, (u, y) = started("triangular")
-    with pytest.raises(StructureError, match="every"):
-        recursion.trace(u, y, every=0)
+    refuses(StructureError, "every", recursion.trace, u, y, every=0)
     with pytest.raises(StructureError, match="split"):
         recursion.model("best")  # pyright: ignore[reportArgumentType]
     with pytest.raises(DataError, match="raw"):
         RecursiveARX.like(Data(u, y).detrend(), na=1, nb=1, basis="triangular:3")
     with pytest.raises(DataError, match="raw"):
         recursion.read(Data(u, y).scale())
-    with pytest.raises(DataError, match="valve -> y, the model u -> y"):
-        recursion.read(Data(u, y, inputs="valve"))
+    refuses(DataError, "valve -> y, the model u -> y", recursion.read, Data(u, y, inputs="valve"))
 
 
 def test_bad_samples_leave_the_state_alone():
@@ -413,8 +406,7 @@ def test_bad_samples_leave_the_state_alone():
         (u[None], y, 1.0, "shape"), (u, y[:, None, None], 1.0, "shape"), (u, y, -1.0, "weights"),
         (u, y, np.ones(3), "weights"),
     ):
-        with pytest.raises(DataError, match=message):
-            recursion.update(bad_u, bad_y, weights)
+        refuses(DataError, message, recursion.update, bad_u, bad_y, weights)
     np.testing.assert_array_equal(recursion.root, before[0])
     np.testing.assert_array_equal(recursion.past_u, before[1])
     assert recursion.samples == before[2]
