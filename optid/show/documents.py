@@ -8,7 +8,7 @@ import numpy as np
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation import Validation
-from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT, POOR_FIT, USELESS_FIT
+from optid.identify.verdict import POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
 from optid.show.sections import TONES, Banner, Charts, Code, Columns, Document, Fold, Heading, Notes, Pair, Section
 
@@ -73,10 +73,6 @@ def _length(data: Any) -> str:
 
 
 def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Section:
-    failed = [f"{part.name} ({part.value})" for part in judged.failed]
-    sentence = f"FAIL: {'; '.join(failed)}." if failed else "All tests of the verdict pass."
-    if not failed and judged.word != GOOD:
-        sentence += f" A good model has a fit of at least {GOOD_FIT:g} %, and {GOOD_BLOCK:g} % in its worst block."
     which = ", lowest output" if fit.model.l > 1 else ""
     fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
     if test is not None:
@@ -84,7 +80,7 @@ def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Se
         fits.append(("simulation fit, test record", np.array(simulated or np.nan)))
     cards = tuple((label + which, wording.percent(np.min(values))) for label, values in fits)
     advice = [str(one) for one in fit.advice] if advise and judged.word in ADVISED else []
-    parts = [Banner(TONES[judged.word], f"The model on this record: {judged.word}", sentence, cards),
+    parts = [Banner(TONES[judged.word], f"The model on this record: {judged.word}", summary.judgement(judged), cards),
              summary.verdict_table(judged)]
     return Section("trust", "", [*parts, *([Notes(advice)] if advice else [])])
 

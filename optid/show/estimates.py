@@ -57,7 +57,8 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
         if function.is_linear:
             continue
         f = function.nonlinearity
-        points = _points(f.basis)
+        nodes = isinstance(f.basis, Triangular) and f.basis.p < MOST_NODES
+        points = f.basis.grid(f.basis.p + 1 if nodes else EVEN)
         label = f"{function.name} ({function.unit})" if function.unit else function.name
         if known is None:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
@@ -107,11 +108,6 @@ def _interval_row(
     if decimals > 7 or max(abs(value), abs(lower), abs(upper)) >= 1e7:
         return name, f"{value:.4e}", f"{error:.1e}", f"{lower:.4e}", f"{upper:.4e}"
     return name, *(f"{x:.{max(decimals, 0)}f}" for x in (value, error, lower, upper))
-
-
-def _points(basis: Any) -> np.ndarray:
-    """Points at which f is listed: the nodes of a piecewise linear f when they are few, an even grid otherwise."""
-    return basis.grid(basis.p + 1 if isinstance(basis, Triangular) and basis.p < MOST_NODES else EVEN)
 
 
 def _basis(basis: Any) -> str:

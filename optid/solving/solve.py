@@ -1,5 +1,6 @@
 """Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, prove it."""
 
+import os
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,15 +14,16 @@ from optid.backends.choice import choose, fallbacks, find
 from optid.certificate.convex import TANGENT, certify_convex
 from optid.certificate.infeasibility import satisfiable
 from optid.errors import SolverRefused, StructureError
+from optid.processes import run_forked
 from optid.program.judging import judge, measure_violation
 from optid.program.program import Program, Values
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
-from optid.solving.isolated import run_isolated
 from optid.structures.least_squares import rank_one_of
 
 Procedure = Generator[Program, Solution, Any]
 
 LIE = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
+GRACE = 0.5  # seconds after its time limit at which a solver is killed
 UNUSABLE = (Status.FAILED, Status.LIMIT)
 OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
 CONFLICT = "the constraints contradict each other"
@@ -102,12 +104,20 @@ def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
 
 
 def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
-    """Run a back end from the programme's start; every outcome is an answer."""
+    """Run a back end from the programme's start, in a forked child where it is to be separate; every outcome counts."""
     program.clear_duals()
     if settings.warm and program.start:
         program.assign(program.start)
+    clock = time.monotonic()
     try:
-        return run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
+        if not separate or not hasattr(os, "fork"):
+            return back_end.run(program, settings)
+        limit = None if settings.time_limit is None else settings.time_limit + GRACE
+        return run_forked(back_end.run, program, settings, seconds=limit)
+    except TimeoutError:
+        return Answer(Status.LIMIT, f"stopped after {time.monotonic() - clock:.1f} s: it did not keep its time limit")
+    except ChildProcessError as death:
+        return Answer(Status.FAILED, f"the solver's process died: {death}")
     except StructureError as refusal:  # its message has the remedy for the user
         raise SolverRefused(str(refusal)) from refusal
     except Exception as error:  # a solver that crashes is an outcome, not a traceback

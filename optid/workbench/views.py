@@ -9,7 +9,6 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.uncertainty import uncertainty
-from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
 from optid.models.functions import step_length
 from optid.show import charts, summary
 from optid.show.page import coded
@@ -86,13 +85,9 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
 def judged(fit: Any) -> dict[str, Any]:
     """Return the verdict on a fit and its residual tests."""
     found = fit.verdict
-    says = "; ".join(f"{part.name}: {part.value}" for part in found.failed) or "Every test passes."
-    if not found.failed and found.word != GOOD:
-        says = (f"No test fails; a good model simulates {GOOD_FIT:g} % of the record, and {GOOD_BLOCK:g} % of every "
-                "block.")
-    return {"word": found.word, "tone": TONES[found.word], "sentence": says, "parts": [
-        [part.name, part.value, "PASS" if part.passed else "FAIL"] for part in found.parts],
-        "charts": [coded(one) for one in charts.correlation_charts(charts.validated(fit.model, fit.data.raw()))]}
+    return {"word": found.word, "tone": TONES[found.word], "sentence": summary.judgement(found),
+            "parts": [list(row) for row in summary.verdict_table(found).rows],
+            "charts": [coded(one) for one in charts.correlation_charts(charts.validated(fit.model, fit.data.raw()))]}
 
 
 def _finite(value: float) -> float | None:
