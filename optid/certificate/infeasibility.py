@@ -74,8 +74,8 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
     if not found:
         return True
     bs = [program.variables[b] for _, b in form.blocks] if form is not None and form.gauge == "norm" else []
-    spoken = {v.id for name in names for c in program.constraints[name] for v in c.variables()}
-    return _feasible(found) and all(_has_length(b, found) for b in bs if b.id in spoken)
+    used = {v.id for name in names for c in program.constraints[name] for v in c.variables()}
+    return _feasible(found) and all(_has_length(b, found) for b in bs if b.id in used)
 
 
 def _feasible(members: Sequence[Any]) -> bool:

@@ -74,9 +74,9 @@ def run(job: Run, x0: Array, horizon: int = 1) -> Array:
                     states += g(y[:, o])[:, None] * model.E[:, j]
                 h = model.latent_values(stretch.z[then] + states @ model.Cz.T)
                 y = states @ model.C.T + stretch.direct[then] + h @ model.Fz.T
-            wild = ~np.all((job.low <= y) & (y <= job.high), axis=1)
-            if wild.any():
-                raise _left(job, first + i + int(np.argmax(wild)))
+            beyond = ~np.all((job.low <= y) & (y <= job.high), axis=1)
+            if beyond.any():
+                raise _left(job, first + i + int(np.argmax(beyond)))
         outputs[first + horizon - 1 : first + horizon - 1 + len(y)] = y
     return outputs
 

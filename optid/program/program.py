@@ -191,7 +191,7 @@ class Program:
         """
         if not builders:
             return self
-        demand = self.problem.is_dcp() if convex is None else convex
+        convex_only = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
         usual = self.usual_sizes
@@ -217,7 +217,7 @@ class Program:
                             f"constraint {name!r} uses {', '.join(sorted(v.name() for v in foreign))}, "
                             f"which is not a variable of {self.name!r} ({', '.join(self.variables)})"
                         )
-                    if demand and not member.is_dcp():
+                    if convex_only and not member.is_dcp():
                         raise StructureError(
                             f"constraint {name!r} is not convex, and {self.name!r} is a convex formulation: {member}. "
                             "State it in the named variables of the relaxation or use an exact formulation."

@@ -22,7 +22,7 @@ from optid.structures.least_squares import rank_one_of
 
 Procedure = Generator[Program, Solution, Any]
 
-LIE = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
+FALSE_CLAIM = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
 GRACE = 0.5  # seconds after its time limit at which a solver is killed
 UNUSABLE = (Status.FAILED, Status.LIMIT)
 OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
@@ -80,7 +80,7 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     solution = attempt(back_end, settings, chosen)
     if not chosen or options:
         return solution
-    outside = solution.residuals is not None and solution.residuals.violation > LIE
+    outside = solution.residuals is not None and solution.residuals.violation > FALSE_CLAIM
     if solution.status is Status.FAILED or (solution.status is Status.LIMIT and outside):
         for other in fallbacks(program, back_end.name):
             found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
@@ -210,7 +210,7 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
     if answer.status not in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
         return answer.status, f"{answer.word}; {amount}" if amount else answer.word
     if outside:
-        if residuals.violation > LIE:
+        if residuals.violation > FALSE_CLAIM:
             return Status.FAILED, f"{name} claims success, but {amount}" if claims else f"{answer.word}; {amount}"
         return Status.INACCURATE, amount
     if residuals.stationarity > GRADIENT * limit or residuals.complementarity > limit:
