@@ -214,7 +214,8 @@ class StateSpace(Model):
             y = x @ self.C.T + f @ self.D.T + h @ self.Fz.T + self.offset_y
             moves = [x @ self.A.T, f @ self.B.T, y @ self.L.T, h @ self.Ez.T, np.tile(self.offset_x, (len(u), 1)), -x]
             moves += [np.outer(g(y[:, o]), e) for g, o, e in zip(self.feedback, self.output_of, self.E.T)]
-            change, sizes = sum(moves), np.max([np.abs(move).max(axis=1, initial=0.0) for move in moves], axis=0)
+            change = sum(moves, np.zeros_like(x))
+            sizes = np.max([np.abs(move).max(axis=1, initial=0.0) for move in moves], axis=0)
             if np.all(np.abs(change).max(axis=1, initial=0.0) <= RESTS * sizes):
                 return x, y
             slope = self._tangent(x[own], y[own], u[own])[0] - np.eye(self.nx)

@@ -57,8 +57,8 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
         if function.is_linear:
             continue
         f = function.nonlinearity
-        nodes = isinstance(f.basis, Triangular) and f.basis.p < MOST_NODES
-        points = f.basis.grid(f.basis.p + 1 if nodes else EVEN)
+        basis: Any = f.basis
+        points = basis.grid(basis.p + 1 if isinstance(basis, Triangular) and basis.p < MOST_NODES else EVEN)
         label = f"{function.name} ({function.unit})" if function.unit else function.name
         if known is None:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
