@@ -19,7 +19,7 @@ from optid.structures.least_squares import LinearStructure
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
         constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none"
         ) -> Program | Procedure:
-    """Pose ``min ‖Y - Phi_y a - Phi_u b - d‖²``.
+    """Minimise ``‖Y - Phi_y a - Phi_u b - d‖²``.
 
     Named variables: ``a``, ``b``, ``offset``.
 
@@ -44,7 +44,7 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
 
 def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence[int] = 0, prior: str = "dc",
         constraints: Sequence[Any] = ()) -> Program | Procedure:
-    """Pose ``min ‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.
+    """Minimise ``‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.
 
     Named variables: ``b``, ``offset``. Arguments as in `arx`, as are the errors raised.
     """

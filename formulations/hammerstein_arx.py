@@ -36,7 +36,7 @@ from optid.structures.lifted_regression import leading_pairs
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
           curvature: float = 0.0, prior: str = "none", gauge: str = "norm") -> Program | Procedure:
-    """Pose the bilinear least-squares problem ``min ‖Y - Phi_y a - Phi_eta vec(mu bᵀ) - d‖²``.
+    """Minimise the bilinear least squares ``‖Y - Phi_y a - Phi_eta vec(mu bᵀ) - d‖²``.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``.
 
@@ -112,7 +112,7 @@ def _start(problem: EquationError, pairs: Sequence[tuple[str, str]], gauge: str)
 
 
 def _has_signed_factors(program: Program, pairs: Sequence[tuple[str, str]]) -> bool:
-    """Whether a constraint speaks of a mu or a b itself, and thereby decides their sign, not of ``mu bᵀ`` alone."""
+    """Whether a constraint contains a mu or a b itself, not ``mu bᵀ`` alone, and thereby fixes their sign."""
     stand_in = {id(theta): cp.Variable(theta.shape) for name, theta in program.view.inner.items()
                 if name.partition("[")[0] == "Theta"}
     factors = {program.variables[name].id for pair in pairs for name in pair}
@@ -139,7 +139,7 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
             nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
             ridge: float = 0.0, curvature: float = 0.0, prior: str = "none",
             gauge: str = "norm") -> Program | Procedure:
-    """Pose ``min ‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
+    """Minimise ``‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
 
     The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
     shrinks Theta, so a rank-one answer is a start for `exact` rather than its solution.
@@ -168,7 +168,7 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
                      basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
                      constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, curvature: float = 0.0,
                      prior: str = "none", gauge: str = "norm") -> Program | Procedure:
-    """Pose the least-squares problem in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
+    """Minimise the least squares in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
 
     Named variables: ``Theta``, ``a``, ``offset``. Other arguments as in `nuclear`.
 

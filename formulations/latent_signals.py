@@ -52,7 +52,7 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         initial: models without latent signals as additional starting points.
         seed: of the directions of z that are tried.
         tries: searches for every latent signal, those after the first beside the others; with 1, which is quick,
-            a search that seems to have gone astray is not repeated either.
+            a search that seems to have failed is not repeated either.
 
     Raises:
         StructureError: words, orders or starts that do not fit, a basis of affine functions alone.

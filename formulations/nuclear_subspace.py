@@ -123,7 +123,7 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
 
 
 def nuclear_programme(structured: Structured, penalty: float) -> Program:
-    """Pose the convex programme for a penalty lambda.
+    """Build the convex programme for a penalty lambda.
 
     Named variables: ``yhat`` (samples, l), outputs of mean zero and unit variance, and, in predictor form, ``T``, one
     column per output. The expression ``output`` is yhat in units of the data.

@@ -7,7 +7,7 @@ The states at every sample are variables (direct collocation, Hargraves and Pari
 
 in discrete time x(k+1) = f(x(k), u(k), p), so that the errors are those of the free run, whose initial state is
 estimated. It starts from the best of several descents in the parameters alone (`optid.identify.physical`). Constraints
-may speak about parameters and states. W is the inverse of the spread of every output at first and, with several
+may use parameters and states. W is the inverse of the spread of every output at first and, with several
 outputs, of their errors then. Named variables: the parameters and the states, by their names (with several experiments
 ``h[1]``, ``h[2]``, ...).
 """
@@ -33,7 +33,7 @@ from optid.solving.solve import Procedure
 
 Array = np.ndarray
 
-LIMIT = 20_000  # states at all steps of integration up to which the programme is posed
+LIMIT = 20_000  # states at all steps of integration up to which the programme is built
 REWEIGHTED = 3  # times that outputs are weighted anew by their errors
 LEAST = 1e-2  # parameters start from no less than this share of their usual size
 NO_BOUND = "the equations are not convex: no lower bound is known"

@@ -144,7 +144,7 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
 
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
                constraints: Sequence[Any], gauge: str | None, offset: bool, starts: Any, seed: int) -> Procedure:
-    """Search for the best optimum in a gauge that is always reached, and go on from there in the one asked for."""
+    """Search for the best optimum in a gauge that is always reached, and continue from there in the requested one."""
     count = check_integer(starts, "starts")
     criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
     free = replace(criterion, gauge="none" if gauge is None else "norm")

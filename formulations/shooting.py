@@ -1,6 +1,6 @@
 """Output error with the outputs of the plant as variables: one sparse programme for NLP back ends.
 
-``y = A(q)^-1 [sum_c B_c(q) f_c(u_c) + d] + e`` is posed as
+``y = A(q)^-1 [sum_c B_c(q) f_c(u_c) + d] + e`` is stated as
 
     minimise ‖y - x‖²  subject to  x(k) + sum_i a_i x(k-i) = sum_c sum_j b_cj w_c(k - nk_c - j) + d,  w_c = eta_c mu_c,
 
@@ -44,13 +44,13 @@ from optid.program.view import View
 Array = np.ndarray
 
 REFLECTION = 1 - 1e-7  # largest modulus of a reflection coefficient
-LIMIT = 20_000  # samples up to which the programme is posed: beyond, factorisations and CVXPY's own work take minutes
+LIMIT = 20_000  # samples up to which the programme is built: beyond, factorisations and CVXPY's own work take minutes
 NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known"
 
 
 def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
           constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Program:
-    """Pose the least squares of the simulation errors with the simulated outputs as variables.
+    """Minimise the simulation errors with the simulated outputs as variables.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
 

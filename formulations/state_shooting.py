@@ -54,7 +54,7 @@ from optid.statistics.linearised import Linearised
 
 Array = np.ndarray
 
-LIMIT = 5_000  # samples up to which the programme is posed
+LIMIT = 5_000  # samples up to which the programme is built
 # relative difference between the objective and the squared errors of a run of the model that is rounding
 SAME_RUN = 1e-6
 
@@ -133,7 +133,7 @@ def _fit(name: str, data: Data, nx: int | str, constraints: Sequence[Any], stabi
 
 def _shoot(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent,
            figures: Mapping[str, Any]) -> Procedure:
-    """Solve the programme from where the descents arrived, and judge the model by its own run."""
+    """Solve the programme from the result of the descents, and judge the model by its run."""
     fit = StateShooting(plan.name, errors, constraints, plan.units)
     x = fit.signed(best.x)
     program = replace(fit.pose(x, errors.linearise(x), 0.0), settled=best.converged)

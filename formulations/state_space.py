@@ -6,7 +6,7 @@ The parts there are make the formulation: none of f, g, h (`ss`), f and g (`hamm
 the place of C x + D f(u) (`formulations.latent_signals`). ``criterion="simulation"`` takes K = 0 and the free run,
 ``"measured feedback"`` K = 0 with the measured outputs in g, ``"prediction"`` estimates K with the other unknowns. All
 are procedures: starts from subspace fits with several block rows and models of the user, descents on streamed
-sensitivities, the errors weighted anew by their own covariance, functions of latent signals where they are asked for,
+sensitivities, the errors weighted anew by their own covariance, functions of latent signals where they are requested,
 and at the optimum z0, or under constraints, convex programmes in the tangent of the iterate,
 
     minimise ‖r‖² + remainder    subject to    r = R (z - z0) + e0,  the user's constraints,

@@ -7,7 +7,7 @@
        min ‖R [x0; offset; vec Theta_1; ...] - s‖²,    Theta_i = mu_i [B_i; D_i]ᵀ
 
    R and s are the record, compressed (`optid.identify.subspace.realisation`).
-4. The noise model from the prediction errors, when it is asked for: `optid.identify.noise`.
+4. The noise model from the prediction errors, when it is needed: `optid.identify.noise`.
 
 The third programme has two forms:
 
@@ -88,7 +88,7 @@ def identified(plan: Plan, found: Observability | None = None) -> Procedure:
 
 
 def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block_rows: int) -> Bound:
-    """Return the Hankel bound of the objective in units of the record; none where no proof was asked for."""
+    """Return the Hankel bound of the objective in units of the record; none where no proof was requested."""
     said = "the (A, C) step minimises no criterion of the whole model"
     if solution.bound is None:
         return Bound.none(said)
@@ -101,7 +101,7 @@ def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block
 
 
 def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
-    """Pose the least squares of a plan under its constraints on coefficients; ``recover`` gives the model."""
+    """Build the least squares of a plan under its constraints on coefficients; ``recover`` gives the model."""
     problem, form, units = realisation.problem, realisation.form, plan.units
     names, linear = realisation.names, ("x0", "offset") if form.offset else ("x0",)
     if realisation.factored:

@@ -19,17 +19,11 @@ _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 @dataclass(frozen=True)
 class Description:
-    """Signature and docstring of a function.
+    """Signature and docstring of a function."""
 
-    Attributes:
-        signature: defaults as values, expressions and annotations as text.
-        text: the docstring.
-        siblings: docstrings of the functions of the same module, by name.
-    """
-
-    signature: inspect.Signature
-    text: str
-    siblings: Mapping[str, str]
+    signature: inspect.Signature  # defaults as values, expressions and annotations as text
+    text: str  # the docstring
+    siblings: Mapping[str, str]  # docstrings of the functions of the same module, by name
 
     @property
     def summary(self) -> str:

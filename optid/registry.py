@@ -69,7 +69,7 @@ def render(result: Any, form: str = "text", *arguments: Any, **options: Any) -> 
     """Return a result in a form, by the renderer registered as "<class name>.<form>".
 
     Results are data: they know no table and no figure, and import nothing that draws or prints them. A notebook shows
-    the text of a result that has no HTML of its own.
+    the text of a result without an HTML renderer.
 
     Args:
         result: the result.

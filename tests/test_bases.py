@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 from scipy.integrate import quad
 from scipy.interpolate import BSpline as Spline
 
@@ -239,10 +240,8 @@ def test_missing_samples(basis):
 def test_error_outside_names_sample_and_value(basis):
     basis = with_outside(basis, "error")
     basis.values([-0.7, 1.3])
-    with pytest.raises(DataError, match=r"Sample 1 .* 5, outside the interval \[-0.7, 1.3\]"):
-        basis.values([0.0, 5.0])
-    with pytest.raises(DataError, match="Sample 1"):
-        basis.slopes([0.0, 5.0])
+    refuses(DataError, r"Sample 1 .* 5, outside the interval \[-0.7, 1.3\]", basis.values, [0.0, 5.0])
+    refuses(DataError, "Sample 1", basis.slopes, [0.0, 5.0])
     assert basis.is_outside([0.0, 5.0, -2.0, np.nan, 1.3]).sum() == 2
 
 
@@ -250,8 +249,7 @@ def test_error_outside_names_sample_and_value(basis):
 @given(scale=st.floats(1e-3, 1e3), offset=st.floats(-50, 50))
 def test_change_of_units(basis, scale, offset):
     if isinstance(basis, UserFunctions):
-        with pytest.raises(StructureError, match="keeps the units"):
-            basis.mapped(scale, offset)
+        refuses(StructureError, "keeps the units", basis.mapped, scale, offset)
         return
     basis = with_outside(basis, "extrapolate")
     new, matrix, constant = basis.mapped(scale, offset)
@@ -268,8 +266,7 @@ def test_json_round_trip(basis):
 
 def test_user_functions_ask_for_themselves():
     description = json.loads(json.dumps(FITTED[-1].to_dict()))
-    with pytest.raises(StructureError, match=r"'u', 'u3'.*functions="):
-        from_dict(description)
+    refuses(StructureError, r"'u', 'u3'.*functions=", from_dict, description)
     again = from_dict(description, {"u": lambda u: u, "u3": (lambda u: u**3)})
     assert again.values([0.5]) == pytest.approx(np.array([[0.5, 0.125]]))
 
@@ -307,8 +304,7 @@ def test_parse(text, basis):
     ],
 )
 def test_parse_refuses(text, error, words):
-    with pytest.raises(error, match=words):
-        parse(text)
+    refuses(error, words, parse, text)
 
 
 @pytest.mark.parametrize(

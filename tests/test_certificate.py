@@ -5,6 +5,7 @@ import pytest
 from exact_search import hammerstein, monotone, regress, search_circle
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 from scripts import benchmark
 
 from optid.certificate.ladder import certify
@@ -334,9 +335,7 @@ def test_sign_of_b_as_a_lifted_constraint_with_a_cone():
 def test_bad_arguments_are_named():
     problem = hammerstein(0, 3, 4, 60)
     point = minimise(problem).point
-    with pytest.raises(StructureError, match="cone 0"):
-        certify(problem, point, cones={0: np.ones((2, 3))})
+    refuses(StructureError, "cone 0", certify, problem, point, cones={0: np.ones((2, 3))})
     with pytest.raises(StructureError, match=r"E \(r, 14\)"):
         certify(problem, point, linear=Linear(np.ones((1, 3)), np.ones(1), np.ones(1, bool)))
-    with pytest.raises(StructureError, match="effort"):
-        certify(problem, point, effort="all")
+    refuses(StructureError, "effort", certify, problem, point, effort="all")

@@ -4,6 +4,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from problems import BASIS, dense, plant, raw_problem, record, regression
+from refusals import refuses
 from systems import BASES, by_hand, inputs, mimo, nonlinearity, siso
 
 import optid
@@ -206,8 +207,7 @@ def test_resolve_along_a_path_of_weights():
     again = optid.resolve(fit, {"weight": 20.0})
     direct = optid.fit(record(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=20.0)
     assert again.solution.objective == pytest.approx(direct.solution.objective, rel=1e-7)
-    with pytest.raises(StructureError, match="no parameter 'wieght'.*weight"):
-        optid.resolve(fit, {"wieght": 1.0})
+    refuses(StructureError, "no parameter 'wieght'.*weight", optid.resolve, fit, {"wieght": 1.0})
 
 
 @pytest.mark.parametrize("change, error, words", [
@@ -226,8 +226,7 @@ def test_resolve_along_a_path_of_weights():
     ({"basis": Triangular(6).fitted(-1, 9)}, RankError, "never excited"),
 ])
 def test_bad_structure_names_the_argument_and_the_remedy(change, error, words):
-    with pytest.raises(error, match=words):
-        optid.fit(record(count=100), **({"na": 2, "nb": 2, "basis": BASIS} | change))
+    refuses(error, words, optid.fit, record(count=100), **{"na": 2, "nb": 2, "basis": BASIS} | change)
 
 
 def test_a_zero_input_channel_has_a_gauge():

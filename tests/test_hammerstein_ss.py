@@ -335,6 +335,14 @@ def test_static_gain_is_the_slope_between_equilibria():
     refuses(StructureError, "u0 has shape", model.static_gain, 1.0)
 
 
+def test_the_static_curve_of_an_input_leaves_the_functions_of_the_others_out():
+    model, points = with_feedback(), np.array([-0.2, 0.3])
+    alone = replace(model, nonlinearities=tuple(
+        f if c == 0 else f.scaled(0.0) for f, c in zip(model.nonlinearities, model.input_of)))
+    for u, y in zip(points, model.static_curve(0, points)):
+        assert y == pytest.approx(alone.simulate(np.tile([u, 0.0], (500, 1)))[-1], abs=1e-9)
+
+
 def test_responses():
     model = linear()
     impulse = np.zeros((12, 2))

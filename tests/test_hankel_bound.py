@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 from scipy.optimize import least_squares
 
 import optid
@@ -123,8 +124,7 @@ def test_one_step_errors_lie_below_the_bound_and_are_refused():
     bounds = hankel_bounds([np.column_stack([u, y])], None, inputs=[0], outputs=[1], block_rows=(40,), largest=2)
     one_step = float(np.sum(e[1:] ** 2))
     assert bounds.value(1)[0] > 1.5 * one_step  # the counterexample: it is no bound on that error
-    with pytest.raises(StructureError, match="was not measured by the simulator"):
-        bounds.bound(1, one_step)
+    refuses(StructureError, "was not measured by the simulator", bounds.bound, 1, one_step)
     simulated = np.zeros(len(u))
     for k in range(1, len(u)):
         simulated[k] = 0.9 * simulated[k - 1] + u[k - 1]
@@ -165,8 +165,7 @@ def test_exact_data_are_bounded_by_nothing():
      StructureError, "0 to 2"),
 ])
 def test_bad_arguments(call, error, words):
-    with pytest.raises(error, match=words):
-        call(np.random.default_rng(0).normal(size=(100, 2)))
+    refuses(error, words, call, np.random.default_rng(0).normal(size=(100, 2)))
 
 
 def state_space_record(count=400, noise=0.2):

@@ -314,7 +314,7 @@ def test_tables_figures_and_checks_show_the_latent_function():
     from optid.show.plots import nonlinearity
 
     titles = [ax.get_title(loc="left") for ax in nonlinearity(fit).axes]
-    assert titles == ["Nonlinearity of u", "Latent nonlinearity of z"]
+    assert titles == ["Nonlinearity f of u", "Latent nonlinearity h of z"]
 
 
 @pytest.mark.parametrize("formulation", ["lfr.exact", "wiener_ss.exact"])

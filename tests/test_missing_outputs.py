@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scripts
+from refusals import refuses
 from sample_fits import quiet
 
 import optid
@@ -131,14 +132,12 @@ def test_the_estimation_ends_and_refuses_what_it_cannot_estimate():
     assert f"by {ROUNDS} preliminary models" in impute(data, restless)[1]
     y = np.array(data.y)
     y[1:, 1] = np.nan
-    with pytest.raises(RankError, match="fewer than two samples"):
-        impute(Data(data.u, y), restless)
+    refuses(RankError, "fewer than two samples", impute, Data(data.u, y), restless)
 
 
 def test_the_nuclear_norm_names_the_form_that_takes_more_gaps():
     cell = next(cell for name, cell in CELLS.items() if name == "subspace.nuclear 2y")
     data = gaps.punctured(gaps.record(cell, 3000, 0), 0.4, 0)
-    with pytest.raises(RankError, match="usable windows .* or form='projection'"):
-        score(cell, data)
+    refuses(RankError, "usable windows .* or form='projection'", score, cell, data)
     other = replace(cell, structure={**cell.structure, "form": "projection"})
     assert score(other, data) > 80

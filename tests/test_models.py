@@ -191,6 +191,8 @@ def test_static_gain_is_the_slope_of_the_steady_state(model):
             point = u0 + sign * step * np.eye(model.m)[c]
             ends.append(model.simulate(np.tile(point, (600, 1)))[-1])
         gain[:, c] = (ends[0] - ends[1]) / (2 * step)
+        curve = model.static_curve(c, u0[c] + step * np.array([1.0, -1.0]))
+        assert curve[0] - curve[1] == pytest.approx(ends[0] - ends[1], abs=1e-11)
     assert np.reshape(model.static_gain(u0), gain.shape) == pytest.approx(gain, abs=1e-6)
     refuses(StructureError, "integrator", replace(model, a=-np.eye(2)[None] if model.l > 1 else [-1.0]).static_gain, u0)
     refuses(StructureError, "one operating point per input", model.static_gain, np.zeros(7))

@@ -178,7 +178,7 @@ def test_a_vector_has_no_singular_values_to_show():
 def test_names_of_channels_are_text_not_mathematics():
     texts = [t.get_text() for ax in plots.nonlinearity(mimo_fit()).axes for t in (ax.title, ax.xaxis.label)]
     texts += [ax.get_title(loc="left") for ax in plots.nonlinearity(mimo_fit()).axes]
-    assert r"heat & \$x_1\$ (kW)" in texts and r"Nonlinearity of heat & \$x_1\$" in texts
+    assert r"heat & \$x_1\$ (kW)" in texts and r"Nonlinearity f_heat & \$x_1\$ of heat & \$x_1\$" in texts
 
 
 def test_many_experiments_are_cut_to_the_first_three_and_the_title_says_so():

@@ -91,7 +91,7 @@ def test_every_region_has_a_word_and_is_about_poles(word, name):
 
 
 @pytest.mark.parametrize("call, words", [
-    (lambda: disc(0.2, 0.0), "positive radius"),
+    (lambda: disc(0.2, 0.0), "positive radius"), (lambda: disc(np.nan, 0.2), "finite centre"),
     (lambda: strip(), "low= and/or high="),
     (lambda: strip(0.9, 0.1), "low < high"),
     (lambda: sector(2.0), r"\(0, pi/2\]"),

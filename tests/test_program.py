@@ -6,6 +6,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from problems import record
+from refusals import refuses
 from zoo import CASES, case, pose
 
 from optid import Polynomial, fit
@@ -61,8 +62,7 @@ def test_constraints_of_every_form_get_names():
     assert [len(g) for g in group.values()] == [1, 2]
     assert list(named(x <= 1, "default")) == ["default"]
     assert list(named([x <= 1, x >= 0], "pair")) == ["pair[0]", "pair[1]"]
-    with pytest.raises(StructureError, match="'truth'.*bool"):
-        named({"truth": True}, "default")
+    refuses(StructureError, "'truth'.*bool", named, {"truth": True}, "default")
 
 
 def test_constraint_in_a_callable_sees_the_named_variables():
@@ -75,26 +75,22 @@ def test_constraint_in_a_callable_sees_the_named_variables():
 
 def test_unknown_variable_names_the_nearest():
     program, _ = bilinear()
-    with pytest.raises(StructureError, match="'mi'.*'mu'"):
-        program.subject_to(lambda v: v["mi"] >= 0)
+    refuses(StructureError, "'mi'.*'mu'", program.subject_to, lambda v: v["mi"] >= 0)
 
 
 def test_foreign_variable_is_named():
     program, _ = bilinear()
-    with pytest.raises(StructureError, match="stranger"):
-        program.subject_to({"odd": cp.Variable(name="stranger") >= 0})
+    refuses(StructureError, "stranger", program.subject_to, {"odd": cp.Variable(name="stranger") >= 0})
 
 
 def test_names_are_used_once():
     program, _ = bilinear()
-    with pytest.raises(StructureError, match="two constraints named 'gauge'"):
-        program.subject_to(lambda v: {"gauge": v["b"][0] >= 0})
+    refuses(StructureError, "two constraints named 'gauge'", program.subject_to, lambda v: {"gauge": v["b"][0] >= 0})
 
 
 def test_nonconvex_constraint_in_a_convex_formulation_is_refused():
     program = case("qp_equality").build()
-    with pytest.raises(StructureError, match="'ring' is not convex"):
-        program.subject_to(lambda v: {"ring": cp.sum_squares(v["x"]) >= 1})
+    refuses(StructureError, "'ring' is not convex", program.subject_to, lambda v: {"ring": cp.sum_squares(v["x"]) >= 1})
     nonconvex, _ = bilinear()
     assert "ring" in nonconvex.subject_to(lambda v: {"ring": cp.sum_squares(v["mu"]) >= 1}).user_constraints
 
@@ -131,10 +127,8 @@ def test_frozen_constraints_stay_in_force():
 
 def test_freezing_what_is_not_there_or_of_another_shape():
     program, _ = bilinear()
-    with pytest.raises(StructureError, match="'mu2'.*'mu'"):
-        program.freeze(mu2=[1.0])
-    with pytest.raises(StructureError, match=r"'b' has shape \(2,\).*\(3,\)"):
-        program.freeze(b=[1.0, 0.0, 0.0])
+    refuses(StructureError, "'mu2'.*'mu'", program.freeze, mu2=[1.0])
+    refuses(StructureError, r"'b' has shape \(2,\).*\(3,\)", program.freeze, b=[1.0, 0.0, 0.0])
 
 
 # values and duals
@@ -164,8 +158,7 @@ def test_view_of_several_inputs_asks_for_the_channel():
     x = cp.Variable(2)
     view = View({"mu[valve]": x}, channels=("valve", "pump"))
     assert view.key("mu", "valve") == "mu[valve]"
-    with pytest.raises(StructureError, match="valve, pump"):
-        view.key("mu")
+    refuses(StructureError, "valve, pump", view.key, "mu")
     assert View({"mu": x}, channels=("valve",)).key("mu") == "mu"
 
 

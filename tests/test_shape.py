@@ -4,6 +4,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from problems import BASIS, NODES, dense, plant, raw_problem, record, search
+from refusals import refuses
 from systems import nonlinearity
 
 import optid
@@ -237,8 +238,7 @@ def test_two_channels_share_their_dynamics():
     (lambda: shape.coefficients("a"), "low= and/or high="),
 ])
 def test_impossible_arguments_are_refused_at_once(build, words):
-    with pytest.raises(StructureError, match=words):
-        build()
+    refuses(StructureError, words, build)
 
 
 @pytest.mark.parametrize("rule, words", [
@@ -252,8 +252,7 @@ def test_impossible_arguments_are_refused_at_once(build, words):
     (lambda v: {"q": cp.Variable(name="mine") >= 0}, "uses mine, which is not a variable"),
 ])
 def test_constraints_that_do_not_fit_the_structure_are_refused(rule, words):
-    with pytest.raises(StructureError, match=words):
-        optid.fit(record(), na=2, nb=2, basis=BASIS, constraints=[rule])
+    refuses(StructureError, words, optid.fit, record(), na=2, nb=2, basis=BASIS, constraints=[rule])
 
 
 def test_rules_about_the_static_characteristic_need_one_output_and_a_channel():

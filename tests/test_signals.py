@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refuses
 
 from optid import signals
 from optid.errors import StructureError
@@ -30,8 +31,7 @@ def test_every_signal_has_its_length_and_stays_in_range(name, n, low, width):
                                                  ((50, 1, 1), "low must be below high"),
                                                  ((50, 0, np.inf), "low must be below high")])
 def test_every_signal_refuses_bad_length_and_range(name, arguments, part):
-    with pytest.raises(StructureError, match=part):
-        MAKERS[name](*arguments)
+    refuses(StructureError, part, MAKERS[name], *arguments)
 
 
 def test_random_signals_depend_on_the_seed_alone():
@@ -157,5 +157,4 @@ def test_steps_go_up_and_down():
     ],
 )
 def test_bad_arguments(call, part):
-    with pytest.raises(StructureError, match=part):
-        call()
+    refuses(StructureError, part, call)

@@ -10,7 +10,7 @@ from zoo import ABORTING, EVERYTHING, HANGING, RAISING, case, claiming, pose
 
 from optid.backends import Answer, BackEnd, Settings, back_ends, choice
 from optid.errors import LookupFailed, SolverMissing, StructureError
-from optid.program.solution import Bound, Status
+from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import run, solve
 
 
@@ -22,22 +22,55 @@ def projection():
 
 # what a claim is worth
 
-def test_success_at_an_infeasible_point_is_refused():
-    found = solve(projection(), claiming({"x": [2.0, 2.0]}, duals={"budget": np.array([0.0])}))
-    assert found.status is Status.FAILED and found.claimed == "optimal"
-    assert "budget" in found.reason and "claims success" in found.reason
-    assert found.residuals.worst == "budget" and found.objective == 0.0
+NAN = float("nan")
 
 
-def test_success_slightly_outside_is_inaccurate():
-    found = solve(projection(), claiming({"x": [1.0 + 1e-5] * 2}, duals={"budget": np.array([2.0])}))
-    assert found.status is Status.INACCURATE and "budget" in found.reason
+@pytest.mark.parametrize(("claim", "x", "dual", "status", "words"), [
+    (Status.OPTIMAL, [2.0, 2.0], 0.0, Status.FAILED, ["budget", "claims success"]),
+    (Status.OPTIMAL, [1.0 + 1e-5] * 2, 2.0, Status.INACCURATE, ["budget"]),
+    (Status.OPTIMAL, [0.5, 0.5], 0.0, Status.INACCURATE, ["not stationary"]),
+    (Status.OPTIMAL, [1.0, 1.0], None, Status.LOCAL, []), (Status.OPTIMAL, [1.0, 1.0], 2.0, Status.OPTIMAL, []),
+    (Status.INACCURATE, [1.0, 1.0], 2.0, Status.OPTIMAL, []),
+    (Status.INACCURATE, [1.0, 1.0], None, Status.INACCURATE, []),
+    (Status.OPTIMAL, [NAN, 1.0], None, Status.FAILED, ["non-finite"]),
+    (Status.OPTIMAL, [np.inf, 1.0], None, Status.FAILED, ["non-finite"]),
+    (Status.OPTIMAL, [1e200, 1.0], None, Status.FAILED, ["non-finite"]),
+    (Status.OPTIMAL, [1.0, 2.0, 3.0], None, Status.FAILED, ["cannot be judged: cannot reshape"]),
+    (Status.OPTIMAL, None, None, Status.FAILED, ["no point"]),
+    (Status.INFEASIBLE, None, None, Status.FAILED, ["start"]),
+    (Status.INFEASIBLE, [0.0, 0.0], None, Status.FAILED, ["satisfies every constraint"]),
+    (Status.LIMIT, [2.0, 2.0], None, Status.LIMIT, ["its word", "budget"]),
+    (Status.UNBOUNDED, None, None, Status.UNBOUNDED, ["its word"]),
+])
+def test_a_claim_is_judged_at_its_point(claim, x, dual, status, words):
+    duals = None if dual is None else {"budget": np.array([dual])}
+    found = solve(projection(), claiming({} if x is None else {"x": x}, claim, duals, "its word"))
+    assert found.status is status and all(word in found.reason for word in words)
+    assert found.claim is claim and found.claimed == "its word"
+    assert found.proof == (status is Status.OPTIMAL) or words == ["budget"]
+    taken_back = claim is Status.INFEASIBLE or claim is Status.OPTIMAL and status not in (Status.OPTIMAL, Status.LOCAL)
+    assert found.false_claim == taken_back
+    if found.has_point and status is not Status.FAILED:
+        assert found.objective == pytest.approx(np.sum((np.array(x) - 2) ** 2))
+        assert np.isnan(found.residuals.stationarity) == (dual is None)
+    assert found.has_point == (x is not None and len(x) == 2 and bool(np.all(np.abs(x) < 1e100)))
 
 
-def test_success_at_a_point_that_is_not_stationary_is_inaccurate():
-    found = solve(projection(), claiming({"x": [0.5, 0.5]}, duals={"budget": np.array([0.0])}))
-    assert found.status is Status.INACCURATE and "not stationary" in found.reason
-    assert not found.proof
+def test_nothing_claimed_is_not_false():
+    assert not Solution(Status.FAILED, "", "").false_claim
+
+
+@pytest.mark.parametrize("values", [{}, {"x": np.array([NAN, 1.0])}, {"y": np.ones(2)}])
+def test_an_answer_without_a_usable_point_is_in_units_of_the_record(values):
+    found = solve(replace(projection(), scale=3.0, unit=4.0), claiming(values, Status.LOCAL))
+    assert found.status is Status.FAILED and found.scale == 12.0
+
+
+@pytest.mark.parametrize("solver", ["clarabel", "ipopt", "osqp"])
+def test_the_time_of_compiling_is_part_of_the_solve(solver):
+    times = solve(projection(), solver).times
+    assert 0.0 < times.compile <= times.solve
+    assert times.total == pytest.approx(times.build + times.solve + times.judge + times.prove)
 
 
 def test_multiplier_of_the_wrong_sign_does_not_make_a_point_stationary():
@@ -59,47 +92,12 @@ def test_multipliers_outside_their_cone_count_as_missing(constraint, dual):
     assert found.status is Status.INACCURATE
 
 
-def test_right_point_without_multipliers_is_locally_optimal_without_proof():
-    found = solve(projection(), claiming({"x": [1.0, 1.0]}))
-    assert found.status is Status.LOCAL and not found.proof and np.isnan(found.residuals.stationarity)
-
-
-def test_right_point_with_multipliers_is_proved():
-    found = solve(projection(), claiming({"x": [1.0, 1.0]}, duals={"budget": np.array([2.0])}))
-    assert found.status is Status.OPTIMAL and found.proof and found.objective == pytest.approx(2.0)
-
-
-def test_inaccurate_claim_is_raised_when_our_residuals_are_clean():
-    answer = claiming({"x": [1.0, 1.0]}, Status.INACCURATE, {"budget": np.array([2.0])}, "almost")
-    assert solve(projection(), answer).status is Status.OPTIMAL
-    unsure = claiming({"x": [1.0, 1.0]}, Status.INACCURATE, word="almost")
-    assert solve(projection(), unsure).status is Status.INACCURATE
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_numbers_that_are_not_finite_are_a_failure(bad):
-    found = solve(projection(), claiming({"x": [bad, 1.0]}))
-    assert found.status is Status.FAILED and "non-finite" in found.reason and not found.has_point
-
-
 def test_success_without_a_point_or_with_half_of_one_is_a_failure():
     assert "no point" in solve(projection(), claiming({})).reason
     x, y = cp.Variable(name="x"), cp.Variable(name="y")
     program = pose("two", cp.square(x) + cp.square(y), {"sum": x + y == 1}, [x, y])
     found = solve(program, claiming({"x": 0.5}))
     assert found.status is Status.FAILED and "y" in found.reason
-
-
-def test_infeasible_is_not_believed_when_the_start_is_feasible():
-    found = solve(projection(), claiming({}, Status.INFEASIBLE, word="infeasible"))
-    assert found.status is Status.FAILED and "start" in found.reason
-    found = solve(projection(), claiming({"x": [0.0, 0.0]}, Status.INFEASIBLE, word="infeasible"))
-    assert found.status is Status.FAILED and "satisfies every constraint" in found.reason
-
-
-def test_why_it_stopped_survives_a_bad_point():
-    found = solve(projection(), claiming({"x": [2.0, 2.0]}, Status.LIMIT, word="iteration limit"))
-    assert found.status is Status.LIMIT and "iteration limit" in found.reason and "budget" in found.reason
 
 
 def test_bounds_of_the_variables_themselves_are_judged():

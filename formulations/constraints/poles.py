@@ -102,10 +102,10 @@ def disc(centre: float, radius: float) -> Rule:
     For the coefficients of a polynomial it is defined, and exact, up to na = 2.
 
     Raises:
-        StructureError: a radius that is not positive.
+        StructureError: a centre that is not finite, a radius that is not a positive number.
     """
-    if not radius > 0:
-        raise StructureError(f"disc needs a positive radius; got {radius!r}")
+    if not (np.isfinite(centre) and 0 < radius < np.inf):
+        raise StructureError(f"disc needs a finite centre and a positive radius; got {centre!r} and {radius!r}")
     held, sides = radius * (1 - MARGIN), [disc_side(radius * (1 - MARGIN), float(centre))]
     rule = region_rule(f"disc:{centre:g},{radius:g}", sides, f"the disc of radius {radius:g} around {centre:g}")
 
@@ -231,7 +231,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         largest = float(np.max(np.abs(model.poles), initial=0.0))
         if largest <= radius * (1 + MARGIN):
             return ""
-        return f"constraint {name!r}: the largest pole has modulus {largest:.6g}; ask for a smaller radius"
+        return f"constraint {name!r}: the largest pole has modulus {largest:.6g}; use a smaller radius"
 
     def stand_in(arguments: Mapping[str, Any]) -> str:
         na = arguments.get("na", 0)

@@ -5,7 +5,7 @@ Every function returns a `Rule`, to be passed in ``constraints=[...]``. Two kind
 * about the *shape* of f, free of scale (monotone, convex, odd, dead zone, known up to a factor). In the exact
   formulations they act on ``mu``, and an inequality (monotone, convex, concave) also keeps the sum of ``b`` from being
   negative, so that it holds for the static characteristic of a stable plant as for f. In the relaxed ones they act on
-  ``Theta``; an inequality then speaks of the static characteristic alone, the sum over the lags.
+  ``Theta``; an inequality then acts on the static characteristic alone, the sum over the lags.
 * about the *static characteristic* ``y = (f(u) sum(b) + d) / (1 + sum(a))``, in units of the output: slope, range,
   points, gain. They are linear in ``(a, Theta, offset)`` and mean the same in every formulation and gauge. They
   include ``1 + sum(a) > 0``, which every stable model satisfies: without it there is no static characteristic.
@@ -273,7 +273,7 @@ def _inputs(view: View, channel: str | None) -> Sequence[str]:
 
 def _cone(word: str, direction: str, channel: str | None, rows: Callable[[Any], np.ndarray], heights: bool = True
           ) -> Rule:
-    """Rows on f that are not negative; ``heights`` says that they are differences of its values."""
+    """Rows on f that are not negative; ``heights`` marks differences of its values."""
 
     def build(view: View) -> Any:
         if direction == "decreasing" and channel in view.spans:

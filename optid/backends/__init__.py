@@ -1,4 +1,4 @@
-"""Back ends: the only place that knows a solver."""
+"""Back ends: the only modules that call solvers."""
 
 from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.choice import back_ends, find

@@ -23,21 +23,13 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is asked of a solver, in words that do not depend on the solver.
+    """Requests to a solver, in words that do not depend on the solver."""
 
-    Attributes:
-        accuracy: requested relative accuracy; every back end translates it into its own tolerances.
-        time_limit: seconds, or None.
-        warm: start from the programme's ``start`` (or the previous solution) where the solver can.
-        verbose: let the solver print.
-        options: native options, passed through.
-    """
-
-    accuracy: float = 1e-8
-    time_limit: float | None = None
-    warm: bool = True
-    verbose: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)
+    accuracy: float = 1e-8  # requested relative accuracy; every back end translates it into its own tolerances
+    time_limit: float | None = None  # seconds, or None
+    warm: bool = True  # start from the programme's ``start`` (or the previous solution) where the solver can
+    verbose: bool = False  # let the solver print
+    options: Mapping[str, Any] = field(default_factory=dict)  # native options, passed through
 
     def __post_init__(self) -> None:
         if not _is_number(self.accuracy) or not 0 < self.accuracy < 1:
@@ -48,22 +40,14 @@ class Settings:
 
 @dataclass(frozen=True)
 class Answer:
-    """A solver's claim.
+    """A solver's claim."""
 
-    Attributes:
-        status: its own status in our words; a claim of success is ``Status.LOCAL`` or ``Status.OPTIMAL``.
-        word: its own word.
-        values: {variable: array}, empty without a point.
-        duals: {constraint: flat multipliers}; may be incomplete.
-        iterations: -1 where unknown.
-        compile: seconds of the call that translated the programme for the solver; nan where they are not told apart.
-    """
-
-    status: Status
-    word: str
-    values: Mapping[str, np.ndarray] = field(default_factory=dict)
-    duals: Mapping[str, np.ndarray] = field(default_factory=dict)
-    iterations: int = -1
+    status: Status  # its own status in our words; a claim of success is ``Status.LOCAL`` or ``Status.OPTIMAL``
+    word: str  # its own word
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)  # {variable: array}, empty without a point
+    duals: Mapping[str, np.ndarray] = field(default_factory=dict)  # {constraint: flat multipliers}; may be incomplete
+    iterations: int = -1  # -1 where unknown
+    # seconds of the call that translated the programme for the solver; nan where they are not measured separately
     compile: float = float("nan")
 
 
@@ -91,33 +75,20 @@ class Minimum:
 
 @dataclass(frozen=True)
 class BackEnd:
-    """One solver under one word.
+    """One solver under one word."""
 
-    Attributes:
-        name: the word, in lower case.
-        classes: programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP".
-        run: (program, settings) -> Answer.
-        installed: whether it can run here.
-        pip: what to install where it cannot.
-        structures: types of structure it accepts, whatever the class of the programme.
-        duals: whether it returns multipliers.
-        warm: whether it can start from a given point.
-        thorough: options with which it searches further for a better local optimum, for where the proof fails.
-        about: one line for the table of solvers.
-        broken: why its entry point cannot be loaded, "" where it can.
-    """
-
-    name: str
-    classes: frozenset[str]
-    run: Callable[["Program", Settings], Answer] = field(repr=False)
-    installed: bool = True
-    pip: str = ""
-    structures: tuple[type[Structure], ...] = ()
-    duals: bool = True
-    warm: bool = False
+    name: str  # the word, in lower case
+    classes: frozenset[str]  # programme classes it accepts: "LP", "QP", "SOCP", "SDP", "conic", "NLP"
+    run: Callable[["Program", Settings], Answer] = field(repr=False)  # (program, settings) -> Answer
+    installed: bool = True  # whether it can run here
+    pip: str = ""  # what to install where it cannot
+    structures: tuple[type[Structure], ...] = ()  # types of structure it accepts in any class of programme
+    duals: bool = True  # whether it returns multipliers
+    warm: bool = False  # whether it can start from a given point
+    # options with which it searches further for a better local optimum, for where the proof fails
     thorough: Mapping[str, Any] = field(default_factory=dict)
-    about: str = ""
-    broken: str = ""
+    about: str = ""  # one line for the table of solvers
+    broken: str = ""  # why its entry point cannot be loaded, "" where it can
 
     @property
     def accepted(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Own solver for group-sparse least squares: block descent on the groups that matter, finished by Newton steps.
 
-Neighbouring onsets of a fault are nearly collinear, which makes plain block descent crawl. On the groups that are not
-zero the objective is smooth, so that a Newton step from there ends the crawl; groups enter when the gradient violates
+Neighbouring onsets of a fault are nearly collinear, which makes plain block descent slow. On the groups that are not
+zero the objective is smooth, so that a Newton step converges quickly; groups enter when the gradient violates
 the optimality conditions. The iteration stops by the duality gap, whose dual point is feasible by construction.
 """
 

@@ -252,7 +252,7 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
 
 
 def _status(statistics: dict[str, Any]) -> tuple[str, Status]:
-    """Read IPOPT's words; fatrop only says whether it succeeded, so that its point has to speak for itself."""
+    """Read IPOPT's words; fatrop only reports success or failure, so that its point is judged."""
     word = str(statistics.get("return_status", ""))
     if word in STATUS:
         return word, STATUS[word]

@@ -1,4 +1,4 @@
-"""Every conic and QP solver that CVXPY knows, by name, with one requested accuracy translated per solver.
+"""Every conic and QP solver of CVXPY by name, with one requested accuracy translated per solver.
 
 Small least squares under constraints go straight to Clarabel: CVXPY takes longer to translate than it to solve.
 """

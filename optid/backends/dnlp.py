@@ -1,7 +1,7 @@
 """All private names of CVXPY that optid needs, in one place, for the versions pinned in the project file.
 
 A nonconvex programme passes through CVXPY's own smooth chain (variable attributes lowered, kinks replaced by epigraph
-variables); what comes out, `Smooth`, is what every NLP back end works on. The way back, values and multipliers, goes
+variables); the result, `Smooth`, is the input of every NLP back end. The way back, values and multipliers, goes
 through the inverse data of the same chain, never by position.
 """
 
@@ -32,19 +32,13 @@ CACHE = "optid"  # our entry in the problem's own cache of compiled solvers
 
 @dataclass(frozen=True)
 class Smooth:
-    """A programme after CVXPY's smooth chain, with the way back.
+    """A programme after CVXPY's smooth chain, with the way back."""
 
-    Attributes:
-        original: the problem it was made from.
-        problem: the smooth problem; its constraints are read through ``rows``.
-        attributes, kinks: the two reductions, with their inverse data in ``inverse``.
-    """
-
-    original: cp.Problem
-    problem: cp.Problem
-    attributes: CvxAttr2Constr
-    kinks: Dnlp2Smooth
-    inverse: tuple[Any, Any]
+    original: cp.Problem  # the problem it was made from
+    problem: cp.Problem  # the smooth problem; its constraints are read through ``rows``
+    attributes: CvxAttr2Constr  # the first of the two reductions
+    kinks: Dnlp2Smooth  # the second
+    inverse: tuple[Any, Any]  # their inverse data
 
     @cached_property
     def variables(self) -> list[cp.Variable]:
@@ -127,7 +121,7 @@ def kept(problem: cp.Problem, key: Any, make: Callable[[], Any]) -> Any:
 class Derivatives:
     """Values and exact derivatives of a smooth problem, from CVXPY's compiled derivative engine.
 
-    The engine differentiates at the point of its last evaluation, whatever point it is asked for: it is reached through
+    The engine differentiates at the point of its last evaluation, not at the point passed: it is reached through
     `at`, which evaluates first where the point is a new one.
 
     Attributes:

@@ -2,7 +2,7 @@
 
 Without constraints the numbers are handled by `optid.structures.rank_one`. With constraints every step minimises the
 quadratic model of the Lagrangian over the programme's own convex constraints and the tangents of the others. A
-step that the tangents misled is corrected by solving for everything but b, which is convex.
+step for which the tangents are a poor model is corrected by solving for everything but b, which is convex.
 """
 
 import cvxpy as cp
@@ -214,7 +214,7 @@ class _Constrained:
                 old, reached = self._lift(x), self._lift(new)
                 size = float(np.linalg.norm(reached - old) / (1e-300 + np.linalg.norm(reached)))
                 rises = after > before + slack and size > 1e-7
-                # the tangents may mislead along a curved constraint: return to it by solving for all but b
+                # tangents are a poor model along a curved constraint: return to it by solving for all but b
                 settled = self._settle(self.at.point(new)) if rises else None
                 if settled is not None and self._merit(settled[1], weight) < before - slack:
                     after, new, rises = self._merit(settled[1], weight), settled[1], False

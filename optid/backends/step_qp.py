@@ -56,7 +56,7 @@ class Coordinates:
 
     @cached_property
     def blocks(self) -> list[tuple[slice, slice, slice]]:
-        """Where vec(mu_i b_iᵀ) stands in z, and mu_i and b_i in x."""
+        """The places of vec(mu_i b_iᵀ) in z, and of mu_i and b_i in x."""
         found, at = [], self.form.problem.linear
         for where, (p, q) in zip(self.form.problem.slices, self.form.problem.blocks):
             found.append((where, slice(at, at + p), slice(at + p, at + p + q)))

@@ -28,18 +28,13 @@ ROUNDING = {"qr": 1e-13, "gram": 1e-15}  # of the projected energy, the second p
 
 @dataclass(frozen=True, eq=False)
 class HankelBounds:
-    """Lower bounds for several numbers of block rows and all orders.
+    """Lower bounds for several numbers of block rows and all orders."""
 
-    Attributes:
-        block_rows: the alphas that were tried.
-        values: (len(block_rows), orders) squared error in squared units of the weighted outputs, by order from zero;
-            zero where alpha is too small to say anything about an order.
-        energy: squared norm of the weighted outputs over the samples in complete windows, the yardstick.
-    """
-
-    block_rows: tuple[int, ...]
+    block_rows: tuple[int, ...]  # the alphas that were tried
+    # (len(block_rows), orders) squared error in squared units of the weighted outputs, by order from zero; zero where
+    # alpha is too small to say anything about an order
     values: Array
-    energy: float
+    energy: float  # squared norm of the weighted outputs over the samples in complete windows, the yardstick
 
     def value(self, n: int) -> tuple[float, int]:
         """Return the largest bound for order n and its number of block rows; refuse other orders (`StructureError`)."""
@@ -65,7 +60,7 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
                   weights: Array | None = None) -> HankelBounds:
     """Bound the simulation error of every model of order 0 to ``largest``.
 
-    Windows that touch a missing sample are left out, which keeps the bound valid: it then speaks about fewer samples.
+    Windows that touch a missing sample are left out, which keeps the bound valid for the remaining samples.
 
     Args:
         records: one array (N, c) of raw channels per experiment, NaN = missing.

@@ -74,8 +74,8 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
     if not found:
         return True
     bs = [program.variables[b] for _, b in form.blocks] if form is not None and form.gauge == "norm" else []
-    spoken = {v.id for name in names for c in program.constraints[name] for v in c.variables()}
-    return _feasible(found) and all(_has_length(b, found) for b in bs if b.id in spoken)
+    used = {v.id for name in names for c in program.constraints[name] for v in c.variables()}
+    return _feasible(found) and all(_has_length(b, found) for b in bs if b.id in used)
 
 
 def _feasible(members: Sequence[Any]) -> bool:
@@ -84,7 +84,7 @@ def _feasible(members: Sequence[Any]) -> bool:
         try:
             solve_quietly(problem, solver)
             break
-        except cp.SolverError:  # it gave up; where both do, nothing is known, so nothing can be blamed
+        except cp.SolverError:  # it failed; where both fail, the constraints count as satisfiable
             continue
     else:
         return True
@@ -99,7 +99,7 @@ def _has_length(b: cp.Variable, members: Sequence[Any]) -> bool:
 
 def _linearised(member: Any) -> Any:
     expression, slopes = member.expr, jacobians(member.expr)
-    if slopes is None:  # nothing is known of it, so it cannot be blamed
+    if slopes is None:  # without a gradient it counts as satisfiable
         return cp.Constant(0.0) <= 0
     linear: Any = flat_value(expression)
     for variable, slope in slopes.items():

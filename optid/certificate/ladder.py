@@ -144,7 +144,7 @@ def _remembered(problem: RankOne, point: Point, effort: str, steps: int, max_siz
 
 def _climb(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: Linear, effort: str, steps: int,
            max_size: int) -> Certification:
-    """Certify rung by rung, up to the last one asked for or the first that proves the point."""
+    """Certify rung by rung, up to the last one requested or the first that proves the point."""
     check_constraints(cones, linear, problem)
     case = prepare(problem, point, cones, linear)
     if not case.core.shapes and not len(linear.right):

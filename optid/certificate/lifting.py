@@ -94,7 +94,7 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
 
 @dataclass(frozen=True)
 class Places:
-    """Where the variables of a programme, and the products of bilinear ones, stand in the lifted vector z."""
+    """The places of the variables of a programme, and of products of bilinear ones, in the lifted vector z."""
 
     size: int  # length of z
     columns: dict[int, int]  # {id of a variable: its first column}

@@ -4,7 +4,7 @@
     S = H + sum lambda_s L_s - sum_{j<k} sym(W_jk kron c_j c_k^T),   q = S z - g + E^T lambda / 2,   W_jk >= 0
 
 is the Lagrangian dual written around a point z; its own dual is the moment relaxation, whose moment matrix proposes
-where a better point may be. CVXPY poses it and Clarabel solves it; both are imported on first use.
+where a better point may be. It is stated in CVXPY and solved by Clarabel; both are imported on first use.
 """
 
 from collections.abc import Mapping, Sequence
@@ -99,7 +99,7 @@ def relax(objective: Quadratic, blocks: Sequence[Block], cones: Mapping[int, Arr
     lifted = cp.bmat([[corner, column.T], [column, objective.gram + square]]) >> 0
     problem = cp.Problem(cp.Maximize(level), [lifted, *constraints])
     try:
-        solve_quietly(problem)  # whatever comes back is checked and repaired
+        solve_quietly(problem)  # the result is checked and repaired
     except cp.SolverError:
         return None
     if weights.value is None or lifted.dual_value is None:

@@ -21,17 +21,11 @@ ACTIVE = 1e-6  # a row counts as active when its slack is below this fraction of
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """Constraints on the lifted vector: ``rows @ z <= right``, or ``=`` where ``equality``.
+    """Constraints on the lifted vector: ``rows @ z <= right``, or ``=`` where ``equality``."""
 
-    Attributes:
-        rows: (r, n).
-        right: (r,).
-        equality: (r,) of bool.
-    """
-
-    rows: Array
-    right: Array
-    equality: np.ndarray
+    rows: Array  # (r, n)
+    right: Array  # (r,)
+    equality: np.ndarray  # (r,) of bool
 
     def slack(self, z: Array) -> tuple[Array, Array]:
         """(slack, size of the terms), each (r,)."""

@@ -74,7 +74,7 @@ def check_back_end(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list
 
 
 def check_formulation(formulation: str | Callable[..., Any], data: Data, **arguments: Any) -> None:
-    """Pose a formulation on a record, on damaged copies of it, and on what it must refuse.
+    """Apply a formulation to a record, to damaged copies of it, and to records that it must refuse.
 
     The record is one that the model should describe, with at least 100 samples; the arguments are the formulation's.
 
@@ -121,7 +121,7 @@ def _about_formulation(formulation: str | Callable[..., Any], data: Data, argume
     for what, record in {**damaged, "3 samples": short, "an input that never moves": still}.items():
         again = attempt(record)
         if isinstance(again, Exception) and not isinstance(again, OptidError):
-            yield f"{what}: {type(again).__name__}: {again} (an error of optid.errors is asked for, with the remedy)"
+            yield f"{what}: {type(again).__name__}: {again} (it must be an error of optid.errors, with the remedy)"
         elif what not in damaged and not isinstance(again, Exception):
             yield f"{what}: accepted"
     if not isinstance(again := attempt(data, no_such_argument=1), OptidError):
@@ -129,7 +129,7 @@ def _about_formulation(formulation: str | Callable[..., Any], data: Data, argume
 
 
 def _about_model(model: Any, data: Data) -> Iterator[str]:
-    """What the rest of optid asks of a model."""
+    """Check the attributes and methods of a model that optid uses."""
     for name in ("inputs", "outputs", "dt", "nonlinearities", "memory", "poles", "kind"):
         if not hasattr(model, name):
             yield f"the model has no {name}"

@@ -48,7 +48,7 @@ def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: S
          **parts: Any) -> Program:
     """Make a programme of plain parts: named constraints (or lists of them), variables under their own names.
 
-    Constraints may speak about further named expressions; the other parts are attributes of `Program`.
+    Constraints may use further named expressions; the other parts are attributes of `Program`.
     """
     groups = {key: tuple(group) if isinstance(group, list | tuple) else (group,) for key, group in constraints.items()}
     named = {variable.name(): variable for variable in variables}

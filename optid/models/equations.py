@@ -87,7 +87,7 @@ class Equations:
         return round(count)
 
     def evaluated(self, v: Mapping[str, Any], outputs: tuple[str, ...]) -> dict[str, Any]:
-        """Return what the function says of states and outputs; refuse unknown or missing names (`StructureError`)."""
+        """Return the values of states and outputs; refuse unknown or missing names (`StructureError`)."""
         found = self.right(_Named(v))
         if not isinstance(found, Mapping):
             raise StructureError(f"the equations return a {type(found).__name__}; return a dictionary of "

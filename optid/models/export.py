@@ -209,7 +209,7 @@ def _called(nonlinearity: Nonlinearity, u: Any) -> Any:
             warnings.simplefilter("ignore", FutureWarning)
             values = [function(scalar) for function in basis.functions]
         f = ca.Function("f", [scalar], [sum(float(w) * value for w, value in zip(weights, values))])
-    except Exception as error:  # whatever the user's function does with what is no array
+    except Exception as error:  # the user's function may fail in any way on what is no array
         raise StructureError(
             f"{type(basis).__name__} cannot be called with a CasADi scalar ({type(error).__name__}: {error}): write it "
             "in arithmetic and NumPy functions, or fit the model again with BSpline or Triangular.") from None

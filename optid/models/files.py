@@ -35,7 +35,7 @@ def load(path: str | Path, functions: dict[str, Any] | None = None) -> Any:
 
 
 def record_of(path: str | Path) -> dict[str, Any] | None:
-    """Return what a model file says of the record that the model was identified from; None where it says nothing.
+    """Return the entry of a model file about the record of the identification; None without one.
 
     That are ``files``, absolute paths, and how they are read. Errors as of `load`.
     """
@@ -51,7 +51,7 @@ def record_of(path: str | Path) -> dict[str, Any] | None:
 
 
 def write(content: dict[str, Any], path: str | Path, form: str, version: int) -> Path:
-    """Write JSON types to a file that says of what form ("optid model") and version it is; it replaces an older one."""
+    """Write JSON types to a file with its form ("optid model") and version; it replaces an older one."""
     path = Path(path)
     text = json.dumps({"format": form, "version": version, **content}, indent=1, allow_nan=False)
     with complete(path) as part:

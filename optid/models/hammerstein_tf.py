@@ -26,7 +26,7 @@ from optid.models.recursions import autoregression, predict_regression
 
 # share of |b| below which sum b counts as zero: the offset of f then has no effect that could be measured
 TINY_SUM = 1e-6
-FORGOTTEN = 1e-12  # a free response below this share of its start no longer informs about the initial state
+FORGOTTEN = 1e-12  # a free response below this share of its start carries no information about the initial state
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,7 +69,7 @@ class HammersteinTF(Model):
     gauge: str = field(default="none", kw_only=True)
     GAUGES = GAUGES
     SIMULATORS = ("predict", "free")
-    equation, coefficients = text.equations, text.coefficients
+    equation, coefficients, noise = text.equations, text.coefficients, property(text.noise)
 
     def __post_init__(self) -> None:
         a, offset = finite(self.a, "a"), np.atleast_1d(finite(self.offset, "offset"))
@@ -98,8 +98,7 @@ class HammersteinTF(Model):
             if b.ndim != (1 if l == 1 else 2) or not b.size or b.shape[1:] not in ((), (l,)):
                 raise StructureError(f"b[{c}] has shape {b.shape}; it must be {'(nb,)' if l == 1 else f'(nb, {l})'}.")
         if any(f.offset is not None for f in self.nonlinearities):
-            raise StructureError(
-                "A nonlinearity of a model has offset None: put the constant of the equation in offset=.")
+            raise StructureError("A nonlinearity of a model has offset None: the constant belongs in offset=.")
         for name, values in (("c", self.c), ("d", self.d)):
             if values is not None and values.ndim != 1:
                 raise StructureError(f"{name} has shape {values.shape}; it must be (n{name},).")
@@ -111,7 +110,7 @@ class HammersteinTF(Model):
                 f"C is not invertible: it has a zero of modulus {largest:.6g}. Reflect it into the unit circle "
                 "(optid.models.roots.contained): the spectrum of the noise stays what it is.")
 
-    # -- sizes ---------------------------------------------------------------------------------------------------
+    # -- sizes and noise -----------------------------------------------------------------------------------------
 
     @property
     def na(self) -> int:
@@ -138,10 +137,7 @@ class HammersteinTF(Model):
 
     @property
     def memory(self) -> int:
-        """Samples at the start of a record that cannot be predicted.
-
-        The largest lag for ARX and ARMAX; none for output error and Box-Jenkins, whose initial state is estimated.
-        """
+        """Samples that cannot be predicted: the largest lag for ARX and ARMAX; else the initial state is estimated."""
         return self.largest_lag if self.d is None else 0
 
     @cached_property
@@ -164,8 +160,6 @@ class HammersteinTF(Model):
         found.flags.writeable = False
         return found
 
-    # -- noise ---------------------------------------------------------------------------------------------------
-
     @property
     def structure(self) -> str:
         """Which of the four it is: "oe", "arx", "armax" or "bj"."""
@@ -177,15 +171,6 @@ class HammersteinTF(Model):
     def noise_denominator(self) -> Array:
         """Coefficients of D after the leading one: `d`, or `a` where D is A."""
         return self.a if self.d is None else self.d
-
-    @property
-    def noise(self) -> str:
-        """The noise model in words and numbers; "" for ARX, whose name says it."""
-        c, d = text.polynomial(self.c), text.polynomial(() if self.d is None else self.d)
-        return {
-            "arx": "", "armax": f"C = {c}, D = A", "bj": f"C = {c}, D = {d}",
-            "oe": "e is added to the output: C = D = 1",
-        }[self.structure]
 
     # -- plant ---------------------------------------------------------------------------------------------------
 
@@ -228,9 +213,19 @@ class HammersteinTF(Model):
         return roots.largest_first(np.linalg.eigvals(companion).astype(complex))
 
     def _static_gain(self, points: Array) -> Array:
-        slopes = np.array([f.slope(u) for f, u in zip(self.nonlinearities, points)])
-        sums = np.stack([np.atleast_1d(b.sum(axis=0)) for b in self.b], axis=1)
-        return static_solution(np.eye(self.l) + self.matrices.sum(axis=0), sums * slopes)
+        return self._at_rest(self.numerators.sum(axis=0) * [f.slope(u) for f, u in zip(self.nonlinearities, points)])
+
+    def static_curve(self, c: int, points: Array) -> Array:
+        """Return the outputs (N, l) at rest with input c held at points (N,) and the functions of the others at zero.
+
+        An integrator is refused (`StructureError`).
+        """
+        level = self._at_rest(np.column_stack([self.offset, self.numerators[:, :, c].sum(axis=0)]))
+        return level[:, 0] + np.outer(self.nonlinearities[c](points), level[:, 1])
+
+    def _at_rest(self, right: Array) -> Array:
+        """Solve the equations at rest for constant right-hand sides (l, r)."""
+        return static_solution(np.eye(self.l) + self.matrices.sum(axis=0), right)
 
     def impulse_response(self, n: int = 100) -> Array:
         """Return the response of A^-1 B_c to a unit impulse of f_c, (n, l, m), in the gauge of the model."""
@@ -299,7 +294,7 @@ class HammersteinTF(Model):
 
     def driven(self, u: Array) -> Array:
         """Return the right-hand side sum_c B_c(q) f_c(u_c) + offset, (N, l), with nothing before the record."""
-        right, f = np.tile(self.offset, (len(u), 1)), [f(samples) for f, samples in zip(self.nonlinearities, u.T)]
+        right, f = np.tile(self.offset, (len(u), 1)), [f(one) for f, one in zip(self.nonlinearities, u.T)]
         for lag, c in np.argwhere(self.numerators[: len(u)].any(axis=1)):
             right[lag:] += f[c][: len(u) - lag, None] * self.numerators[lag, :, c]
         return right
@@ -319,9 +314,9 @@ class HammersteinTF(Model):
         right = self.driven(u)
         right[: len(state)] += state[: len(right)]
         y = autoregression(self.matrices, right)
-        wild = ~np.isfinite(y).all(axis=1)
-        if wild.any():
-            k = int(np.argmax(wild))
+        lost = ~np.isfinite(y).all(axis=1)
+        if lost.any():
+            k = int(np.argmax(lost))
             name = self.outputs[int(np.argmin(np.isfinite(y[k])))]
             raise DataError(
                 f"{label}The simulated output {name!r} leaves the range of numbers at sample {k}: the largest pole has "
@@ -336,16 +331,12 @@ class HammersteinTF(Model):
         free run gives it. Directions that the record does not determine are set to zero.
         """
         n, outputs = self.largest_lag, self.l
-        if n == 0:
-            return np.zeros((0, outputs))
         whitened = simulator == "predict" and self.d is not None
         radius = max(self.radius, roots.radius(self.c) if whitened else 0.0)
         forgotten = 10 * n + (int(2 * np.log(FORGOTTEN) / np.log(radius)) if 0 < radius < 1 else 0)
         count = len(y) if radius >= 1 else min(len(y), forgotten)
         units, rest = signal_units(y), (y - self._simulated(u, np.zeros((n, outputs)), label))[:count]
         present = np.isfinite(rest)
-        if not present.any():
-            return np.zeros((n, outputs))
         free = self._response(np.eye(outputs)[None], count)
         columns = np.zeros((count, outputs, n, outputs))
         for i in range(min(n, count)):
@@ -372,8 +363,7 @@ class HammersteinTF(Model):
         check_inputs(self, u, "The last samples: ")
         if np.isnan(y).any():
             k, o = np.argwhere(np.isnan(y))[0]
-            raise DataError(
-                f"Output {self.outputs[o]!r} is missing {n - k} samples before the end: the state needs it.")
+            raise DataError(f"Output {self.outputs[o]!r} is missing {n - k} samples before the end.")
         return self.following(u, y)
 
     def following(self, u: Array, y: Array) -> Array:
@@ -398,7 +388,7 @@ class HammersteinTF(Model):
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
-        """Build the model that `to_dict` described, or a file says with the plant apart or without noise."""
+        """Build the model that `to_dict` described, also one whose file holds the plant apart or no noise model."""
         if content["kind"] == "HammersteinARX":
             content = {**content, "c": (), "d": None}
         elif "plant" in content:

@@ -19,9 +19,9 @@ from optid.models.roots import spectral_radius
 from optid.models.state_signals import Direct, Parts, Signals, Stretch
 
 STEPS = 50  # steps at most
-# damping at least, relative to the diagonal of the information, where a step gained little of what it promised
+# damping at least, relative to the diagonal of the information, where a step gained much less than predicted
 FIRM = 0.01
-ARRIVED = 2e-5  # gain of the log-likelihood of no account; half a unit is one standard error of a parameter
+ARRIVED = 2e-5  # negligible gain of the log-likelihood; half a unit is one standard error of a parameter
 NUMBERS = 200_000  # entries of the sensitivities formed at a time
 NO_FUNCTIONS = tabulated(())
 

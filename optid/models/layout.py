@@ -1,4 +1,4 @@
-"""Which sample stands in which column of the regression y = Phi theta + e."""
+"""The samples in the columns of the regression y = Phi theta + e."""
 
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -57,6 +57,7 @@ class Model(Ports):
     offset_note: Any
     equation: Callable[..., str]
     impulse_response: Callable[..., Array]
+    static_curve: Callable[[int, Array], Array]
     _static_gain: Callable[[Array], Array]
     _state_shape: Any
     _predicted: Callable[[Array, Array, int, Array, str], Array]
@@ -352,7 +353,7 @@ def static_solution(matrix: Array, right: Array) -> Array:
 
 
 def _in_json(value: Any) -> Any:
-    """Arrays as lists, parts as what they say of themselves."""
+    """Arrays as lists, parts as their own descriptions."""
     if isinstance(value, tuple):
         return [_in_json(one) for one in value]
     if isinstance(value, np.ndarray):

@@ -21,7 +21,7 @@ class Nonlinearity:
     Attributes:
         basis: a basis with its interval.
         mu: (P,) coefficients.
-        offset: the constant of f; None where it cannot be told from the constant of the model, and counted as zero.
+        offset: the constant of f; None, which counts as zero, where it is part of the constant of the model.
 
     Raises:
         StructureError: mu does not have one finite coefficient per basis function.

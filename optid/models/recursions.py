@@ -144,11 +144,11 @@ def innovations(s: Array, drive: Array | None, c: Array, d: Array, start: int = 
 
 def predict(found: Filtered, c: Array, d: Array, horizon: int) -> Array:
     """Predict ``horizon`` samples ahead, (N,): the sample less what the last innovations added; NaN without them."""
-    told = np.where(np.isnan(found.predicted), np.nan, found.innovations)
+    used = np.where(np.isnan(found.predicted), np.nan, found.innovations)
     response = lfilter(np.concatenate([[1.0], c]), np.concatenate([[1.0], d]), np.eye(1, horizon)[0])
     prediction = found.filled.copy()
     for i, weight in enumerate(response):
-        prediction[i:] -= weight * told[: len(told) - i]
+        prediction[i:] -= weight * used[: len(used) - i]
     return prediction
 
 

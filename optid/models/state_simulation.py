@@ -16,11 +16,11 @@ from optid.models.state_space import StateSpace
 
 STRETCH = 16384  # samples expanded at a time
 FAR = 100.0  # a simulation that leaves this many times the range of the data has diverged
-# a derivative with respect to the initial state below this share of its largest value no longer informs
+# a derivative with respect to the initial state below this share of its largest value carries no information
 FORGOTTEN = 1e-12
 STEPS = 50
-SETTLED = 1e-20  # a step that promises less than this share of the squared error is the last one
-DIGITS = 1e-15  # of the outputs; a step that promises less than their square is the last one, too
+SETTLED = 1e-20  # a step with a smaller predicted share of the squared error is the last one
+DIGITS = 1e-15  # of the outputs; a step with a smaller predicted reduction than their square is the last one, too
 ROUNDING = 1e-14
 SIMULATORS = ("predict", "measured_feedback", "free")
 
@@ -74,9 +74,9 @@ def run(job: Run, x0: Array, horizon: int = 1) -> Array:
                     states += g(y[:, o])[:, None] * model.E[:, j]
                 h = model.latent_values(stretch.z[then] + states @ model.Cz.T)
                 y = states @ model.C.T + stretch.direct[then] + h @ model.Fz.T
-            wild = ~np.all((job.low <= y) & (y <= job.high), axis=1)
-            if wild.any():
-                raise _left(job, first + i + int(np.argmax(wild)))
+            beyond = ~np.all((job.low <= y) & (y <= job.high), axis=1)
+            if beyond.any():
+                raise _left(job, first + i + int(np.argmax(beyond)))
         outputs[first + horizon - 1 : first + horizon - 1 + len(y)] = y
     return outputs
 
@@ -128,7 +128,7 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
 def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) -> tuple[Array, float]:
     """Return the triangular root (n + 1, n + 1) of [derivative, error] over the samples present, and the error^2.
 
-    Where the error of the whole record is of no interest, the run ends when the initial state is forgotten.
+    Where the error of the whole record is not needed, the run ends when the initial state has no effect any more.
     """
     from optid.models.state_kernels import sensitivities
 

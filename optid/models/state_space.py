@@ -189,39 +189,59 @@ class StateSpace(Model):
         Raises:
             StructureError: u0 of the wrong size, a pole at 1, or no equilibrium found.
         """
-        points = self._operating_point(u0)
-        f, x = self.expanded(points[None])[0], np.zeros(self.nx)
+        u = self._operating_point(u0)[None]
+        x, y = self._at_rest(self.expanded(u), u)
+        return x[0], y[0]
+
+    def static_curve(self, c: int, points: Array) -> Array:
+        """Return the outputs (N, l) at rest with input c held at points (N,) and the functions of the others at zero.
+
+        A model without such a state of rest is refused (`StructureError`).
+        """
+        u, f = np.zeros((len(points), self.m)), np.zeros((len(points), len(self.nonlinearities)))
+        u[:, c] = points
+        for j in np.flatnonzero(np.equal(self.input_of, c)):
+            f[:, j] = self.nonlinearities[j](points)
+        return self._at_rest(f, u)[1]
+
+    def _at_rest(self, f: Array, u: Array) -> tuple[Array, Array]:
+        """Return states (N, n) and outputs (N, l) at rest under inputs u (N, m) with function values f (N, r)."""
+        x = np.zeros((len(u), self.nx))
+        curved = bool(self.feedback or self.latent)
+        own = slice(None if curved else 1)  # else the tangent is the same everywhere
         for _ in range(NEWTON_STEPS):
-            h = self.latent_values(self.latent_signals(x[None], points[None]))[0]
-            y = self.C @ x + self.D @ f + self.Fz @ h + self.offset_y
-            g = np.array([function(y[o]) for function, o in zip(self.feedback, self.output_of)])
-            terms = np.array([self.A @ x, self.B @ f, self.E @ g, self.L @ y, self.Ez @ h, self.offset_x, -x])
-            change = terms.sum(axis=0)
-            if np.abs(change).max(initial=0.0) <= RESTS * np.abs(terms).max(initial=0.0):
+            h = self.latent_values(self.latent_signals(x, u))
+            y = x @ self.C.T + f @ self.D.T + h @ self.Fz.T + self.offset_y
+            moves = [x @ self.A.T, f @ self.B.T, y @ self.L.T, h @ self.Ez.T, np.tile(self.offset_x, (len(u), 1)), -x]
+            moves += [np.outer(g(y[:, o]), e) for g, o, e in zip(self.feedback, self.output_of, self.E.T)]
+            change = sum(moves, np.zeros_like(x))
+            sizes = np.max([np.abs(move).max(axis=1, initial=0.0) for move in moves], axis=0)
+            if np.all(np.abs(change).max(axis=1, initial=0.0) <= RESTS * sizes):
                 return x, y
-            x = x - np.linalg.lstsq(self._tangent(x, y, points)[0] - np.eye(self.nx), change)[0]
-            if not np.all(np.isfinite(x)):
+            slope = self._tangent(x[own], y[own], u[own])[0] - np.eye(self.nx)
+            if not np.all(np.isfinite(slope)):
                 break
-        if not self.feedback and not self.latent:
+            x = x - (np.linalg.pinv(slope) @ change[:, :, None])[:, :, 0]
+        if not curved:
             static_solution(self.A + self.L @ self.C - np.eye(self.nx), self.B)
         raise StructureError(
-            f"No equilibrium was found at u0 = {points.tolist()}: the feedback does not let the model rest there.")
+            f"No equilibrium was found at u0 = {u[0].tolist()}: the feedback does not let the model rest there.")
 
     def _static_gain(self, points: Array) -> Array:
-        A, B, C, D = self._tangent(*self.equilibrium(points), points)
+        x, y = self.equilibrium(points)
+        A, B, C, D = (one[0] for one in self._tangent(x[None], y[None], points[None]))
         return D - C @ static_solution(A - np.eye(self.nx), B)
 
     def _tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
-        """Return A, B, C, D of the free run near a state (n,), outputs (l,) and inputs (m,)."""
-        slopes = np.zeros((len(self.nonlinearities), self.m))
+        """Return A, B, C, D of the free run near states (N, n), outputs (N, l) and inputs (N, m), N of each."""
+        slopes = np.zeros((len(u), len(self.nonlinearities), self.m))
         for j, (f, c) in enumerate(zip(self.nonlinearities, self.input_of)):
-            slopes[j, c] = f.slope(u[c])
-        z = self.latent_signals(x[None], u[None])[0]
-        inner = np.array([h.slope(one) for h, one in zip(self.latent, z)])[:, None]
-        C, D = self.C + self.Fz @ (inner * self.Cz), self.D @ slopes + self.Fz @ (inner * self.Dz)
-        back = self.returned(y[None])[0]
-        A = self.A + self.Ez @ (inner * self.Cz) + back @ C
-        return A, self.B @ slopes + self.Ez @ (inner * self.Dz) + back @ D, C, D
+            slopes[:, j, c] = f.slope(u[:, c])
+        z = self.latent_signals(x, u)
+        inner = np.array([h.slope(one) for h, one in zip(self.latent, z.T)]).T.reshape(z.shape)[:, None]
+        Ez, Fz, back = self.Ez * inner, self.Fz * inner, self.returned(y)
+        C, D = self.C + Fz @ self.Cz, self.D @ slopes + Fz @ self.Dz
+        return self.A + Ez @ self.Cz + back @ C, self.B @ slopes + Ez @ self.Dz + back @ D, C, D
 
     def latent_signals(self, x: Array, u: Array) -> Array:
         """Return z (N, k) at states x (N, n) and inputs u (N, m)."""

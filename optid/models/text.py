@@ -32,6 +32,13 @@ def polynomial(coefficients: Iterable[float], digits: int = 4) -> str:
     return "1" + signed_terms(((float(c), f"q^-{i}") for i, c in enumerate(coefficients, start=1)), digits)
 
 
+def noise(model: Any) -> str:
+    """Write C and D of a transfer-function model; "" for ARX, whose name says it."""
+    c, d = polynomial(model.c), polynomial(() if model.d is None else model.d)
+    return {"arx": "", "armax": f"C = {c}, D = A", "bj": f"C = {c}, D = {d}",
+            "oe": "e is added to the output: C = D = 1"}[model.structure]
+
+
 def coefficients(model: Any) -> list[tuple[str, float]]:
     """Return (name, value) of every coefficient of A, B, the offset, C and (Box-Jenkins) D, as tables show them."""
     several, found = model.l > 1, []

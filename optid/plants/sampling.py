@@ -7,7 +7,7 @@ from optid.arrays import Array
 from optid.errors import DataError, StructureError
 from optid.models.recursions import lfilter
 
-WILD = 1e8
+BOUND = 1e8
 
 
 def as_input(u: ArrayLike, channels: int) -> Array:
@@ -45,9 +45,9 @@ def gaussian(rng: np.random.Generator, n: int, channels: int, size: float, colou
 def check_bounded(states: Array, plant: str) -> None:
     """Refuse a simulation that left all bounds (`DataError` with the first sample at which it did)."""
     with np.errstate(invalid="ignore"):
-        wild = ~(np.abs(states) < WILD).all(axis=1)
-    if wild.any():
-        raise DataError(f"the simulated {plant} leaves all bounds at sample {int(np.argmax(wild))}: "
+        outside = ~(np.abs(states) < BOUND).all(axis=1)
+    if outside.any():
+        raise DataError(f"the simulated {plant} leaves all bounds at sample {int(np.argmax(outside))}: "
                         "use a smaller input, less noise or a shorter sampling time.")
 
 

@@ -1,4 +1,4 @@
-"""What prices, fits and intervals ask of the compressed data behind a programme."""
+"""The interface of compressed data that prices, fits and intervals use."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,19 +12,12 @@ from optid.errors import RankError
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """How far an estimate scatters.
+    """How far an estimate scatters."""
 
-    Attributes:
-        covariance: (k, k) of its coordinates.
-        noise: (l, l) covariance of the errors, in units of the objective.
-        dof: degrees of freedom that are left to estimate it.
-        penalised: whether a penalty is part of the objective.
-    """
-
-    covariance: Array
-    noise: Array
-    dof: float
-    penalised: bool = False
+    covariance: Array  # (k, k) of its coordinates
+    noise: Array  # (l, l) covariance of the errors, in units of the objective
+    dof: float  # degrees of freedom that are left to estimate it
+    penalised: bool = False  # whether a penalty is part of the objective
 
 
 class Compressed(Protocol):

@@ -15,7 +15,7 @@ Map = Callable[[np.ndarray], np.ndarray]
 """Of arrays, such as from the Jacobian of an argument to its part of that of an atom."""
 
 DENSE = 100_000  # entries of the Jacobian up to which an expression is small
-MOST = 30_000_000  # entries up to which a large expression is differentiated here where CVXPY knows no gradient
+MOST = 30_000_000  # entries up to which a large expression is differentiated here where CVXPY has no gradient
 MOVES = {"index", "special_index", "reshape", "transpose", "Hstack", "Vstack", "Concatenate", "Promote", "broadcast_to",
          "diag_vec", "diag_mat", "upper_tri", "squeeze", "Stack", "nonneg_wrap", "nonpos_wrap", "symmetric_wrap",
          "psd_wrap", "nsd_wrap", "real"}
@@ -49,13 +49,13 @@ def flat_value(expression: cp.Expression) -> np.ndarray:
 def jacobians(expression: cp.Expression) -> dict[cp.Variable, Any] | None:
     """Return the Jacobian (rows, size) of an expression with respect to each of its variables.
 
-    Rows and columns follow the entries column by column. None where CVXPY knows no gradient at the assigned point.
+    Rows and columns follow the entries column by column. None where CVXPY has no gradient at the assigned point.
     Small expressions are differentiated here, with the common atoms by their own rules: CVXPY composes sparse
     matrices atom by atom, which takes ten times as long. Large ones are left to it, and their Jacobians are sparse.
     """
     entries = expression.size * sum(variable.size for variable in expression.variables())
     gradients: Any = expression.grad if entries > DENSE else {None: None}
-    if None in gradients.values():  # CVXPY knows no gradient of an odd power where it is negative
+    if None in gradients.values():  # CVXPY has no gradient of an odd power where it is negative
         node = _differentiate(expression, {}) if entries <= MOST else None
         return None if node is None else dict(node.slopes)
     found = {}
@@ -129,7 +129,7 @@ def _moved(expression: Any) -> list[Map]:
 
 
 def _of_atom(part: Any, value: np.ndarray) -> Map | None:
-    """Use the gradient (size of the argument, size) of an atom as CVXPY knows it."""
+    """Use the gradient (size of the argument, size) of an atom by CVXPY."""
     if part is None:
         return None
     matrix = part.toarray() if sp.issparse(part) else np.asarray(part, dtype=float)

@@ -96,7 +96,7 @@ def term_size(member: Constraint, usual: Mapping[int, float] | None = None) -> f
 
 
 def _terms(expression: cp.Expression, usual: Mapping[int, float]) -> float | None:
-    """Largest sum of the magnitudes of the terms of an entry; None where CVXPY knows no gradient."""
+    """Largest sum of the magnitudes of the terms of an entry; None where CVXPY has no gradient."""
     slopes = jacobians(expression)
     if slopes is None:
         return None

@@ -1,4 +1,4 @@
-"""What the bound of a user's constraint is: which rows move with it, how fast, and what a small step of it is."""
+"""The bound of a user's constraint: the rows that move with it, their rates, and a small step of it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,26 +28,21 @@ class Limit:
     """One CVXPY constraint of a user with its bound.
 
     The rows read ``row <= shift * t`` (``row = shift * t``) once the bound has moved by t.
-
-    Attributes:
-        member: the constraint as the user wrote it.
-        shift: by how much every row moves per unit of the bound: a number or an expression; for a cone an array,
-            flat, or a number where that is not known.
-        bound: name of the bound; rows of one name move together. None: every row has a bound of its own.
-        band: (rows, entries) for an equality that stands for ``|rows @ x| <= t`` with t = 0: the rows.
-        span: (independent rows, entries) the equalities that the constraint poses in their place.
-        step: returns what 1 % is in units of the bound, at the assigned point; None takes the size of its terms.
-        words: what the step is 1 % of.
-        sizes: what the rows, flat, were divided by in the programme.
     """
 
-    member: Constraint
+    member: Constraint  # the constraint as the user wrote it
+    # by how much every row moves per unit of the bound: a number or an expression; for a cone an array, flat, or a
+    # number where that is not known
     shift: Any = 1.0
-    bound: str | None = ""
+    bound: str | None = ""  # name of the bound; rows of one name move together. None: each row has its own bound
+    # (rows, entries) for an equality that stands for ``|rows @ x| <= t`` with t = 0: the rows
     band: np.ndarray | None = None
+    # (independent rows, entries) the equalities that the constraint imposes in their place
     span: np.ndarray | None = None
+    # returns what 1 % is in units of the bound, at the assigned point; None takes the size of its terms
     step: Callable[[], float] | None = None
-    words: str = ""
+    words: str = ""  # what the step is 1 % of
+    # what the rows, flat, were divided by in the programme
     sizes: np.ndarray = field(default_factory=lambda: np.ones(1))
 
     @classmethod
@@ -90,7 +85,7 @@ def spans(group: Sequence[Constraint]) -> list[slice]:
 def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray) -> tuple[float, int]:
     """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
 
-    Bounds are compared by what a small step of each gains. The multipliers are those of the rows as they are posed,
+    Bounds are compared by what a small step of each gains. The multipliers are those of the rows as they are scaled,
     flat over the members, per unit of the objective.
     """
     totals = {}

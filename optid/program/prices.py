@@ -24,27 +24,18 @@ class Price:
     Multiplier and price are derivatives by the bound that the user wrote: the number in the constraint, in its units.
     Rows that share a bound move together; of several bounds the most expensive one counts. For conditions without a
     number (monotone, odd, ...) the bound is the zero in their rows: how far, in units of f, each of them may be missed.
-
-    Attributes:
-        name: the user's name.
-        active: how many of its rows hold with equality.
-        rows: how many rows it has.
-        slack: smallest slack over the rows in units of the constraint (0 for equalities).
-        multiplier: change of the objective per unit of the bound; ``nan`` where the solver gives no multipliers.
-        fit_points: points of one-step fit (%, all outputs together) gained per unit of the bound; ``nan`` where the
-            constraint belongs to a step with an objective of its own.
-        step: what 1 % is in units of the bound.
-        words: of what: of the range of f where the bound is about f, else of the size of what it bounds.
     """
 
-    name: str
-    active: int
-    rows: int
-    slack: float
-    multiplier: float
+    name: str  # the user's name
+    active: int  # how many of its rows hold with equality
+    rows: int  # how many rows it has
+    slack: float  # smallest slack over the rows in units of the constraint (0 for equalities)
+    multiplier: float  # change of the objective per unit of the bound; ``nan`` where the solver gives no multipliers
+    # points of one-step fit (%, all outputs together) gained per unit of the bound; ``nan`` where the constraint
+    # belongs to a step with another objective
     fit_points: float
-    step: float = float("nan")
-    words: str = ""
+    step: float = float("nan")  # what 1 % is in units of the bound
+    words: str = ""  # of what: of the range of f where the bound is about f, else of the size of what it bounds
 
     @property
     def binding(self) -> bool:
@@ -89,7 +80,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
 def price_earlier_steps(steps: Mapping[str, tuple[Program, Solution]], last: Program) -> tuple[Price, ...]:
     """Return the prices of the constraints that are not in the last programme, from the step in which each stood.
 
-    Their multipliers are in units of the objective of their own step, so they have no price in points of fit.
+    Their multipliers are in units of the objective of that step, so they have no price in points of fit.
     """
     found = []
     for name, (program, solution) in steps.items():

@@ -17,7 +17,7 @@ from optid.program.solution import Bound
 from optid.program.structure import Structure
 from optid.program.view import Values, View
 
-STATED = ("objective", "constraints", "variables", "view", "derived")  # what a programme says in CVXPY
+STATED = ("objective", "constraints", "variables", "view", "derived")  # the statement of a programme in CVXPY
 
 
 def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
@@ -56,7 +56,7 @@ class Program:
         variables: {name: CVXPY variable}.
         start: {name: array}: a point to start from; never zero for a bilinear programme, where zero is a saddle.
         recover: values -> model.
-        view: the expressions constraints may speak about.
+        view: the expressions that constraints may use.
         structural: names of constraints that belong to the formulation.
         parameters: {name: CVXPY parameter} that may change between solves without recompiling.
         derived: {name: expression}: variables that the others determine exactly, such as residuals passed as
@@ -95,9 +95,9 @@ class Program:
     @classmethod
     def deferred(cls, name: str, statement: Callable[[], Mapping[str, Any]], *, start: Values,
                  structure: Structure, **known: Any) -> "Program":
-        """Return a programme that is stated in CVXPY only where something asks for the statement.
+        """Return a programme that is stated in CVXPY only when the statement is first used.
 
-        Back ends and judgement that know its structure do without; constraints of the user ask for it at once.
+        Back ends and judgement for its structure do not use it; constraints of the user do at once.
 
         Args:
             name: of the formulation.
@@ -125,7 +125,7 @@ class Program:
 
     @property
     def is_stated(self) -> bool:
-        """Whether the programme stands in CVXPY; one that is `deferred` does not until something asks for it."""
+        """Whether the programme is stated in CVXPY; one that is `deferred` is not until its statement is needed."""
         return "_statement" not in vars(self)
 
     @property
@@ -191,7 +191,7 @@ class Program:
         """
         if not builders:
             return self
-        demand = self.problem.is_dcp() if convex is None else convex
+        convex_only = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
         usual = self.usual_sizes
@@ -203,7 +203,7 @@ class Program:
                 if not group:
                     continue
                 if name in constraints:
-                    raise StructureError(f"there are two constraints named {name!r}; give each a name of its own")
+                    raise StructureError(f"there are two constraints named {name!r}; give each its own name")
                 for member in (limit.member for limit in group):
                     foreign = set(member.variables()) - known
                     own = {v for v in foreign if self.view.owns(v)}
@@ -217,7 +217,7 @@ class Program:
                             f"constraint {name!r} uses {', '.join(sorted(v.name() for v in foreign))}, "
                             f"which is not a variable of {self.name!r} ({', '.join(self.variables)})"
                         )
-                    if demand and not member.is_dcp():
+                    if convex_only and not member.is_dcp():
                         raise StructureError(
                             f"constraint {name!r} is not convex, and {self.name!r} is a convex formulation: {member}. "
                             "State it in the named variables of the relaxation or use an exact formulation."

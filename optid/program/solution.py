@@ -31,9 +31,9 @@ class Bound:
 
     Attributes:
         value: the bound D, in units of the objective; ``-inf`` where none was found.
-        proved: True when the bound closes the gap to the point it was asked for.
+        proved: True when the bound closes the gap to its point.
         method: how it was obtained ("instant", "ascent", "sdp", "product cuts", "nuclear dual", ...).
-        reason: one sentence for people: why it is a proof, or why there is none.
+        reason: one sentence: why it is a proof, or why there is none.
         multipliers: the evidence from which the value can be recomputed.
     """
 
@@ -45,28 +45,22 @@ class Bound:
 
     @classmethod
     def none(cls, reason: str) -> "Bound":
-        """Say why there is no bound."""
+        """Return no bound, with the reason."""
         return cls(-np.inf, False, "none", reason)
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Our own measurements at a solver's point; all relative, zero at an exact solution.
+    """Our own measurements at a solver's point; all relative, zero at an exact solution."""
 
-    Attributes:
-        violation: largest constraint violation, relative to the size of the constraint's terms.
-        worst: name of the constraint that is violated most.
-        stationarity: largest component of the gradient of the Lagrangian, relative to the terms it is a sum of plus
-            the objective per size of the variable (so that units do not matter); multipliers of the wrong sign count
-            as missing. ``nan`` where it cannot be formed (no multipliers, or an objective with kinks: the bound
-            judges there).
-        complementarity: sum of the products of multiplier and slack, relative to the objective (where it vanishes, to a
-            hundredth of its scale).
-    """
-
-    violation: float
-    worst: str
+    violation: float  # largest constraint violation, relative to the size of the constraint's terms
+    worst: str  # name of the constraint that is violated most
+    # largest component of the gradient of the Lagrangian, relative to the terms it is a sum of plus the objective per
+    # size of the variable (so that units do not matter); multipliers of the wrong sign count as missing. ``nan`` where
+    # it cannot be formed (no multipliers, or an objective with kinks: the bound judges there)
     stationarity: float
+    # sum of the products of multiplier and slack, relative to the objective (where it vanishes, to a hundredth of its
+    # scale)
     complementarity: float
 
 
@@ -74,8 +68,8 @@ class Residuals:
 class Times:
     """Seconds spent building, solving, judging and proving.
 
-    ``compile`` is the part of ``solve`` that translated the programme for the solver; nan where the back end does not
-    tell it apart.
+    ``compile`` is the part of ``solve`` that translated the programme for the solver; nan where the back end does
+    not measure it.
     """
 
     build: float = 0.0
@@ -96,10 +90,10 @@ class Solution:
 
     Attributes:
         status: why it stopped, after judgement.
-        claimed: what the solver said, in its own word.
+        claimed: status in the solver's own word.
         reason: one sentence where the status needs one.
         values: {variable name: array} in the units of the programme, empty where there is no point; see `Fit.values`.
-        duals: {constraint name: multiplier array} of the rows and the objective as the programme poses them, empty
+        duals: {constraint name: multiplier array} of the rows and the objective in units of the programme, empty
             where the solver gives none; see `optid.program.prices`.
         objective: value of the programme's objective at ``values`` in units of the record, recomputed (``nan`` without
             a point).
@@ -109,7 +103,7 @@ class Solution:
         solver: name of the back end; ``chosen`` says why when it was chosen automatically.
         iterations: as counted by the solver, -1 where it does not say.
         times: seconds per phase.
-        claim: what the solver said, in our words; None where nothing was asked of one.
+        claim: status claimed by the solver; None where no solver ran.
         failed: name of the back end chosen first, which gave no usable answer; "" where it did.
     """
 

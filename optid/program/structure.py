@@ -7,7 +7,7 @@ import numpy as np
 
 from optid.arrays import Array
 
-ZERO = 1e-9  # a variable without a start that is smaller than this has no size of its own to measure by
+ZERO = 1e-9  # a variable without a start that is smaller than this has no size to measure by
 
 
 class Structure:
@@ -40,7 +40,7 @@ class Structure:
         """Return values in the shapes of the variables, derived ones computed from the others, and what they violate.
 
         That is the largest relative violation of a structural constraint, and its name. Only a programme that is
-        `deferred` asks for it.
+        `deferred` uses it.
         """
         raise NotImplementedError
 

@@ -1,9 +1,9 @@
-"""The units in which problems are posed: outputs about their level, in multiples of their spread.
+"""The units of the programmes: outputs about their level, in multiples of their spread.
 
 A model is the same model in any units, but a solver's tolerances and the digits of a sum of squares are not. Every
-formulation therefore poses its problem on a record whose outputs have mean zero and variance one, all outputs divided
-by the same number, so that their weights against each other stay; inputs that act linearly are treated likewise. The
-constraints still speak in the units of the record: `outward` gives them the named expressions in these.
+formulation therefore uses a record whose outputs have mean zero and variance one, all outputs divided by the same
+number, which preserves their relative weights; inputs that act linearly are treated likewise. Constraints are stated
+in the units of the record: `outward` returns the named expressions in these.
 """
 
 from collections.abc import Mapping, Sequence

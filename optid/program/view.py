@@ -1,4 +1,4 @@
-"""What a constraint may speak about: the named expressions of a programme, in the units of the record."""
+"""The named expressions of a programme that constraints may use, in the units of the record."""
 
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
@@ -17,7 +17,7 @@ Values = Mapping[str, np.ndarray]  # values of variables by name
 
 @dataclass(eq=False, repr=False)
 class View(Mapping[str, cp.Expression]):
-    """The named expressions that a constraint may speak about, and the structure it may need.
+    """The named expressions that a constraint may use, and the structure it may need.
 
     A factored model has ``mu`` and ``b`` of an input, a relaxed one the product ``Theta``, a linear one ``b`` alone;
     the step that chooses the poles of a state-space model has ``P`` and ``Q`` = A P, the step that chooses B and D
@@ -36,7 +36,7 @@ class View(Mapping[str, cp.Expression]):
         outputs: names of the outputs, where constraints may have to choose one.
         units: from the units of the programme to those of the record, in which the expressions are; None where they
             are the same.
-        delays: of the inputs in samples, where the model is a polynomial one that knows them.
+        delays: of the inputs in samples, of a polynomial model.
         iterate: whether the reference is the point where a descent stands, which constraints must not cut off.
     """
 

@@ -1,1 +1,1 @@
-"""What people see of a fit: the printed result, tables and drawings."""
+"""Results for people: printed text, tables, figures and pages."""

@@ -1,6 +1,7 @@
 """Charts of pages: records, nonlinearities, responses, poles, residual tests, as data for the plot inside the page."""
 
 import warnings
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,25 +13,29 @@ from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
 from optid.identify.validation.predictions import one_step, simulated
 from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions, step_length
+from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
+    from optid.identify.order.lags import LagScan
     from optid.identify.order.study import OrderStudy
     from optid.identify.search import Identification
     from optid.identify.validation import Comparison, Validation
 
 MOST_EXPERIMENTS = 4
 COLOURS = tuple(f"c{k}" for k in range(10))
+Lines = tuple[str, list[Array] | None, dict[str, Any]]
 
 
-def _unit(name: str, unit: str) -> Axis:
+def channel_axis(name: str, unit: str) -> Axis:
+    """Return the axis of a channel, with its unit where it has one."""
     return Axis(f"{name} ({unit})" if unit else name, unit=unit)
 
 
 def validated(model: Any, record: Data) -> "Validation":
-    """Validate a model without the warnings, which stand in the notes."""
+    """Validate a model without the warnings, which the notes repeat."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         return validate(model, record)
@@ -58,34 +63,52 @@ def free_run(model: Any, record: Data) -> list[Array] | None:
 
 def record_charts(models: dict[str, Any], data: Data, *, ahead: bool = True, group: str = "time") -> list[Chart]:
     """Measured outputs, simulations of models, and one-step predictions of a single one; inputs below, linked."""
-    record, charts = data.raw(), []
-    runs = {name: free_run(model, record) for name, model in models.items()}
-    predicted = one_step(next(iter(models.values())), record) if ahead else None
-    for k, e in enumerate(record.experiments[:MOST_EXPERIMENTS]):
-        t = e.start + record.dt * np.arange(e.n_samples, dtype=float)
-        several = f", experiment {k + 1} of {record.n_experiments}" if record.n_experiments > 1 else ""
-        for o, name in enumerate(record.outputs):
-            series = [Series("measured", t, e.y[:, o], colour="ink", width=1.2)]
-            series += [Series(label if len(models) > 1 else "simulated", t, run[k][:, o], colour=colour, width=1.9)
-                       for (label, run), colour in zip(runs.items(), COLOURS * len(runs)) if run is not None]
-            if predicted is not None:
-                series.append(Series("one step ahead", t, predicted[k][:, o], colour="c1", dash="4 2", width=1.3))
-            charts.append(Chart(f"Output {name}{several}", "Every simulation starts from the best-fitting initial "
-                                "state and uses no measured output.", Axis("time"), _unit(name, record.output_units[o]),
-                                series, f"{group}{k}", height=300))
-        for c, name in enumerate(record.inputs):
-            charts.append(Chart(f"Input {name}{several}", "", Axis("time"), _unit(name, record.input_units[c]),
-                                [Series(name, t, e.u[:, c], colour="muted", width=1.2)], f"{group}{k}", height=190))
+    record = data.raw()
+    runs, caption = runs_of(models, record, ahead), (
+        "Every simulation starts from the best-fitting initial state and uses no measured output.")
+    return [chart for k in range(min(record.n_experiments, MOST_EXPERIMENTS))
+            for chart in time_charts(record, k, runs, f"{group}{k}", caption)]
+
+
+def runs_of(models: dict[str, Any], record: Data, ahead: bool = True) -> list[Lines]:
+    """Return the simulations of models, and the one-step predictions of a single one, as `time_charts` takes them."""
+    runs: list[Lines] = [
+        (label if len(models) > 1 else "simulated", free_run(model, record), {"colour": colour, "width": 1.9})
+        for (label, model), colour in zip(models.items(), COLOURS * len(models))]
+    if ahead:
+        predicted = one_step(next(iter(models.values())), record)
+        runs.append(("one step ahead", predicted, {"colour": "c1", "dash": "4 2", "width": 1.3}))
+    return runs
+
+
+def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", caption: str = "",
+                part: slice = slice(None), heights: tuple[int, int] = (300, 190)) -> list[Chart]:
+    """Return charts of every output, measured and of some runs, and of every input over some samples of experiment k.
+
+    A run has a name, outputs (N, l) of every experiment or None for none, and the options of its series.
+    """
+    e = record.experiments[k]
+    t = (e.start + record.dt * np.arange(e.n_samples, dtype=float))[part]
+    several = f", experiment {k + 1} of {record.n_experiments}" if record.n_experiments > 1 else ""
+    charts = []
+    for o, name in enumerate(record.outputs):
+        series = [Series("measured", t, e.y[part, o], colour="ink", width=1.2)]
+        series += [Series(label, t, run[k][part, o], **how) for label, run, how in runs if run is not None]
+        y = channel_axis(name, record.output_units[o])
+        charts.append(Chart(f"Output {name}{several}", caption, Axis("time"), y, series, group, height=heights[0]))
+    for c, name in enumerate(record.inputs):
+        charts.append(Chart(f"Input {name}{several}", "", Axis("time"), channel_axis(name, record.input_units[c]),
+                            [Series(name, t, e.u[part, c], colour="muted", width=1.2)], group, height=heights[1]))
     return charts
 
 
-def nonlinearity_charts(fit: "Fit") -> list[Chart]:
-    """Every static function over its interval, its 95 % band, and the density of the samples below."""
+def nonlinearity_charts(fit: "Fit", linear: bool = False) -> list[Chart]:
+    """Every static function, or every nonlinear one, over its interval, its 95 % band, and the density of samples."""
     known, _ = uncertainty(fit)
     record = fit.data.raw() if isinstance(fit.data, Data) else None
     charts = []
     for function in static_functions(fit.model):
-        if function.is_linear:
+        if function.is_linear and not linear:
             continue
         f = function.nonlinearity
         samples = visited(function, record)
@@ -99,13 +122,18 @@ def nonlinearity_charts(fit: "Fit") -> list[Chart]:
         series.append(Series(function.word, grid, f(grid), width=2.2))
         here = samples[(samples >= low) & (samples <= high)]
         if here.size:
-            counts, edges = np.histogram(here, bins=40, range=(low, high))
-            series.append(Series("density of the samples", edges[:-1], counts / counts.max(), "bars", "muted",
-                                 aside=True))
+            series.append(density(here, low, high))
         charts.append(Chart(f"{function.what} {function.word} of {function.name}", "The bars show where the samples "
-                            "lie: the function is uncertain where there are few.", _unit(function.name, function.unit),
-                            Axis(f"{function.word}({function.name})"), series))
+                            "lie: the function is uncertain where there are few.",
+                            channel_axis(function.name, function.unit), Axis(f"{function.word}({function.name})"),
+                            series))
     return charts
+
+
+def density(samples: Array, low: float, high: float) -> Series:
+    """Return a histogram of samples (N,) between two values as bars, the highest of height one."""
+    counts, edges = np.histogram(samples, bins=40, range=(low, high))
+    return Series("density of the samples", edges[:-1], counts / max(counts.max(), 1), "bars", "muted", aside=True)
 
 
 def dynamics_charts(models: dict[str, Any], fit: "Fit | None" = None) -> list[Chart]:
@@ -157,10 +185,11 @@ def pole_chart(poles: dict[str, Array]) -> Chart:
 
 def correlation_charts(checked: "Validation") -> list[Chart]:
     """Every residual test with its 99 % band, its name and its outcome."""
-    return [_correlation(test) for test in checked.tests]
+    return [correlation_chart(test) for test in checked.tests]
 
 
-def _correlation(test: Correlation) -> Chart:
+def correlation_chart(test: Correlation) -> Chart:
+    """Correlations of a residual test as stems, with their 99 % band; those outside it as red diamonds."""
     own = test.input is None
     tested = test.lags != 0 if own else np.full(test.lags.size, True)  # an autocorrelation is one at lag zero
     lags, values, band = test.lags[tested].astype(float), test.values[tested], test.band[tested]
@@ -199,7 +228,19 @@ def block_chart(found: "Identification") -> Chart:
                  Axis("block"), Axis("fit (%)", unit="%"), series)
 
 
-def spectrum_chart(name: str, values: Array, rank: int) -> Chart:
+def theta_charts(fit: "Fit") -> list[Chart]:
+    """Singular values of Theta of every input, before the rank is forced to one."""
+    return [_spectrum(f"Singular values of Theta, {name}", values, 1)
+            for name, values in summary.theta_singular_values(fit).items()]
+
+
+def spectrum_charts(fit: "Fit") -> list[Chart]:
+    """Singular values that a procedure of several steps measured, from which it read the order."""
+    order = int(fit.model.orders.get("nx", 0)) or 1
+    return [_spectrum(name[:1].upper() + name[1:], values, order) for name, values in summary.spectra(fit).items()]
+
+
+def _spectrum(name: str, values: Array, rank: int) -> Chart:
     """Singular values relative to the first; those up to the rank in colour: they should stand out."""
     relative = np.maximum(values / max(float(values[0]), 1e-300), 1e-16)
     order = np.arange(1.0, values.size + 1)
@@ -223,16 +264,38 @@ def noise_chart(model: Any) -> Chart:
 
 
 def order_charts(study: "OrderStudy") -> list[Chart]:
-    """Singular values with their threshold and the prediction errors by number of states."""
+    """Singular values, their tails with the threshold, criteria and hold-out by states, and the scan of lags."""
     ranks, states = study.ranks, study.states
-    n = np.arange(ranks.singular_values.size, dtype=float)
-    floor = max(ranks.floor, 1e-300)
-    tails = [Series("values after n together", n, np.maximum(np.sqrt(ranks.statistics), floor / 10), "dots"),
-             Series("threshold", n, np.maximum(np.sqrt(ranks.thresholds), floor / 10), colour="c1", dash="4 3")]
-    k = np.arange(states.bic.size, dtype=float)
+    n, k = np.arange(float(ranks.singular_values.size)), np.arange(float(states.bic.size))
+    floor, sizes = max(ranks.floor, 1e-300), Axis("size", log=True)
+
+    def tail(name: str, squares: Array, **how: Any) -> Series:
+        return Series(name, n, np.maximum(np.sqrt(squares), floor / 10), **how)
+
+    tails = [tail("values after n together", ranks.statistics, kind="dots"),
+             tail("threshold", ranks.thresholds, colour="c1", dash="4 3"),
+             tail("expected of noise", ranks.expected, colour="muted", dash="1 3")]
+    if ranks.exact:
+        tails.append(tail("rounding", np.full(n.size, floor**2), colour="ink"))
     best = [Series(word, k, (cost - cost.min()) / states.windows, colour=colour, width=2.0)
             for word, cost, colour in (("AICc", states.aicc, "c0"), ("BIC", states.bic, "c1"))]
-    return [Chart("Singular values", "An order is accepted where its value falls below the threshold.",
-                  Axis("number of states"), Axis("size", log=True), tails),
-            Chart("Prediction errors", "Criteria per window above the best; the smallest is preferred.",
-                  Axis("number of states"), Axis("above the best"), best)]
+    charts = [_spectrum("Singular values", ranks.singular_values, study.nx),
+              Chart("Singular values after n together", "An order is accepted where its value falls below the "
+                    "threshold.", Axis("number of states"), sizes, tails),
+              Chart("Prediction errors", "Criteria per window above the best; the smallest is preferred.",
+                    Axis("number of states"), Axis("above the best"), best)]
+    if np.isfinite(states.fit).any():
+        charts.append(Chart("Prediction of the part held out", "", Axis("number of states"), Axis("fit (%)", unit="%"),
+                            [Series("hold-out fit", k, states.fit, width=2.0)]))
+    if study.lags is not None:
+        charts.append(Chart("Lags", "Smallest BIC per row above the best.", Axis("na, nb, nk"), Axis("above the best"),
+                            [_over(study.lags, word, colour) for word, colour in zip(("na", "nb", "nk"), COLOURS)]))
+    return charts
+
+
+def _over(scan: "LagScan", word: str, colour: str) -> Series:
+    """The smallest BIC of a scan of lags for every value of one of its orders."""
+    values = np.array([int(np.ravel(getattr(one, word))[0]) for one in scan.candidates])
+    costs, counts = np.array([one.bic for one in scan.candidates]), np.unique(values)
+    found = [float(costs[values == count].min()) for count in counts]
+    return Series(f"over {word}", counts, (np.array(found) - scan.best("bic").bic) / scan.rows, colour=colour)

@@ -34,8 +34,11 @@ def validation_tables(checked: "Validation") -> list[Table]:
 
 
 def _test_table(checked: "Validation") -> Table:
-    tests = [(f"{t.output}: {_verdict(t)}", t) for t in checked.tests]
-    rows = [(text, _outcome(t), number(t.p_value, 2), _outside(t)) for text, t in tests]
+    rows = []
+    for t in checked.tests:
+        outcome, outside = "PASS" if t.passed else "FAIL", f"{t.outside} of {t.lags.size - (t.input is None)}"
+        found = (outcome, number(t.p_value, 2), outside) if np.isfinite(t.p_value) else ("-", "-", "-")
+        rows.append((f"{t.output}: {_verdict(t)}", *found))
     structure, note = checked.structure, ""
     if structure is not None:
         outcome = "PASS" if structure.passed else "FAIL"
@@ -54,14 +57,6 @@ def _verdict(test: Any) -> str:
     if test.input is None:
         return "white" if test.passed else "not white"
     return f"independent of {test.input}" if test.passed else f"depends on {test.input}"
-
-
-def _outcome(test: Any) -> str:
-    return "-" if np.isnan(test.p_value) else "PASS" if test.passed else "FAIL"
-
-
-def _outside(test: Any) -> str:
-    return "-" if np.isnan(test.p_value) else f"{test.outside} of {test.lags.size - (test.input is None)}"
 
 
 def horizon_table(curve: "HorizonCurve") -> Table:

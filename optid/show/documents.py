@@ -1,6 +1,5 @@
 """Documents of every result, most important facts first, which terminal, notebook and page render."""
 
-import textwrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,9 +7,10 @@ import numpy as np
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation import Validation
-from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT, POOR_FIT, USELESS_FIT
+from optid.identify.verdict import POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
 from optid.show.sections import TONES, Banner, Charts, Code, Columns, Document, Fold, Heading, Notes, Pair, Section
+from optid.show.terminal import set_table, wrapped
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -73,10 +73,6 @@ def _length(data: Any) -> str:
 
 
 def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Section:
-    failed = [f"{part.name} ({part.value})" for part in judged.failed]
-    sentence = f"FAIL: {'; '.join(failed)}." if failed else "All tests of the verdict pass."
-    if not failed and judged.word != GOOD:
-        sentence += f" A good model has a fit of at least {GOOD_FIT:g} %, and {GOOD_BLOCK:g} % in its worst block."
     which = ", lowest output" if fit.model.l > 1 else ""
     fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
     if test is not None:
@@ -84,7 +80,7 @@ def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Se
         fits.append(("simulation fit, test record", np.array(simulated or np.nan)))
     cards = tuple((label + which, wording.percent(np.min(values))) for label, values in fits)
     advice = [str(one) for one in fit.advice] if advise and judged.word in ADVISED else []
-    parts = [Banner(TONES[judged.word], f"The model on this record: {judged.word}", sentence, cards),
+    parts = [Banner(TONES[judged.word], f"The model on this record: {judged.word}", summary.judgement(judged), cards),
              summary.verdict_table(judged)]
     return Section("trust", "", [*parts, *([Notes(advice)] if advice else [])])
 
@@ -108,12 +104,8 @@ def _fit_charts(fit: "Fit") -> list[Any]:
     parts: list[Any] = []
     if isinstance(fit.data, Data):
         parts.append(Charts(charts.record_charts({"": fit.model}, fit.data), wide=True))
-    several = [*charts.nonlinearity_charts(fit), *charts.dynamics_charts({"": fit.model}, fit)]
-    for name, values in summary.theta_singular_values(fit).items():
-        several.append(charts.spectrum_chart(f"Singular values of Theta, {name}", values, 1))
-    order = fit.model.orders.get("nx", 0)
-    several += [charts.spectrum_chart(name[:1].upper() + name[1:], values, int(order) or 1)
-                for name, values in summary.spectra(fit).items()]
+    several = [*charts.nonlinearity_charts(fit), *charts.dynamics_charts({"": fit.model}, fit),
+               *charts.theta_charts(fit), *charts.spectrum_charts(fit)]
     if summary.has_noise(fit.model):
         several.append(charts.noise_chart(fit.model))
     return [*parts, Charts(several)]
@@ -215,33 +207,27 @@ def require_model(fit: "Fit") -> None:
 
 def order_text(study: "OrderStudy") -> str:
     """Return tables, recommendation and reasons, at most 80 columns wide."""
-    ranks, states = study.ranks, study.states
-    lines = [f"Order of {study.data}" if study.data else "Order"]
-    lines.append(f"  {ranks.windows} windows, {study.block_rows} block rows, level {ranks.level:.2g}")
-    heads = f"{'s(n)':>11}{'s/s next':>10}{'tail':>11}{'threshold':>11}{'p':>9}{'BIC':>11}{'hold-out %':>12}"
-    lines.append(f"  {'n':>3}{heads}")
-    roots = np.sqrt(ranks.statistics), np.sqrt(ranks.thresholds)
-    bic = states.bic - states.bic.min()
-    for n in range(min(max(ORDERS, study.nx + 3), ranks.singular_values.size)):
-        single = f"{ranks.singular_values[n - 1]:11.4g}" if n else f"{'':11}"
-        ratio = f"{ranks.ratios[n - 1]:10.3g}" if 0 < n <= ranks.ratios.size else f"{'':10}"
-        cost = f"{bic[n]:11.1f}" if n < bic.size else f"{'':11}"
-        fit = f"{states.fit[n]:12.2f}" if n < bic.size and np.isfinite(states.fit[n]) else f"{'':12}"
-        mark = " <" if n == study.nx else ""
-        tail = f"{roots[0][n]:11.4g}{roots[1][n]:11.4g}{ranks.p_values[n]:9.2g}"
-        lines.append(f"  {n:>3}{single}{ratio}{tail}{cost}{fit}{mark}"[:80])
-    if study.lags is not None:
-        lines.append(f"  {'lags by':<10}{'':<34}{'BIC':>12}{'hold-out %':>12}")
-        for name in ("aicc", "bic", "fit"):
-            if name != "fit" or any(np.isfinite(c.fit) for c in study.lags.candidates):
-                one = study.lags.best(name)
-                fit = f"{one.fit:12.2f}" if np.isfinite(one.fit) else ""
-                word = {"fit": "hold-out", "aicc": "AICc", "bic": "BIC"}[name]
-                lines.append(f"  {word:<10}{str(one):<34}{one.bic:12.1f}{fit}"[:80])
-    said = f"nx = {study.nx}"
-    if study.lags is not None:
-        said += f"; {study.lags.best('bic')}"
-    lines.append(f"Recommended: {said}")
+    ranks, states, scan = study.ranks, study.states, study.lags
+    columns = [(ranks.singular_values, 1, ".4g"), (ranks.ratios, 1, ".3g"), (np.sqrt(ranks.statistics), 0, ".4g"),
+               (np.sqrt(ranks.thresholds), 0, ".4g"), (ranks.p_values, 0, ".2g"),
+               (states.bic - states.bic.min(), 0, ".1f"), (states.fit, 0, ".2f")]
+
+    def cell(values: Any, k: int, digits: str) -> str:
+        return f"{values[k]:{digits}}" if 0 <= k < values.size and np.isfinite(values[k]) else ""
+
+    rows = [(f"{n}{' <' * (n == study.nx)}", *(cell(values, n - first, digits) for values, first, digits in columns))
+            for n in range(min(max(ORDERS, study.nx + 3), ranks.singular_values.size))]
+    tables = [wording.Table(f"{ranks.windows} windows, {study.block_rows} block rows, level {ranks.level:.2g}",
+                            ("n", "s(n)", "s/s next", "tail", "threshold", "p", "BIC", "hold-out %"), rows)]
+    if scan is not None:
+        held = any(np.isfinite(one.fit) for one in scan.candidates)
+        best = {word: scan.best(name) for word, name in (("AICc", "aicc"), ("BIC", "bic"), ("hold-out", "fit"))
+                if name != "fit" or held}
+        tables.append(wording.Table("", ("lags by", "orders", "BIC", "hold-out %"), [
+            (word, str(one), f"{one.bic:.1f}", f"{one.fit:.2f}" if np.isfinite(one.fit) else "")
+            for word, one in best.items()]))
+    lines = [f"Order of {study.data}" if study.data else "Order", *(line for one in tables for line in set_table(one))]
+    lines.append(f"Recommended: nx = {study.nx}{'' if scan is None else '; ' + str(scan.best('bic'))}")
     for reason in (*study.reasons, *(f"note: {note}" for note in study.notes)):
-        lines += textwrap.wrap(reason, 80, initial_indent="  - ", subsequent_indent="    ")
+        lines += wrapped(f"- {reason}")
     return "\n".join(lines)

@@ -19,7 +19,7 @@ MOST_NODES, EVEN = 20, 11
 """A piecewise linear f with fewer cells than the first is listed at its nodes, any other at so many points."""
 
 MOST_ROWS, ABREAST = 12, 3
-"""More coefficients than the first, without errors to show, stand in so many columns beside each other."""
+"""More coefficients than the first, without errors to show, are set in so many columns."""
 
 
 def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:
@@ -57,7 +57,8 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
         if function.is_linear:
             continue
         f = function.nonlinearity
-        points = _points(f.basis)
+        basis: Any = f.basis
+        points = basis.grid(basis.p + 1 if isinstance(basis, Triangular) and basis.p < MOST_NODES else EVEN)
         label = f"{function.name} ({function.unit})" if function.unit else function.name
         if known is None:
             rows, head = [(number(u, 4), number(value)) for u, value in zip(points, f(points))], ()
@@ -107,11 +108,6 @@ def _interval_row(
     if decimals > 7 or max(abs(value), abs(lower), abs(upper)) >= 1e7:
         return name, f"{value:.4e}", f"{error:.1e}", f"{lower:.4e}", f"{upper:.4e}"
     return name, *(f"{x:.{max(decimals, 0)}f}" for x in (value, error, lower, upper))
-
-
-def _points(basis: Any) -> np.ndarray:
-    """Points at which f is listed: the nodes of a piecewise linear f when they are few, an even grid otherwise."""
-    return basis.grid(basis.p + 1 if isinstance(basis, Triangular) and basis.p < MOST_NODES else EVEN)
 
 
 def _basis(basis: Any) -> str:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from optid.identify.verdict import Verdict
 
 MOST_ROWS = 12
-"""Rows of a table; the rest stands in the printed text."""
+"""Rows of a table; the printed text has the rest."""
 
 COLOURS = {"good": "#00843f", "plain": "#1f72c9", "fair": "#b85600", "bad": "#c83350"}
 

@@ -58,20 +58,20 @@ def _breakable(equation: str) -> str:
     return re.sub(r" (?![+-] )", "\N{NO-BREAK SPACE}", equation)
 
 
-def coded(chart: Chart) -> dict[str, Any]:
-    """Return a chart as JSON types for the script of the page."""
+def coded(chart: Chart, most: int = MOST) -> dict[str, Any]:
+    """Return a chart as JSON types for the script of the page, its curves of at most so many samples."""
     axes = {name: {key: value for key, value in asdict(axis).items() if value not in (None, False, "")}
             for name, axis in (("x", chart.x), ("y", chart.y))}
     cursor = all(one.kind in ("curve", "area", "bars") for one in chart.series)
     return {"title": chart.title, "caption": chart.caption, "group": chart.group, "equal": chart.equal,
-            "height": chart.height, "cursor": cursor, **axes, "series": [_series(one) for one in chart.series]}
+            "height": chart.height, "cursor": cursor, **axes, "series": [_series(one, most) for one in chart.series]}
 
 
-def _series(one: Series) -> dict[str, Any]:
+def _series(one: Series, most: int) -> dict[str, Any]:
     xs, ys, lows = (None if v is None else np.asarray(v, dtype=float) for v in (one.xs, one.ys, one.lows))
     assert xs is not None and ys is not None
-    if ys.size > MOST:
-        kept = extremes(ys, MOST // 2)
+    if ys.size > most:
+        kept = extremes(ys, most // 2)
         xs, ys, lows = xs[kept], ys[kept], None if lows is None else lows[kept]
     coded = {"name": one.name, "kind": one.kind, "colour": f"var(--{one.colour})", "dash": one.dash,
              "width": one.width, "aside": one.aside, "xs": _numbers(xs, "<f8"), "ys": _numbers(ys, "<f4")}

@@ -1,4 +1,4 @@
-"""Drawings on matplotlib axes: each function draws one panel, and knows nothing of the figure around it."""
+"""Drawings on matplotlib axes: each function draws one panel, independent of its figure."""
 
 from collections.abc import Callable, Sequence
 from functools import wraps
@@ -7,12 +7,11 @@ from typing import Any, ParamSpec, TypeVar, cast
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle, FancyBboxPatch
+from matplotlib.patches import FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
 from optid.arrays import Array
-from optid.identify.validation.correlations import Correlation
-from optid.show.sections import decibels, extremes
+from optid.show.sections import Chart, extremes
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
 BLUE, ORANGE, GREEN, RED = "#1063b5", "#a84e00", "#007a3e", "#b82e47"
@@ -56,13 +55,18 @@ STYLE: dict[str, Any] = {
 }
 
 LINES = [(colour, dash) for dash in ("-", "--", ":") for colour in (BLUE, ORANGE, GREEN)]
-"""Colour and dash of the first, second, ... of several curves."""
+COLOURS = {f"c{k}": LINES[k % len(LINES)] for k in range(10)} | {
+    "ink": (INK, "-"), "muted": (MUTED, "-"), "red": (RED, "-")}
+"""Colour and dash of the curves that a chart names by the variables of the style sheet."""
+
+MARKERS = {"stems": "o", "diamonds": "D", "dots": "o", "poles": "x"}
+"""Signs of the series of a chart that are no lines."""
 
 CLOSEUP = 200
-"""Samples of a long record that are drawn where single ones are to be told apart."""
+"""Samples of the close-up of a long record, in which single samples are visible."""
 
 POINTS = 2000
-"""A line with more samples than this is drawn as the smallest and largest sample of each of half as many bins."""
+"""Samples of a line; of a longer one the extremes and the gaps of a third as many stretches are drawn."""
 
 
 P = ParamSpec("P")
@@ -99,7 +103,7 @@ def thinned(t: Array, y: Array) -> tuple[Array, Array]:
     """Keep the extremes of every bin of a long line, so that no peak is lost; t, y (N,) become `POINTS` long."""
     if y.size <= POINTS:
         return t, y
-    picked = extremes(y, POINTS // 2)
+    picked = extremes(y, POINTS // 3)
     return t[picked], y[picked]
 
 
@@ -114,113 +118,36 @@ def liveliest(y: Array) -> slice:
     return slice(first, first + CLOSEUP)
 
 
-def draw_record(ax: Axes, t: Array, lines: Sequence[tuple[str, Array, dict[str, Any]]]) -> None:
-    """Draw several signals (N,) over the time t (N,): (label, signal, options of the line)."""
-    for label, y, options in lines:
-        ax.plot(*thinned(t, y), label=label, **options)
-    ax.margins(x=0.01)
-
-
-def draw_nonlinearity(
-    ax: Axes, f: Any, u: Array, band: tuple[Array, Array, Array] | None, *, name: str, label: str
-) -> None:
-    """Draw f over the range of its input, its confidence band, and where the samples lie.
-
-    Args:
-        ax: axes.
-        f: the `Nonlinearity`.
-        u: (N,) samples of the input; may be empty.
-        band: (grid, lower, upper), or None.
-        name: name of the input, with its unit.
-        label: name of the function.
-    """
-    low, high = f.basis.interval or ((float(np.nanmin(u)), float(np.nanmax(u))) if u.size else (-1.0, 1.0))
-    grid = np.linspace(low, high, 401)
-    values = f(grid)
-    bottom, top = float(np.min(values)), float(np.max(values))
-    if band is not None:
-        points, lower, upper = band
-        ax.fill_between(points, lower, upper, color=BLUE, alpha=0.22, linewidth=0, label="95 % band")
-        bottom, top = min(bottom, float(np.min(lower))), max(top, float(np.max(upper)))
-    ax.plot(grid, values, color=BLUE, linewidth=2.0, label=label)
-    span = (top - bottom) or 1.0
-    ax.set_ylim(bottom - 0.3 * span, top + 0.06 * span)
-    here = u[(u >= low) & (u <= high)]
-    if here.size:
-        counts, edges = np.histogram(here, bins=40, range=(low, high))
-        ax.bar(edges[:-1], 0.16 * counts / counts.max(), np.diff(edges), align="edge", color=MUTED, alpha=0.3,
-               linewidth=0, transform=ax.get_xaxis_transform(), label="samples")
-    ax.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
-    ax.set_xlabel(name)
-    ax.legend(loc="best", handlelength=1.4)
-
-
-def draw_correlation(ax: Axes, test: Correlation, title: str) -> None:
-    """Draw the correlations of a residual test as stems, with their 99 % band; values outside it as red diamonds."""
-    lags, values = test.lags, test.values
-    tested = lags != 0 if test.input is None else np.full(lags.size, True)  # an autocorrelation is one at lag zero
-    lags, values, band = lags[tested], values[tested], test.band[tested]
-    ax.fill_between(lags, -band, band, color=MUTED, alpha=0.16, linewidth=0)
-    ax.axhline(0, color=MUTED, linewidth=0.8)
-    outside = np.abs(values) > band
-    for mask, colour, marker in ((~outside, BLUE, "o"), (outside, RED, "D")):
-        ax.vlines(lags[mask], 0, values[mask], color=colour, linewidth=1.3)
-        ax.plot(lags[mask], values[mask], marker, color=colour, markersize=3.2)
-    reach = 1.15 * float(np.nanmax(np.abs(values), initial=1.3 * float(np.nanmax(band, initial=1e-3))))
-    ax.set_ylim(-reach, reach)
-    ax.set_title(title)
-    ax.set_xlabel("lag")
-    ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
-
-
-def draw_poles(ax: Axes, poles: Array) -> None:
-    """Draw complex poles in the unit circle."""
-    ax.add_patch(Circle((0, 0), 1.0, facecolor="none", edgecolor=MUTED, linewidth=1.0))
-    ax.axhline(0, color=GRID, linewidth=0.8)
-    ax.axvline(0, color=GRID, linewidth=0.8)
-    inside = np.abs(poles) < 1
-    for mask, colour in ((inside, BLUE), (~inside, RED)):
-        ax.plot(poles[mask].real, poles[mask].imag, "x", color=colour, markersize=7, markeredgewidth=1.8)
-    reach = 1.12 * max(1.0, float(np.max(np.abs(poles), initial=0.0)))
-    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xlabel="real", ylabel="imaginary")
-    ax.grid(False)
-    ax.set_title("Poles")
-
-
-def draw_steps(ax: Axes, dt: float, responses: Array, labels: Sequence[str]) -> None:
-    """Draw step responses (n, K) over the time; K names, one alone is not shown."""
-    t = dt * np.arange(len(responses))
-    for k, (label, (colour, dash)) in enumerate(zip(labels, LINES * len(labels))):
-        ax.step(t, responses[:, k], linestyle=dash, color=colour, label=label, where="post")
-    ax.axhline(0, color=MUTED, linewidth=0.8)
-    ax.margins(x=0.01)
-    ax.set(xlabel="time")
-    ax.set_title("Step response")
-
-
-def draw_response(
-    ax: Axes, w: Array, response: Array, bands: Sequence[tuple[Array, Array] | None], labels: Sequence[str]
-) -> None:
-    """Draw magnitudes in dB over the frequency.
-
-    Args:
-        ax: axes.
-        w: (F,) frequencies, rad per unit of time.
-        response: (F, K) complex responses.
-        bands: K pairs of lower and upper magnitude (F,), or None.
-        labels: K names; one alone is not shown.
-    """
-    for k, (label, band) in enumerate(zip(labels, bands)):
-        colour, dash = LINES[k % len(LINES)]
-        if band is not None:
-            ax.fill_between(w, decibels(band[0]), decibels(band[1]), color=colour, alpha=0.2, linewidth=0)
-        ax.plot(w, decibels(np.abs(response[:, k])), dash, color=colour, label=label)
-    ax.set_xscale("log")
-    ax.set_xlim(w[0], w[-1])
-    ax.set(xlabel="frequency (rad per unit of time)", ylabel="magnitude (dB)")
-    ax.set_title("Frequency response")
-    if len(labels) > 1:
-        ax.legend(loc="lower left", ncols=2, handlelength=1.6)
+def draw_chart(ax: Axes, chart: Chart, legend: bool = True, title: str = "") -> None:
+    """Draw a chart of a page on axes, under its own title or another; a legend where there are several names."""
+    for one in chart.series:
+        name, (colour, dash) = plain(one.name) or None, COLOURS[one.colour]
+        xs, ys = np.asarray(one.xs), np.asarray(one.ys)
+        if one.kind == "area":
+            ax.fill_between(xs, one.lows, ys, color=colour, alpha=0.2, linewidth=0, label=name)
+        elif one.kind == "bars":
+            ax.bar(xs, 0.16 * ys, xs[1] - xs[0], align="edge", color=colour, alpha=0.3, linewidth=0, label=name,
+                   transform=ax.get_xaxis_transform())
+        elif one.kind in MARKERS:
+            if one.kind in ("stems", "diamonds"):
+                ax.vlines(xs, 0, ys, color=colour, linewidth=1.3)
+            ax.plot(xs, ys, MARKERS[one.kind], color=colour, markersize=6 if one.kind == "poles" else 4, label=name)
+        else:
+            style: Any = (0, tuple(map(float, one.dash.split()))) if one.dash else dash
+            ax.plot(*thinned(xs, ys), color=colour, linestyle=style, linewidth=0.85 * one.width, label=name)
+    ax.set(xlabel=plain(chart.x.title), ylabel=plain(chart.y.title), title=plain(title or chart.title))
+    ax.set(**{f"{name}scale": "log" for name, axis in (("x", chart.x), ("y", chart.y)) if axis.log})
+    ax.set(xlim=(chart.x.low, chart.x.high), ylim=(chart.y.low, chart.y.high))
+    if any(one.kind == "bars" for one in chart.series):  # below the curves
+        low, high = ax.get_ylim()
+        ax.set_ylim(low - 0.25 * (high - low), high)
+    if not chart.x.log and all(np.all(np.asarray(one.xs) % 1 == 0) for one in chart.series):
+        ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    if chart.equal:
+        ax.set_aspect("equal")
+        ax.grid(False)
+    if legend and sum(bool(one.name) for one in chart.series) > 1:
+        ax.legend(loc="best", handlelength=1.6)
 
 
 def draw_gap(ax: Axes, gap: float, threshold: float) -> None:
@@ -259,17 +186,3 @@ def draw_ladder(ax: Axes, rungs: Sequence[str], reached: int, closed: bool) -> N
         if i + 1 < len(rungs):
             ax.annotate("", (i + 1.08, 0.5), (i + 0.92, 0.5),
                         arrowprops={"arrowstyle": "-", "color": MUTED, "alpha": 0.6})
-
-
-def draw_singular_values(ax: Axes, values: Array, name: str, rank: int = 1) -> None:
-    """Draw singular values relative to the first; those up to `rank` in colour: they should stand out."""
-    relative = values / max(float(values[0]), 1e-300)
-    order = np.arange(1, values.size + 1)
-    floor = max(1e-16, 0.3 * float(np.min(relative[relative > 0], initial=1.0)))
-    ax.vlines(order, floor, np.maximum(relative, floor), color=GRID, linewidth=3)
-    ax.plot(order[:rank], np.maximum(relative[:rank], floor), "o", color=BLUE, markersize=7)
-    ax.plot(order[rank:], np.maximum(relative[rank:], floor), "o", color=MUTED, markersize=6)
-    ax.set_yscale("log")
-    ax.set(ylim=(floor, 2.0), xlabel="index", ylabel="relative to the first", xlim=(0.5, values.size + 0.5))
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.set_title(name)

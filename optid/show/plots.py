@@ -7,20 +7,16 @@ from collections.abc import Sequence
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation import Validation
-from optid.identify.validation.predictions import one_step
 from optid.lazy import public_names
-from optid.models.functions import StaticFunction, response_pairs, static_functions, step_length
-from optid.show import panels, summary
-from optid.show.charts import free_run, validated, visited
-from optid.show.estimates import uncertainty
-from optid.show.panels import BLUE, CLOSEUP, INK, MUTED, ORANGE, plain, shorten, styled, with_unit
+from optid.models.functions import static_functions
+from optid.show import charts, panels
+from optid.show.panels import CLOSEUP, MUTED, liveliest, plain, shorten, styled
+from optid.show.sections import Chart
 from optid.structures.least_squares import rank_one_of
 
 if TYPE_CHECKING:
@@ -54,14 +50,10 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     figure = Figure(figsize=(10.0, sum(heights)), layout="constrained")
     rows = cast(Any, figure.subfigures(len(heights), 1, height_ratios=heights))
     _time_panels(rows[0], fit, record, "test record" if test is not None else "estimation record", closeup=long)
-    if rows_of_f:
-        _nonlinearity_panels(rows[1], fit)
-        _dynamics_panels(rows[2], fit)
-    else:
-        left, right = rows[1].subfigures(1, 2, width_ratios=[1, 1.45])
-        _nonlinearity_panels(left, fit)
-        _dynamics_panels(right, fit)
-    _residual_panels(rows[-1], validated(fit.model, record), record, outputs=1, inputs=min(model.m, 2))
+    left, right = rows[1:3] if rows_of_f else rows[1].subfigures(1, 2, width_ratios=[1, 1.45])
+    _panels(left, charts.nonlinearity_charts(fit, linear=True))
+    _dynamics_panels(right, fit)
+    _residual_panels(rows[-1], charts.validated(fit.model, record), record, outputs=1, inputs=min(model.m, 2))
     return figure
 
 
@@ -88,7 +80,7 @@ def nonlinearity(fit: "Fit") -> Figure:
     """Draw every static nonlinearity, of inputs and of outputs fed back, with its 95 % band and where samples lie."""
     count = len(static_functions(fit.model))
     figure = Figure(figsize=(9.0 if count > 1 else 6.4, 3.4 * -(-count // 3)), layout="constrained")
-    _nonlinearity_panels(figure, fit)
+    _panels(figure, charts.nonlinearity_charts(fit, linear=True))
     return figure
 
 
@@ -106,7 +98,7 @@ def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | N
     """
     record = _record(fit, data)
     figure = Figure(figsize=(9.0, 2.5 * record.l), layout="constrained")
-    _residual_panels(figure, checked or validated(fit.model, record), record, outputs=record.l, inputs=record.m)
+    _residual_panels(figure, checked or charts.validated(fit.model, record), record, outputs=record.l, inputs=record.m)
     return figure
 
 
@@ -125,16 +117,8 @@ def noise(fit: "Fit") -> Figure:
     Raises:
         StructureError: the model has no noise covariances.
     """
-    from optid.identify.noise import noise_spectrum
-
-    model = fit.model
-    w = np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, 300)
-    size = np.sqrt(np.abs(np.einsum("foo->fo", noise_spectrum(model, w))))
     figure = Figure(figsize=(6.4, 3.0), layout="constrained")
-    ax = figure.subplots()
-    panels.draw_response(ax, w, size, [None] * model.l, [plain(name) for name in model.outputs])
-    ax.set_title("Spectrum of the noise")
-    ax.set_ylabel("power per unit of bandwidth (dB)")
+    _panels(figure, [charts.noise_chart(fit.model)])
     return figure
 
 
@@ -167,12 +151,11 @@ def singular_values(fit: "Fit") -> Figure:
     Raises:
         DataError: the formulation has no matrix Theta.
     """
-    found = summary.theta_singular_values(fit)
+    found = charts.theta_charts(fit)
     if not found:
         raise DataError(f"formulation {fit.formulation!r} has no matrix Theta with more than one row and column")
     figure = Figure(figsize=(min(9.0, 3.4 * len(found) + 1.0), 2.9), layout="constrained")
-    for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
-        panels.draw_singular_values(ax, values, plain(f"Singular values of Theta, {name}"))
+    _panels(figure, found)
     return figure
 
 
@@ -183,13 +166,11 @@ def spectra(fit: "Fit") -> Figure:
     Raises:
         DataError: the formulation has none.
     """
-    found = summary.spectra(fit)
+    found = charts.spectrum_charts(fit)
     if not found:
         raise DataError(f"formulation {fit.formulation!r} reports no singular values")
     figure = Figure(figsize=(min(9.0, 4.4 * len(found) + 1.0), 2.9), layout="constrained")
-    order = fit.model.orders.get("nx", 0)
-    for ax, (name, values) in zip(figure.subplots(1, len(found), squeeze=False)[0], found.items()):
-        panels.draw_singular_values(ax, values, plain(name[:1].upper() + name[1:]), order or 1)
+    _panels(figure, found)
     return figure
 
 
@@ -217,52 +198,39 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
     longest = max(e.n_samples for e in record.experiments)
     axes = figure.subplots(len(heights), len(shown), squeeze=False, sharey="row", height_ratios=heights,
                            width_ratios=[max(e.n_samples, 0.25 * longest) for e in shown])
-    predicted, free = one_step(fit.model, record), free_run(fit.model, record)
+    runs = charts.runs_of({"": fit.model}, record)
     for k, e in enumerate(shown):
-        t = e.start + record.dt * np.arange(e.n_samples, dtype=float)
-        for o, name in enumerate(record.outputs):
-            lines: list[tuple[str, Array, dict[str, Any]]] = [
-                ("measured", e.y[:, o], {"color": INK, "linewidth": 1.0, "alpha": 0.75})
-            ]
-            if free is not None:
-                lines.append(("simulated", free[k][:, o], {"color": BLUE, "linewidth": 1.6}))
-            lines.append(
-                ("one step ahead", predicted[k][:, o], {"color": ORANGE, "linewidth": 1.0, "linestyle": (0, (3, 1.2))})
-            )
+        for o, chart in enumerate(charts.time_charts(record, k, runs)[: record.l]):
             ax = axes[o * (2 if closeup else 1), k]
-            panels.draw_record(ax, t, lines)
+            panels.draw_chart(ax, chart, legend=False)
             if closeup:
-                _closeup(axes[2 * o, k], axes[2 * o + 1, k], t, e.y[:, o], lines)
-            if k == 0:
-                ax.set_ylabel(with_unit(name, record.output_units[o]))
-        axes[-1, k].set_xlabel("time")
+                _closeup(ax, axes[2 * o + 1, k], charts.time_charts(record, k, runs, part=liveliest(e.y[:, [o]]))[o])
+    for ax in axes.flat:
+        ax.set_title("")
+        ax.label_outer()
     several = f", experiments 1-{len(shown)} of {record.n_experiments}" if record.n_experiments > 1 else ""
     axes[0, 0].set_title(f"Fit over time: {title}{several}")
-    # outside the layout, where it would widen the column it stands in
+    # outside the layout, where it would widen its column
     place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 3, "borderaxespad": 0.2}
     axes[0, -1].legend(**place, handlelength=1.6).set_in_layout(False)
 
 
-def _closeup(ax: Any, below: Any, t: Array, y: Array, lines: Sequence[tuple[str, Array, dict[str, Any]]]) -> None:
+def _closeup(ax: Any, below: Any, chart: Chart) -> None:
     """Draw the stretch in which the output moves most, and mark it in the panel above."""
-    part = panels.liveliest(y[:, None])
-    panels.draw_record(below, t[part], [(label, signal[part], options) for label, signal, options in lines])
-    ax.axvspan(t[part][0], t[part][-1], color=MUTED, alpha=0.15, linewidth=0)
+    panels.draw_chart(below, chart, legend=False)
+    t = chart.series[0].xs
+    ax.axvspan(t[0], t[-1], color=MUTED, alpha=0.15, linewidth=0)
     below.set_ylabel("close-up")
 
 
-def _nonlinearity_panels(figure: Any, fit: "Fit") -> None:
-    functions = static_functions(fit.model)
-    columns = min(len(functions), 3)
-    axes = figure.subplots(-(-len(functions) // columns), columns, squeeze=False)
-    record = fit.data.raw() if isinstance(fit.data, Data) else None
-    for ax in list(axes.flat)[len(functions) :]:
+def _panels(figure: Any, shown: Sequence[Chart]) -> None:
+    """Draw charts in rows of up to three."""
+    columns = min(len(shown), 3)
+    axes = figure.subplots(-(-len(shown) // columns), columns, squeeze=False).ravel()
+    for ax, chart in zip(axes, shown):
+        panels.draw_chart(ax, chart)
+    for ax in axes[len(shown) :]:
         ax.set_axis_off()
-    for ax, function in zip(axes.flat, functions):
-        panels.draw_nonlinearity(ax, function.nonlinearity, visited(function, record), _f_band(fit, function),
-                                 name=with_unit(function.name, function.unit), label=plain(function.word))
-        ax.set_ylabel(plain(f"{function.word}({function.name})"))
-        ax.set_title(function.what if len(functions) == 1 else with_unit(f"{function.what} of {function.name}", ""))
 
 
 def _residual_panels(figure: Any, checked: Validation, record: Data, outputs: int, inputs: int) -> None:
@@ -274,41 +242,17 @@ def _residual_panels(figure: Any, checked: Validation, record: Data, outputs: in
         for k, test in enumerate(tests):
             ax = next(axes)
             title = "Autocorrelation" if test.input is None else f"With past {shorten(test.input)}"
-            panels.draw_correlation(ax, test, plain(title))
-            if k == 0:
-                ax.set_ylabel(plain(f"residual of {shorten(name)}"))
+            panels.draw_chart(ax, charts.correlation_chart(test), legend=False, title=title)
+            ax.set_ylabel("" if k else plain(f"residual of {shorten(name)}"))
 
 
 def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
-    """Poles, the magnitude of every input-output pair and, where it is asked for, the step responses."""
-    model = fit.model
-    widths = [1.0, 1.45, 1.25] if step else [1.0, 1.7]
-    poles, response, *last = figure.subplots(1, len(widths), width_ratios=widths)
-    panels.draw_poles(poles, model.poles)
-    names = [plain(f"{u} to {y}") for u, y in response_pairs(model)]
-    for ax in last:
-        steps = model.step_response(step_length(model))
-        panels.draw_steps(ax, model.dt, steps.reshape(len(steps), -1), names)
-    w = np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, 300)
-    curves = model.frequency_response(w).reshape(w.size, -1)
-    panels.draw_response(response, w, curves, _response_bands(fit, w), names)
-
-
-def _f_band(fit: "Fit", function: StaticFunction) -> tuple[Array, Array, Array] | None:
-    known, _ = uncertainty(fit)
-    if known is None:
-        return None
-    band = known.band(function.index, family=function.family)
-    return np.asarray(band.at), band.lower, band.upper
-
-
-def _response_bands(fit: "Fit", w: Array) -> list[tuple[Array, Array] | None]:
-    known, _ = uncertainty(fit)
-    if known is None:
-        return [None] * len(response_pairs(fit.model))
-    size, _ = known.frequency_response(w)
-    lower, upper = (edge.reshape(w.size, -1).T for edge in (size.lower, size.upper))
-    return list(zip(lower, upper))
+    """Poles, the magnitude of every input-output pair and, on request, the step responses."""
+    magnitude, _, steps, poles = charts.dynamics_charts({"": fit.model}, fit)
+    shown = [poles, magnitude, steps] if step else [poles, magnitude]
+    axes = figure.subplots(1, len(shown), width_ratios=[1.0, 1.45, 1.25] if step else [1.0, 1.7])
+    for ax, chart in zip(axes, shown):
+        panels.draw_chart(ax, chart)
 
 
 __dir__ = public_names(__name__)

@@ -1,4 +1,4 @@
-"""What a result has to say: sections of banners, facts, tables, charts and notes, for every renderer."""
+"""Documents of results: sections of banners, facts, tables, charts and notes, for every renderer."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,19 +18,12 @@ TONES = {"good": "good", "fair": "plain", "poor": "fair", "useless": "bad"}
 
 @dataclass(frozen=True)
 class Banner:
-    """A verdict in one word, with a sentence.
+    """A verdict in one word, with a sentence."""
 
-    Attributes:
-        tone: "good", "plain", "fair" or "bad".
-        word: the verdict.
-        sentence: what it means.
-        cards: (label, value) of the first glance.
-    """
-
-    tone: str
-    word: str
-    sentence: str = ""
-    cards: tuple[tuple[str, str], ...] = ()
+    tone: str  # "good", "plain", "fair" or "bad"
+    word: str  # the verdict
+    sentence: str = ""  # what it means
+    cards: tuple[tuple[str, str], ...] = ()  # (label, value) of the first glance
 
 
 @dataclass(frozen=True)
@@ -46,30 +39,18 @@ class Axis:
 
 @dataclass(frozen=True)
 class Series:
-    """One curve of a chart.
+    """One curve of a chart."""
 
-    Attributes:
-        name: of the legend; "" stands in none.
-        xs: (n,) places, ascending but for "line-only".
-        ys: (n,) values, NaN where there are none; (n,) upper ends of an area.
-        kind: "curve", "line-only" (any order), "area", "stems", "diamonds", "dots",
-            "poles" or "bars" (heights 0 to 1).
-        colour: variable of the style sheet.
-        lows: (n,) lower ends of an area.
-        dash: SVG dashes.
-        width: of the line, in pixels.
-        aside: whether the extent of the chart does not count it.
-    """
-
-    name: str
-    xs: Any
-    ys: Any
+    name: str  # of the legend; "" for none
+    xs: Any  # (n,) places, ascending but for "line-only"
+    ys: Any  # (n,) values, NaN where there are none; (n,) upper ends of an area
+    # "curve", "line-only" (any order), "area", "stems", "diamonds", "dots", "poles" or "bars" (heights 0 to 1)
     kind: str = "curve"
-    colour: str = "c0"
-    lows: Any = None
-    dash: str = ""
-    width: float = 1.6
-    aside: bool = False
+    colour: str = "c0"  # variable of the style sheet
+    lows: Any = None  # (n,) lower ends of an area
+    dash: str = ""  # SVG dashes
+    width: float = 1.6  # of the line, in pixels
+    aside: bool = False  # whether the extent of the chart does not count it
 
 
 @dataclass(frozen=True)
@@ -141,19 +122,13 @@ class Heading:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a document.
+    """A part of a document."""
 
-    Attributes:
-        id: anchor on a page.
-        title: heading, "" for a banner, which has its own.
-        parts: banners, facts, tables, charts, notes, code, folds; a function that returns them where that takes time.
-        page_only: whether printed text and notebooks leave it out.
-    """
-
-    id: str
-    title: str
+    id: str  # anchor on a page
+    title: str  # heading, "" for a banner, which has its own
+    # banners, facts, tables, charts, notes, code, folds; a function that returns them where that takes time
     parts: Sequence[Any] | Callable[[], Sequence[Any]]
-    page_only: bool = False
+    page_only: bool = False  # whether printed text and notebooks leave it out
 
 
 @dataclass(frozen=True)
@@ -167,15 +142,13 @@ class Document:
 
 def extremes(values: Array, bins: int) -> NDArray[np.intp]:
     """Return the places of the smallest and the largest of each of so many stretches of values (N,), and of gaps."""
-    kept = set()
-    edges = np.linspace(0, values.size, bins + 1).astype(int)
-    for a, b in zip(edges[:-1], edges[1:]):
-        part = values[a:b]
-        here = np.isfinite(part)
-        kept |= {a} if not here.all() else set()
-        if here.any():
-            kept |= {a + int(np.nanargmin(part)), a + int(np.nanargmax(part))}
-    return np.array(sorted(kept))
+    width = -(-values.size // bins)
+    stretches = np.pad(values, (0, -values.size % width), constant_values=np.nan).reshape(-1, width)
+    missing, first = ~np.isfinite(stretches), np.arange(0, values.size, width)
+    places = np.concatenate([first + np.argmin(np.where(missing, np.inf, stretches), axis=1),
+                             first + np.argmax(np.where(missing, -np.inf, stretches), axis=1),
+                             (first + np.argmax(missing, axis=1))[missing.any(axis=1)]])
+    return np.unique(places[places < values.size])
 
 
 def decibels(magnitude: Array) -> Array:

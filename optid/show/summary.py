@@ -8,8 +8,10 @@ import numpy as np
 from optid.data.record import Data
 from optid.identify.equation_error import EquationError
 from optid.identify.validation.predictions import predictors
+from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
 from optid.models.functions import has_feedback, static_functions
 from optid.models.kalman import NoiseCovariances
+from optid.models.roots import in_words
 from optid.program.solution import Status
 from optid.show.sections import Facts
 from optid.show.wording import Table, gap_text, number, percent, seconds
@@ -54,6 +56,14 @@ def verdict(fit: "Fit") -> tuple[str, str, str]:
         most = f"{100 * gap:.2g} %"
         return "fair", word, f"A local optimum; no model of this structure can lower the objective by more than {most}."
     return "fair", word, f"A local optimum; whether a better one exists is not known{because}."
+
+
+def judgement(found: "Verdict") -> str:
+    """Return the tests of a verdict that fail, or what a good model would show, in a sentence."""
+    if found.failed:
+        return f"FAIL: {'; '.join(f'{part.name} ({part.value})' for part in found.failed)}."
+    more = f" A good model has a fit of at least {GOOD_FIT:g} %, and {GOOD_BLOCK:g} % in its worst block."
+    return "All tests of the verdict pass." + more * (found.word != GOOD)
 
 
 def verdict_table(found: "Verdict") -> Table:
@@ -211,8 +221,8 @@ def model_facts(fit: "Fit") -> Facts:
     """Orders, poles, noise, gauge, extrapolation of f, and why its offset is not identifiable."""
     model = fit.model
     facts = [
-        ("Orders", ", ".join(f"{name} {_order(value)}" for name, value in model.orders.items())),
-        ("Poles", ", ".join(_complex(p) for p in model.poles) or "none"),
+        ("Orders", ", ".join(f"{name} {' '.join(map(str, np.atleast_1d(n)))}" for name, n in model.orders.items())),
+        ("Poles", in_words(model.poles) or "none"),
     ]
     if isinstance(noise := getattr(model, "noise", None), str) and noise:
         facts.append(("Noise", noise))
@@ -286,15 +296,6 @@ def _measured(value: Any) -> str:
         return number(float(array), 5)
     shown = " ".join(number(float(entry), 4) for entry in array.ravel()[:MOST])
     return shown + (f" ... ({array.size} in all)" if array.size > MOST else "")
-
-
-def _order(value: Any) -> str:
-    """Write an order, or those of the inputs."""
-    return str(value) if np.ndim(value) == 0 else " ".join(map(str, value))
-
-
-def _complex(value: complex) -> str:
-    return f"{value.real:.4g}" if abs(value.imag) < 1e-12 else f"{value.real:.4g}{value.imag:+.4g}j"
 
 
 def _argument(value: Any) -> str:

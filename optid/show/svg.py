@@ -1,4 +1,4 @@
-"""Figures as SVG inside a page: no outside reference, colours that follow the page, identifiers of their own."""
+"""Figures as SVG inside a page: no external reference, colours that follow the page, unique identifiers."""
 
 import io
 import re
@@ -16,7 +16,7 @@ VARIABLES = {INK: "ink", MUTED: "muted", GRID: "grid", PANEL: "panel", BLUE: "bl
 
 
 def inline(figure: Figure, name: str, label: str) -> Markup:
-    """Return the <svg> element of a figure, ready to stand in an HTML page.
+    """Return the <svg> element of a figure, ready to be placed in an HTML page.
 
     Args:
         figure: the figure; text becomes outlines, so that it looks the same everywhere.

@@ -9,7 +9,7 @@ from optid.show.wording import Table
 WIDTH, LEFT = 80, 36
 
 MOST_NAME = 44
-"""First cells of a table wider than this stand on lines of their own."""
+"""First cells of a table wider than this are set on a separate line."""
 
 
 def text(document: Document) -> str:
@@ -78,7 +78,7 @@ def facts_lines(facts: Facts) -> list[str]:
 
 
 def _columns(left: Facts, right: Facts) -> list[str]:
-    """Set two lists of facts side by side; what is too wide for its half gets a line of its own below."""
+    """Set two lists of facts side by side; what is too wide for its half is set on a line below."""
     widths = (LEFT, WIDTH - 2 - LEFT)
     fits: list[list[str]] = []
     wide: Facts = []
@@ -90,7 +90,7 @@ def _columns(left: Facts, right: Facts) -> list[str]:
 
 
 def set_table(table: Table) -> list[str]:
-    """Set a table in 80 columns: first column left, numbers right, a long first cell on a line of its own."""
+    """Set a table in 80 columns: first column left, numbers right, a long first cell on a separate line."""
     widths = [max(len(row[c]) for row in [table.head, *table.rows]) for c in range(1, len(table.head))]
     room = WIDTH - sum(widths) - len(widths)
     names = min(max(len(row[0]) for row in [table.head, *table.rows]), MOST_NAME, max(room, 0))

@@ -8,19 +8,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a heading.
+    """Rows of text under a heading."""
 
-    Attributes:
-        title: heading.
-        head: one word per column.
-        rows: cells, the name of the row first.
-        note: sentence below the table.
-    """
-
-    title: str
-    head: tuple[str, ...]
-    rows: list[tuple[str, ...]]
-    note: str = ""
+    title: str  # heading
+    head: tuple[str, ...]  # one word per column
+    rows: list[tuple[str, ...]]  # cells, the name of the row first
+    note: str = ""  # sentence below the table
 
 
 def number(value: float, digits: int = 5) -> str:

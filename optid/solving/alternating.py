@@ -58,7 +58,7 @@ def run(program: Program, settings: Settings) -> Answer:
             duals[GAUGE] = in_b.duals[GAUGE] / 2.0  # the gradient of bᵀb is twice that of the tangent
         values = {name: np.array(point[name]) for name in program.variables if name in point}
         last = Answer(Status.LIMIT, "iteration limit", values, duals, count)
-        # the decrease has to be far below the accuracy asked for, because convergence is only linear
+        # the decrease has to be far below the requested accuracy, because convergence is only linear
         if before - in_mu.objective <= 1e-4 * settings.accuracy * max(in_mu.objective, 1e-9 * in_mu.scale):
             return replace(last, status=Status.LOCAL, word="stationary")
         before = in_mu.objective

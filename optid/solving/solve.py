@@ -1,5 +1,6 @@
-"""Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, ask for a proof."""
+"""Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, prove it."""
 
+import os
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -13,19 +14,20 @@ from optid.backends.choice import choose, fallbacks, find
 from optid.certificate.convex import TANGENT, certify_convex
 from optid.certificate.infeasibility import satisfiable
 from optid.errors import SolverRefused, StructureError
+from optid.processes import run_forked
 from optid.program.judging import judge, measure_violation
 from optid.program.program import Program, Values
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
-from optid.solving.isolated import run_isolated
 from optid.structures.least_squares import rank_one_of
 
 Procedure = Generator[Program, Solution, Any]
 
-LIE = 1e-3  # a claim of success at a point this far outside the constraints is a lie, not an inaccuracy
+FALSE_CLAIM = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
+GRACE = 0.5  # seconds after its time limit at which a solver is killed
 UNUSABLE = (Status.FAILED, Status.LIMIT)
 OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
 CONFLICT = "the constraints contradict each other"
-NOT_FINITE = "returned non-finite numbers"  # what the reason of a solution says of its solver then
+NOT_FINITE = "returned non-finite numbers"  # the reason of such a solution, after its solver
 
 
 def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
@@ -37,8 +39,8 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
         program: what to solve.
         solver: the back end's word, "auto", or a `BackEnd` (or plain ``run`` function) of your own.
         accuracy: requested relative accuracy, translated for each solver.
-        time_limit: seconds; implies a process of its own, which is killed when it does not stop.
-        isolate: run in a process of its own (default: only with a time limit), so that a crash is an outcome.
+        time_limit: seconds; implies a separate process, which is killed when it does not stop.
+        isolate: run in a separate process (default: only with a time limit), so that a crash is an outcome.
         warm: start from the programme's ``start``.
         prove: ask the programme's certificate for a proof of global optimality.
         verbose: let the solver print.
@@ -78,7 +80,7 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     solution = attempt(back_end, settings, chosen)
     if not chosen or options:
         return solution
-    outside = solution.residuals is not None and solution.residuals.violation > LIE
+    outside = solution.residuals is not None and solution.residuals.violation > FALSE_CLAIM
     if solution.status is Status.FAILED or (solution.status is Status.LIMIT and outside):
         for other in fallbacks(program, back_end.name):
             found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
@@ -92,7 +94,7 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
 
 
 def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
-    """Say in one sentence how many programmes another back end than the one chosen first has solved."""
+    """State how many programmes another back end than the one chosen first has solved."""
     replaced = [solution for _, solution in steps if solution.failed]
     if not replaced:
         return {}
@@ -102,13 +104,21 @@ def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
 
 
 def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
-    """Run a back end from the programme's start; whatever happens to it is an answer."""
+    """Run a back end from the programme's start, in a forked child where it is to be separate; every outcome counts."""
     program.clear_duals()
     if settings.warm and program.start:
         program.assign(program.start)
+    clock = time.monotonic()
     try:
-        return run_isolated(back_end, program, settings) if separate else back_end.run(program, settings)
-    except StructureError as refusal:  # it says what to change, so it must reach the user
+        if not separate or not hasattr(os, "fork"):
+            return back_end.run(program, settings)
+        limit = None if settings.time_limit is None else settings.time_limit + GRACE
+        return run_forked(back_end.run, program, settings, seconds=limit)
+    except TimeoutError:
+        return Answer(Status.LIMIT, f"stopped after {time.monotonic() - clock:.1f} s: it did not keep its time limit")
+    except ChildProcessError as death:
+        return Answer(Status.FAILED, f"the solver's process died: {death}")
+    except StructureError as refusal:  # its message has the remedy for the user
         raise SolverRefused(str(refusal)) from refusal
     except Exception as error:  # a solver that crashes is an outcome, not a traceback
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
@@ -154,7 +164,7 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution
 
 
 def _conflict(base: Solution, reason: str) -> Solution:
-    """Say that no point satisfies the constraints; where a solver stopped is then nothing to go on with."""
+    """Report that no point satisfies the constraints; the point of the solver is dropped."""
     return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}")
 
 
@@ -185,7 +195,7 @@ def _without_point(program: Program, answer: Answer, name: str) -> tuple[Status,
     if answer.status is Status.INFEASIBLE and program.start:
         program.assign(program.start)
         if all(v.value is not None for v in program.variables.values()) and measure_violation(program)[0] < 1e-9:
-            return Status.FAILED, f"{name} says infeasible, but the start satisfies every constraint"
+            return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
     return answer.status, answer.word
 
 
@@ -196,11 +206,11 @@ def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) ->
     outside = residuals.violation > limit
     amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)" if outside else ""
     if answer.status is Status.INFEASIBLE and not outside:
-        return Status.FAILED, f"{name} says infeasible at a point that satisfies every constraint"
+        return Status.FAILED, f"{name} claims infeasibility at a point that satisfies every constraint"
     if answer.status not in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
         return answer.status, f"{answer.word}; {amount}" if amount else answer.word
     if outside:
-        if residuals.violation > LIE:
+        if residuals.violation > FALSE_CLAIM:
             return Status.FAILED, f"{name} claims success, but {amount}" if claims else f"{answer.word}; {amount}"
         return Status.INACCURATE, amount
     if residuals.stationarity > GRADIENT * limit or residuals.complementarity > limit:
@@ -254,62 +264,48 @@ def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Setti
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a procedure returns when its objective is not that of its last programme.
+    """What a procedure returns when its objective is not that of its last programme."""
 
-    Attributes:
-        model: the model.
-        objective: value of the procedure's own objective.
-        bound: bound on that objective, with the reason where there can be none; or a function that returns it, called
-            when the solution of the fit is first asked for.
-        status: status of the procedure as a whole.
-        reason: one sentence for people.
-        figures: what the procedure measured on its way, by the words under which people read it ("condition of R11",
-            "starts", "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first,
-            which the report draws. The fit prints them in this order.
-        extend: returns the model completed by what only some uses need, such as a noise model, and further figures; it
-            is called when the model of the fit is first asked for.
-    """
-
-    model: Any
-    objective: float
+    model: Any  # the model
+    objective: float  # value of the procedure's own objective
+    # bound on that objective, with the reason where there can be none; or a function that returns it, called when the
+    # solution of the fit is first used
     bound: Bound | Callable[[], Bound]
-    status: Status
-    reason: str = ""
+    status: Status  # status of the procedure as a whole
+    reason: str = ""  # one sentence
+    # what the procedure measured on its way, by the names that are printed ("condition of R11", "starts",
+    # "order"): numbers, texts, and one-dimensional arrays such as "singular values", largest first, which the report
+    # draws. The fit prints them in this order
     figures: Mapping[str, Any] = field(default_factory=dict)
+    # returns the model completed by what only some uses need, such as a noise model, and further figures; it is called
+    # when the model of the fit is first used
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
 
     def extended(self) -> tuple[Any, dict[str, Any]]:
-        """Return the completed model and what there is to say of it."""
+        """Return the completed model and further figures."""
         return self.extend() if self.extend else (self.model, {})
 
     @classmethod
     def pointless(cls, status: Status, reason: str) -> "Evidence":
-        """Say why there is no model."""
+        """Return evidence without a model, with the reason."""
         return cls(None, float("nan"), Bound.none(reason), status, reason)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a formulation ended with.
+    """What a formulation ended with."""
 
-    Attributes:
-        model: the model, or None where no programme had a point.
-        solution: the last solution.
-        program: the last programme.
-        steps: every (name, solution) on the way; one entry for a plain programme.
-        figures: those of the evidence, and which solvers stood in for others.
-        constrained: the last programme, with its solution, in which each user constraint stood: a procedure hands its
-            constraints to the steps they are about.
-        evidence: with which a procedure judged the whole, so that solution and program are no pair of their own; the
-            solution has no bound where the evidence has a function that returns it.
-    """
-
-    model: Any
-    solution: Solution
-    program: Program
-    steps: tuple[tuple[str, Solution], ...]
+    model: Any  # the model, or None where no programme had a point
+    solution: Solution  # the last solution
+    program: Program  # the last programme
+    steps: tuple[tuple[str, Solution], ...]  # every (name, solution) on the way; one entry for a plain programme
+    # those of the evidence, and which solvers stood in for others
     figures: Mapping[str, Any] = field(default_factory=dict)
+    # the last programme, with its solution, in which each user constraint stood: a procedure hands its constraints to
+    # the steps they are about
     constrained: Mapping[str, tuple[Program, Solution]] = field(default_factory=dict, repr=False)
+    # with which a procedure judged the whole: solution and program then do not belong together; the solution has
+    # no bound where the evidence has a function that returns it
     evidence: Evidence | None = None
 
 

@@ -21,7 +21,7 @@ BLOCKS = 4
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Where the samples of groups of signals stand in a row; every group enters at lags of its own."""
+    """The places of the samples of groups of signals in a row; every group has its own lags."""
 
     lags: tuple[range, ...]  # lags of every group
     columns: tuple[NDArray[np.int32], ...]  # (lags, signals) columns of every group

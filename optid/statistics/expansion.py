@@ -213,7 +213,7 @@ def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Seq
         rows = rows if present.all() else rows[present]
         if len(rows) <= len(names) + 1:
             raise DataError(f"only {len(rows)} samples have all {kind}s at once: {len(names)} {kind}s cannot be "
-                            "told apart from so few.")
+                            "separated with so few.")
         root = root_of_rows(rows)
         for c, name in enumerate(names, start=1):
             if np.abs(root[c, c]) <= 10 * ROUNDING["qr"] * np.linalg.norm(root[:, c]):
@@ -224,4 +224,4 @@ def check_channels(records: Sequence[Array], inputs: Sequence[str], outputs: Seq
                 sizes = np.abs(shares) * np.linalg.norm(root[1:, 1:c], axis=0)
                 partners = [str(names[j]) for j in np.argsort(-sizes) if sizes[j] > 1e-6 * sizes.max()]
                 raise RankError(f"{kind} {name!r} is a sum of multiples of {', '.join(partners)} and a constant: their "
-                                "effects cannot be told apart. Leave one channel out.")
+                                "effects cannot be separated. Leave one channel out.")

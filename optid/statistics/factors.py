@@ -7,7 +7,7 @@ from optid.arrays import Array
 # part of a column outside the span of those before it, relative to the column, that is rounding, not information
 ROUNDING = {"qr": 1e-12, "gram": 1e-7}
 # condition number of rows with scaled columns beyond which their Gram matrix, which squares it, is replaced by a QR
-# decomposition: small singular values would drown in its rounding, about 1e-16 times the square of it
+# decomposition: small singular values would be lost in its rounding, about 1e-16 times the square of it
 CONDITION_LIMIT = 1e5
 
 

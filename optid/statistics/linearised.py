@@ -18,7 +18,7 @@ from optid.statistics.factors import add_to_root, any_root_of_gram, conditioning
 CONDITION_LIMIT = 1e6
 
 
-# Gram matrix, QR decomposition (slower, twice the digits), or "qr" where the condition number asks for it
+# Gram matrix, QR decomposition (slower, twice the digits), or "qr" where the condition number requires it
 Method = Literal["auto", "gram", "qr"]
 
 

@@ -1,7 +1,7 @@
 """Prediction errors of transfer-function models and their sensitivities, compressed chunk by chunk.
 
 ``y = x + (C/D) e`` with ``A x = sum_c B_c f_c(u_c) + d`` and an initial state in the first n equations. D is A (ARX,
-ARMAX) or a polynomial of its own (Box-Jenkins); C = D = 1 is output error, whose e are the simulation errors. With
+ARMAX) or another polynomial (Box-Jenkins); C = D = 1 is output error, whose e are the simulation errors. With
 w = D/A (one where D is A) the predicted output has the partial derivatives
 
     a_i: -q^-i w x (where D is A: -q^-i y),  mu_c: B_c w eta_c,  b_cj: q^-(nk_c + j) w f_c,  d: w 1,  c_i: q^-i e,
@@ -37,7 +37,7 @@ SMALL = 20_000  # entries of a table that a triangular solution filters sooner t
 CHUNK = 4096  # samples whose sensitivities are formed at a time: they stay in the processor's cache
 # values of basis functions that are kept between linearisations: as many as stay in the processor's cache
 TABLE = 1 << 18
-FORGOTTEN = 1e-13  # share of its peak below which the response to the initial state no longer informs about it
+FORGOTTEN = 1e-13  # share of its peak below which the response to the initial state carries no information about it
 
 
 @dataclass(frozen=True, eq=False)

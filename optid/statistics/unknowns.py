@@ -10,7 +10,7 @@ from optid.models.layout import Layout
 
 
 class Unknowns:
-    """Where every part stands in the vector x; a subclass names the parts."""
+    """The places of the parts of the vector x; a subclass names the parts."""
 
     n: int  # number of states
     experiments: int  # number of experiments
@@ -24,7 +24,7 @@ class Unknowns:
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Where every shared part stands in x; matrices row by row."""
+        """The place of every shared part in x; matrices row by row."""
         found, position = {}, 0
         for name, shape in self.shapes.items():
             found[name] = slice(position, position + int(np.prod(shape)))
@@ -85,7 +85,7 @@ class TransferUnknowns(Unknowns):
 
     @property
     def apart(self) -> bool:
-        """Whether the noise has poles of its own, or none."""
+        """Whether the poles of the noise, if any, differ from those of the plant."""
         return self.nd is not None
 
     @property

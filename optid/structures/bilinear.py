@@ -106,7 +106,7 @@ def descend(core: Core, bs: list[Array], iterations: int = 1000, alternations: i
 class _Projected:
     """The best mu_i for some b_i of unit length, from pieces (nb, k, P), and the least squares that gave them.
 
-    The regressors of the mu_i are basis @ triangle, (k, sum P), regular where every mu_i has an effect of its own.
+    The regressors of the mu_i are basis @ triangle, (k, sum P), regular where the effects of the mu_i are independent.
     """
 
     pieces: list[Array]

@@ -14,7 +14,7 @@ def fit_multipliers(rows: Array, target: Array, equality: np.ndarray) -> tuple[A
     Raises:
         RuntimeError: the iterations did not suffice.
     """
-    if not len(rows):  # which SciPy's solver does not survive
+    if not len(rows):  # which SciPy's solver does not accept
         return np.zeros(0), float(np.linalg.norm(target))
     both = np.vstack([rows, -rows[equality]])
     weights, rest = nnls(both.T, target, maxiter=30 * len(both))

@@ -29,7 +29,7 @@ class Predictor:
 
     windows: Array  # (alpha, d, j): signal c at sample i of window w
     direct: np.ndarray  # (d,) whether a signal acts at once
-    constant: bool  # whether every block row has a constant of its own
+    constant: bool  # whether every block row has its own constant
 
     @cached_property
     def places(self) -> np.ndarray:
@@ -228,8 +228,8 @@ class NuclearProblem:
     def dual(self, multipliers: Array, weight: float) -> tuple[float, Array]:
         """Return a lower bound on the objective in closed form, and the dual point it is taken at.
 
-        The multipliers (r, q) are projected on what the free variables demand, then scaled into the unit ball of the
-        spectral norm: what comes out is feasible whatever came in. Those of ``X = matrix(v, theta)`` give a tight one.
+        The multipliers (r, q) are projected so that the free variables are stationary, then scaled into the unit ball
+        of the spectral norm: the point is always feasible. Multipliers of ``X = matrix(v, theta)`` give a tight bound.
         """
         point = self.projected(multipliers)
         for group in self.groups:

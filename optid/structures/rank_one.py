@@ -62,7 +62,7 @@ class RankOne:
 
     @cached_property
     def proofs(self) -> list[tuple[float, Any]]:
-        """The objective that was proved to be the least one, with its certification, so that nobody proves it again."""
+        """The objective that was proved to be the smallest, with its certification, so that it is proved once."""
         return []
 
     def value(self, z: Array) -> float:
@@ -117,24 +117,15 @@ class Core:
     """The bilinear core of a problem: linear unknowns eliminated, the blocks in whitened coordinates.
 
     Blocks with one row or one column are linear too. Blocks that carry constraints can be kept, and with them w.
-
-    Attributes:
-        problem: the problem it comes from.
-        order: columns of the problem, eliminated ones first.
-        triangle: R factor (n, n) of the reordered root.
-        target: (n,) rotated with it.
-        kept: indices of the blocks in the core.
-        linear: number of linear unknowns kept in the core (all of w, or none).
-        whitening: its coordinates.
     """
 
-    problem: RankOne
-    order: NDArray[np.intp]
-    triangle: Array
-    rotated: Array
-    kept: tuple[int, ...]
-    linear: int
-    whitening: Whitening
+    problem: RankOne  # the problem it comes from
+    order: NDArray[np.intp]  # columns of the problem, eliminated ones first
+    triangle: Array  # R factor (n, n) of the reordered root
+    rotated: Array  # (n,) target rotated with it
+    kept: tuple[int, ...]  # indices of the blocks in the core
+    linear: int  # number of linear unknowns kept in the core (all of w, or none)
+    whitening: Whitening  # its coordinates
 
     @property
     def eliminated(self) -> int:

@@ -36,7 +36,7 @@ def kronecker_factors(gram: Array, shape: tuple[int, int]) -> tuple[Array, Array
 
 
 def _factor(matrix: Array) -> tuple[Array, Array]:
-    """Lower Cholesky factor and inverse; a whisper of the identity keeps the coordinates invertible."""
+    """Lower Cholesky factor and inverse; a tiny multiple of the identity is added to keep it invertible."""
     shifted = matrix.copy()
     shifted.flat[:: len(matrix) + 1] += 1e-13 * max(float(matrix.trace()) / len(matrix), TINY)
     factor, info = _potrf(shifted, lower=1, clean=1)

@@ -1,5 +1,5 @@
 """The workbench: a page on this machine in which a record is fitted, constrained by hand, and diagnosed.
 
-`request` says what was asked for, `bench` fits and judges it, `views` draws it, `diagnosis` asks for faults, `script`
+`request` reads the request, `bench` fits and judges it, `views` draws it, `diagnosis` searches for faults, `script`
 writes the Python that repeats it, `server` hands it to the browser.
 """

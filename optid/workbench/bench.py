@@ -17,10 +17,10 @@ from optid.workbench.request import Request
 from optid.workbench.script import script
 
 KEPT = 40
-"""Fits that a page keeps: what was undone comes back at once."""
+"""Fits that a page keeps, so that an undone change returns at once."""
 
 SOLVING = threading.Lock()
-"""CVXPY and the solvers work for one page at a time."""
+"""Held during a fit: CVXPY and the solvers serve one page at a time."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,14 @@ class Source:
 
 @dataclass
 class Bench:
-    """What belongs to one page; no other page reaches it."""
+    """The state of one page; no other page has access to it."""
 
     source: Source
     fits: "OrderedDict[str, tuple[Any, Any]]" = field(default_factory=OrderedDict)
-    moving: tuple[str, Any] = ("", None)  # what a hand that draws a band has reached, by the key without the band
+    moving: tuple[str, Any] = ("", None)  # the last fit of a drag of a band, by the key without the band
 
     def answer(self, question: str, asked: Mapping[str, Any]) -> Any:
-        """Respond to a request of the page; the response says why a fit is impossible."""
+        """Respond to a request of the page; the response has the reason where a fit is impossible."""
         known: dict[str, Callable[[Mapping[str, Any]], Any]] = {
             "fit": self._fit, "judge": self._judge, "time": self._time, "export": self._export,
             "diagnose": self._diagnose}
@@ -56,7 +56,7 @@ class Bench:
     def _found(self, asked: Mapping[str, Any]) -> tuple[Any, Any]:
         request = Request.parse(asked.get("state"), bool(asked.get("draft")))
         with SOLVING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # what they say stands in the findings
+            warnings.simplefilter("ignore")  # the findings repeat them
             return self._kept(request)
 
     def _kept(self, request: Request) -> tuple[Any, Any]:

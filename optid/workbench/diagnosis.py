@@ -10,10 +10,10 @@ from optid.data.record import Data
 from optid.errors import StructureError
 from optid.show.page import coded
 from optid.show.sections import Axis, Chart, Series
-from optid.workbench.views import reduced
+from optid.workbench.views import SHOWN
 
 TONES = {"healthy": "good", "faulty": "bad"}
-SHOWN = 8
+MOST = 8
 """Candidates whose energy is drawn, those that explain most."""
 
 
@@ -58,16 +58,16 @@ def _charts(found: Any, first: int) -> list[dict[str, Any]]:
     charts = []
     for o, name in enumerate(found.outputs or [f"y{o + 1}" for o in range(seen.r.shape[1])]):
         r = np.where(seen.present[:, o], seen.r[:, o], np.nan)
-        series = [Series("innovation", *reduced(k, r), colour="muted", width=1.0)]
+        series = [Series("innovation", k, r, colour="muted", width=1.0)]
         if seen.fitted[:, o].any():
-            series.append(Series("the best answer", *reduced(k, seen.fitted[:, o]), colour="c1", width=2.0))
+            series.append(Series("the best answer", k, seen.fitted[:, o], colour="c1", width=2.0))
         charts.append(Chart(f"Whitened innovations of {name}", "Mostly between -2 and 2 when healthy.", Axis("sample"),
                             Axis("standard deviations"), series, "fault", height=220))
     if seen.labels:
         peaks = np.nanmax(np.where(np.isnan(seen.gains), -np.inf, seen.gains), axis=1)
-        order = [int(i) for i in np.argsort(-peaks)[:SHOWN] if np.isfinite(peaks[i])]
+        order = [int(i) for i in np.argsort(-peaks)[:MOST] if np.isfinite(peaks[i])]
         series = [Series(seen.labels[i], k, seen.gains[i], colour=f"c{j}", width=1.8) for j, i in enumerate(order)]
         charts.append(Chart("Likelihood of each fault by its onset", "Energy that a fault explains beyond the "
                             "threshold of an alarm: above zero a healthy plant hardly gets.", Axis("onset (sample)"),
                             Axis("energy beyond the threshold"), series, "fault", height=320))
-    return [coded(one) for one in charts]
+    return [coded(one, SHOWN) for one in charts]

@@ -34,29 +34,19 @@ class Constraint:
 
 @dataclass(frozen=True)
 class Request:
-    """One state of the page.
+    """One state of the page."""
 
-    Attributes:
-        inputs: names of the inputs.
-        outputs: names of the outputs.
-        window: first sample and the one after the last.
-        formulation: its name.
-        arguments: of the formulation.
-        constraints: set by hand.
-        draft: whether a hand is moving it, so that one pass for bands of the step response is enough.
-    """
-
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    window: tuple[int, int]
-    formulation: str
-    arguments: Mapping[str, Any]
-    constraints: tuple[Constraint, ...] = ()
-    draft: bool = False
+    inputs: tuple[str, ...]  # names of the inputs
+    outputs: tuple[str, ...]  # names of the outputs
+    window: tuple[int, int]  # first sample and the one after the last
+    formulation: str  # its name
+    arguments: Mapping[str, Any]  # of the formulation
+    constraints: tuple[Constraint, ...] = ()  # set by hand
+    draft: bool = False  # whether it is part of a drag: one pass for bands of the step response is then enough
 
     @classmethod
     def parse(cls, state: Any, draft: bool = False) -> "Request":
-        """Read a state as the page sends it, a `draft` while a hand moves; anything else is a `DataError`."""
+        """Read a state as the page sends it, a `draft` during a drag; anything else is a `DataError`."""
         try:
             constraints = tuple(Constraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
                                 for c in state["constraints"])
@@ -74,7 +64,7 @@ class Request:
 
     @property
     def key(self) -> str:
-        """A text that two states share where they ask for the same fit."""
+        """A text that is equal for states with the same fit."""
         constraints = [(c.word, dict(c.arguments), c.name) for c in self.constraints]
         return json.dumps([self.inputs, self.outputs, self.window, self.formulation, dict(self.arguments), constraints,
                            self.draft and BAND in [c.word for c in self.constraints]], sort_keys=True)

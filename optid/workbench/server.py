@@ -1,7 +1,7 @@
-"""Hand the workbench to a browser on this machine, and to nothing else.
+"""Serve the workbench to a browser on this machine only.
 
-The server listens on 127.0.0.1. A page opens with the token of the start; every page that opens gets a bench of its own
-under a secret of its own, which it sends in a header with every question. A request under another host name (DNS
+The server listens on 127.0.0.1. A page opens with the token of the start; every page that opens gets its own bench
+under its own secret, which it sends in a header with every request. A request under another host name (DNS
 rebinding), from another origin, without the secret or with that of no page is refused. No answer may be read by a page
 of another origin, and the page itself may ask this server only.
 """
@@ -23,14 +23,14 @@ from optid.workbench.bench import Bench, Source
 from optid.workbench.request import shortest
 
 PAGES = 16
-"""Pages that may be open at a time; the oldest gives way."""
+"""Pages that may be open at a time; the oldest is closed."""
 
 LARGEST = 1 << 20
-"""Bytes of a question."""
+"""Bytes of a request."""
 
 SHOWN = ("arx", "hammerstein_arx.exact", "hammerstein_arx.overparametrised", "hammerstein_oe.exact",
          "hammerstein_ss.sivid", "hammerstein_ss.asivid", "hammerstein_ss.exact")
-"""Formulations that a page offers: those that are fitted while a hand moves, and the state-space ones for faults."""
+"""Formulations that a page offers: those that are fitted during a drag, and the state-space ones for faults."""
 
 
 class Server(ThreadingHTTPServer):
@@ -92,7 +92,7 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
-        """Open a page for who knows the token."""
+        """Open a page for a request with the token."""
         asked = urlsplit(self.path)
         token = parse_qs(asked.query).get("token", [""])[0].encode()
         if not (self._own() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
@@ -101,7 +101,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._send(200, body, "text/html", policy)
 
     def do_POST(self) -> None:
-        """Answer a question of a page."""
+        """Respond to a request of a page."""
         bench = self.server.benches.get(self.headers.get("X-Optid-Page", ""))
         size = self.headers.get("Content-Length", "")
         if not self._own() or bench is None or not size.isdecimal() or int(size) > LARGEST:
@@ -138,7 +138,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: the terminal is the user's."""
+        """Write no log to the terminal."""
 
 
 def serve(source: Source, port: int = 0, ready: Callable[[str], None] = print) -> None:
@@ -147,10 +147,10 @@ def serve(source: Source, port: int = 0, ready: Callable[[str], None] = print) -
     Args:
         source: the record.
         port: of 127.0.0.1; any free one by default.
-        ready: hears the address.
+        ready: called with the address.
 
     Raises:
-        DataError: the port is taken, or is none.
+        DataError: the port is in use or invalid.
     """
     try:
         server = Server(source, port)

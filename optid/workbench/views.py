@@ -1,4 +1,4 @@
-"""What the page shows of a fit: at once what a hand moves, and later what takes time, the verdict and the tests."""
+"""The content of the page for a fit: at once what follows a drag, later the verdict and the tests."""
 
 from contextlib import suppress
 from typing import Any
@@ -9,14 +9,13 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.uncertainty import uncertainty
-from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
 from optid.models.functions import step_length
 from optid.show import charts, summary
 from optid.show.page import coded
 from optid.show.sections import TONES, Axis, Chart, Series
 
-BINS = 700
-"""Stretches of the time axis, of each of which the extremes are drawn."""
+SHOWN = 1400
+"""Samples of a curve that are drawn; of a longer one the extremes of half as many stretches."""
 
 POINTS, STEPS, DRAWS = 41, 60, 1000
 """Places of the band of a characteristic; samples of a step response at most; draws for a band under constraints."""
@@ -42,34 +41,9 @@ def quick(fit: Any, run: list[Array] | None) -> dict[str, Any]:
 
 def time_chart(record: Data, run: list[Array] | None, first: int, last: int) -> list[dict[str, Any]]:
     """Return outputs, measured and simulated, and inputs between two samples of the first experiment."""
-    e, found = record.experiments[0], []
-    several = f", experiment 1 of {record.n_experiments}" if record.n_experiments > 1 else ""
-    first, last = max(first, 0), min(last, e.n_samples)
-    t = e.start + record.dt * np.arange(first, last, dtype=float)
-    for o, name in enumerate(record.outputs):
-        series = [("measured", e.y[first:last, o], "ink", 1.1)]
-        if run is not None:
-            series.append(("simulated", run[0][first:last, o], "c0", 1.8))
-        found.append((f"Output {name}", name, record.output_units[o], series, 250))
-    for c, name in enumerate(record.inputs):
-        found.append((f"Input {name}", name, record.input_units[c], [(name, e.u[first:last, c], "muted", 1.1)], 150))
-    return [coded(Chart(title + several, "", Axis("time"), Axis(f"{name} ({unit})" if unit else name, unit=unit),
-                        [Series(label, *reduced(t, values), colour=colour, width=width)
-                         for label, values, colour, width in series], "time", height=height)) | {"tool": "time"}
-            for title, name, unit, series, height in found]
-
-
-def reduced(t: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
-    """Return the smallest and the largest value of every stretch, in order of time."""
-    width = len(values) // bins
-    if width <= 2:
-        return t, values
-    whole = values[: bins * width].reshape(bins, width)
-    low = np.argmin(np.where(np.isfinite(whole), whole, np.inf), axis=1)
-    high = np.argmax(np.where(np.isfinite(whole), whole, -np.inf), axis=1)
-    kept = np.unique(np.concatenate([np.arange(bins) * width + low, np.arange(bins) * width + high,
-                                     [len(values) - 1]]))
-    return t[kept], values[kept]
+    part = slice(max(first, 0), last)
+    shown = charts.time_charts(record, 0, [("simulated", run, {"width": 1.9})], "time", part=part, heights=(250, 150))
+    return [coded(chart, SHOWN) | {"tool": "time"} for chart in shown]
 
 
 def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
@@ -89,53 +63,31 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
         def shown(model: Any, c: int = c, points: Array = points, span: Array = span) -> Array:
             f = model.nonlinearities[c]
             step = model.step_response(count).reshape(count, model.l, -1)[:, 0, c] * np.diff(f(span))
-            return np.concatenate([static(model, c, points), step])
+            return np.concatenate([model.static_curve(c, points)[:, 0], step])
 
         value = shown(model)
         band = None if known is None else known.of(shown)
-        density, edges = np.histogram(samples[np.isfinite(samples)], bins=40, range=(low, high))
-        bars = Series("density of the samples", edges[:-1], density / max(density.max(), 1), "bars", "muted",
-                      aside=True)
+        bars = charts.density(samples[np.isfinite(samples)], low, high)
         for what, at, x, extra in (
-                ("static", points, Axis(_named(channel, record.input_units[c])), [bars]),
+                ("static", points, charts.channel_axis(channel, record.input_units[c]), [bars]),
                 ("step", model.dt * np.arange(count), Axis("time"), [])):
             part = slice(0, points.size) if what == "static" else slice(points.size, None)
             series = [] if band is None else [Series("95 % band", at, band.upper[part], "area", lows=band.lower[part])]
             title = f"Static characteristic of {channel}" if what == "static" else (
                 f"Step response to {channel} from {low:.3g} to {high:.3g}")
-            y = Axis(_named(record.outputs[0], record.output_units[0]))
+            y = charts.channel_axis(record.outputs[0], record.output_units[0])
             found.append(coded(Chart(title, "", x, y, [*series, Series("fit", at, value[part], width=2.2), *extra],
                                      height=300)) | {"tool": what, "channel": channel if model.m > 1 else None,
                                                      "dt": model.dt, "interval": [low, high]})
     return found
 
 
-def static(model: Any, c: int, points: Array) -> Array:
-    """Return the first output at rest with an input held at points (k,), the functions of the others at zero."""
-    if model.structure == "ss":
-        rest = np.eye(model.nx) - model.A
-        gain = model.C[0] @ np.linalg.solve(rest, model.B[:, c]) + model.D[0, c]
-        level = model.C[0] @ np.linalg.solve(rest, model.offset_x) + model.offset_y[0]
-        return level + gain * model.nonlinearities[c](points)
-    rest = np.eye(model.l) + model.matrices.sum(axis=0)
-    gain = np.linalg.solve(rest, np.atleast_1d(np.sum(model.b[c], axis=0)))[0]
-    return np.linalg.solve(rest, np.atleast_1d(model.offset))[0] + gain * model.nonlinearities[c](points)
-
-
 def judged(fit: Any) -> dict[str, Any]:
     """Return the verdict on a fit and its residual tests."""
     found = fit.verdict
-    says = "; ".join(f"{part.name}: {part.value}" for part in found.failed) or "Every test passes."
-    if not found.failed and found.word != GOOD:
-        says = (f"No test fails; a good model simulates {GOOD_FIT:g} % of the record, and {GOOD_BLOCK:g} % of every "
-                "block.")
-    return {"word": found.word, "tone": TONES[found.word], "sentence": says, "parts": [
-        [part.name, part.value, "PASS" if part.passed else "FAIL"] for part in found.parts],
-        "charts": [coded(one) for one in charts.correlation_charts(charts.validated(fit.model, fit.data.raw()))]}
-
-
-def _named(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name
+    return {"word": found.word, "tone": TONES[found.word], "sentence": summary.judgement(found),
+            "parts": [list(row) for row in summary.verdict_table(found).rows],
+            "charts": [coded(one) for one in charts.correlation_charts(charts.validated(fit.model, fit.data.raw()))]}
 
 
 def _finite(value: float) -> float | None:
