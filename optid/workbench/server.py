@@ -1,9 +1,10 @@
-"""Hand the workbench to a browser on this machine, and to nothing else.
+"""Serve the workbench to browsers of this user on this machine only.
 
-The server listens on 127.0.0.1. A page opens with the token of the start; every page that opens gets a bench of its own
-under a secret of its own, which it sends in a header with every question. A request under another host name (DNS
-rebinding), from another origin, without the secret or with that of no page is refused. No answer may be read by a page
-of another origin, and the page itself may ask this server only.
+The server listens on 127.0.0.1. A page opens with the token of the server; every page has its own bench and its own
+secret, which it sends in a header with every request. A request under another host name (DNS rebinding), from another
+origin, or without the secret of a page is refused. No page of another origin can read a response, and the page itself
+may send requests to this server only. The browser is given a file that only this user can read and that redirects to the
+address, because other users can read the command line of the browser.
 """
 
 import json
@@ -13,6 +14,8 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -23,14 +26,14 @@ from optid.workbench.bench import Bench, Source
 from optid.workbench.request import shortest
 
 PAGES = 16
-"""Pages that may be open at a time; the oldest gives way."""
+"""Pages that may be open at a time; the oldest is closed."""
 
 LARGEST = 1 << 20
-"""Bytes of a question."""
+"""Most bytes of a request."""
 
 SHOWN = ("arx", "hammerstein_arx.exact", "hammerstein_arx.overparametrised", "hammerstein_oe.exact",
          "hammerstein_ss.sivid", "hammerstein_ss.asivid", "hammerstein_ss.exact")
-"""Formulations that a page offers: those that are fitted while a hand moves, and the state-space ones for faults."""
+"""Formulations that a page offers: those fast enough for a drag, and the state-space ones for diagnosis."""
 
 
 class Server(ThreadingHTTPServer):
@@ -39,7 +42,7 @@ class Server(ThreadingHTTPServer):
     Attributes:
         source: the record.
         token: opens a page.
-        benches: by the secret of their page.
+        benches: benches by the secret of their page.
     """
 
     daemon_threads = True
@@ -52,7 +55,7 @@ class Server(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """What to open in the browser."""
+        """The address of a new page, with the token."""
         return f"http://127.0.0.1:{self.server_port}/?token={self.token}"
 
     @property
@@ -76,7 +79,7 @@ class Server(ThreadingHTTPServer):
         data, script = self.source.data, scripts("plot.js", "parts.js", "workbench.js")
         begin = {
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
-            "samples": shortest(data), "origin": data.experiments[0].start,
+            "samples": shortest(data), "origins": [e.start for e in data.experiments],
             "inputs": list(data.inputs), "outputs": list(data.outputs),
             "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
         lead = f"{data.n_samples} samples every {data.dt:g}"
@@ -92,21 +95,21 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
-        """Open a page for who knows the token."""
+        """Open a page, given the token; a redirect from a file counts as cross-site."""
         asked = urlsplit(self.path)
         token = parse_qs(asked.query).get("token", [""])[0].encode()
-        if not (self._own() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
-            return self._send(403, "Open the address that optid workbench has printed, with its token.", "text/plain")
+        if not (self._host() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
+            return self._send(403, "Open the address that optid workbench printed, with its token.", "text/plain")
         body, policy = self.server.page(self.server.opened())
         self._send(200, body, "text/html", policy)
 
     def do_POST(self) -> None:
-        """Answer a question of a page."""
+        """Respond to a request of a page."""
         bench = self.server.benches.get(self.headers.get("X-Optid-Page", ""))
         size = self.headers.get("Content-Length", "")
         if not self._own() or bench is None or not size.isdecimal() or int(size) > LARGEST:
             self.close_connection = True
-            return self._send(403, json.dumps({"error": "this page is not known here: open it again"}))
+            return self._send(403, json.dumps({"error": "this page is unknown to the server: open the printed address again"}))
         try:
             asked = json.loads(self.rfile.read(int(size)))
             if not isinstance(asked, dict):
@@ -118,10 +121,13 @@ class _Handler(BaseHTTPRequestHandler):
             code, answer = 500, {"error": f"a defect of optid: {type(error).__name__}: {error}"}
         self._send(code, json.dumps(answer))
 
+    def _host(self) -> bool:
+        return self.headers.get("Host") in self.server.hosts
+
     def _own(self) -> bool:
-        """Whether a request was meant for this server, by a page of this server."""
+        """Whether a request to this server was sent by a page of this server."""
         origin = self.headers.get("Origin")
-        return self.headers.get("Host") in self.server.hosts and (
+        return self._host() and (
             origin is None or origin in [f"http://{host}" for host in self.server.hosts]) and (
             self.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"))
 
@@ -138,28 +144,31 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing: the terminal is the user's."""
+        """Print nothing."""
 
 
-def serve(source: Source, port: int = 0, ready: Callable[[str], None] = print) -> None:
+def serve(source: Source, port: int = 0, ready: Callable[[str, Path], None] = print) -> None:
     """Serve a record until it is interrupted.
 
     Args:
         source: the record.
         port: of 127.0.0.1; any free one by default.
-        ready: hears the address.
+        ready: called with the address, and with a file, readable by this user only, that redirects to it.
 
     Raises:
-        DataError: the port is taken, or is none.
+        DataError: the port is in use, or is not a port.
     """
     try:
         server = Server(source, port)
     except (OSError, OverflowError) as error:
         raise DataError(f"port {port} of 127.0.0.1 cannot be used: "
                         f"{getattr(error, 'strerror', 'it must be 0 to 65535')}") from None
-    with server, warnings.catch_warnings():
+    with server, TemporaryDirectory(prefix="optid-") as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        ready(server.address)
+        redirect = Path(folder) / "workbench.html"
+        redirect.touch(0o600)
+        redirect.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={server.address}">')
+        ready(server.address, redirect)
         try:
             server.serve_forever()
         except KeyboardInterrupt:

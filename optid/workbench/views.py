@@ -1,5 +1,6 @@
-"""What the page shows of a fit: at once what a hand moves, and later what takes time, the verdict and the tests."""
+"""Figures and charts of a fit: those that follow a drag, and, computed later, the verdict and the residual tests."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -16,14 +17,14 @@ from optid.show.page import coded
 from optid.show.sections import TONES, Axis, Chart, Series
 
 BINS = 700
-"""Stretches of the time axis, of each of which the extremes are drawn."""
+"""Intervals of the time axis; the extremes of each are drawn."""
 
 POINTS, STEPS, DRAWS = 41, 60, 1000
-"""Places of the band of a characteristic; samples of a step response at most; draws for a band under constraints."""
+"""Points of a characteristic; most samples of a step response; draws for a band under constraints."""
 
 
-def quick(fit: Any, run: list[Array] | None) -> dict[str, Any]:
-    """Return figures, prices and charts of a fit, as JSON types."""
+def quick(fit: Any, run: list[Array] | None, output: str | None = None) -> dict[str, Any]:
+    """Return figures, prices and charts of a fit, as JSON types; curves of one output, the first by default."""
     model, record = fit.model, fit.data.raw()
     tone, word, sentence = summary.verdict(fit)
     size = 0.0 if run is None else float(np.nanmean(fit.simulation_fit))
@@ -36,20 +37,21 @@ def quick(fit: Any, run: list[Array] | None) -> dict[str, Any]:
                   ["relative gap", summary.gap_text(fit.solution.gap)]],
         "tone": tone, "word": word, "sentence": sentence, "prices": prices, "findings": list(fit.findings),
         "objective": _finite(fit.solution.objective), "equation": model.equation(),
-        "charts": [*characteristics(fit, record), coded(charts.pole_chart({"": model.poles})) | {"tool": "poles"}],
+        "charts": [*characteristics(fit, record, output), coded(charts.pole_chart({"": model.poles})) | {"tool": "poles"}],
     }
 
 
-def time_chart(record: Data, run: list[Array] | None, first: int, last: int) -> list[dict[str, Any]]:
-    """Return outputs, measured and simulated, and inputs between two samples of the first experiment."""
-    e, found = record.experiments[0], []
-    several = f", experiment 1 of {record.n_experiments}" if record.n_experiments > 1 else ""
-    first, last = max(first, 0), min(last, e.n_samples)
+def time_chart(record: Data, run: list[Array] | None, experiment: int = 0,
+               view: Sequence[float] | None = None) -> list[dict[str, Any]]:
+    """Return outputs, measured and simulated, and inputs of an experiment (from 0) between two samples (all)."""
+    e, found = record.select(experiments=experiment).experiments[0], []
+    several = f", experiment {experiment + 1} of {record.n_experiments}" if record.n_experiments > 1 else ""
+    first, last = (0, e.n_samples) if view is None else (max(int(view[0]), 0), min(int(view[1]), e.n_samples))
     t = e.start + record.dt * np.arange(first, last, dtype=float)
     for o, name in enumerate(record.outputs):
         series = [("measured", e.y[first:last, o], "ink", 1.1)]
         if run is not None:
-            series.append(("simulated", run[0][first:last, o], "c0", 1.8))
+            series.append(("simulated", run[experiment][first:last, o], "c0", 1.8))
         found.append((f"Output {name}", name, record.output_units[o], series, 250))
     for c, name in enumerate(record.inputs):
         found.append((f"Input {name}", name, record.input_units[c], [(name, e.u[first:last, c], "muted", 1.1)], 150))
@@ -60,7 +62,7 @@ def time_chart(record: Data, run: list[Array] | None, first: int, last: int) -> 
 
 
 def reduced(t: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
-    """Return the smallest and the largest value of every stretch, in order of time."""
+    """Return the smallest and the largest value of every interval, in order of time."""
     width = len(values) // bins
     if width <= 2:
         return t, values
@@ -72,24 +74,26 @@ def reduced(t: Array, values: Array, bins: int = BINS) -> tuple[Array, Array]:
     return t[kept], values[kept]
 
 
-def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
-    """Return the static characteristic and the step response of every input, with bands where they are known."""
-    model, found = fit.model, []
+def characteristics(fit: Any, record: Data, output: str | None = None) -> list[dict[str, Any]]:
+    """Return the static characteristic and the step response of an output to every input, with bands if known."""
+    model, found, several = fit.model, [], len(record.outputs) > 1
+    o = 0 if output is None else record.outputs.index(output)
+    name, unit = record.outputs[o], record.output_units[o]
     known = None
     with suppress(OptidError):  # some fits have no intervals
         known = uncertainty(fit, draws=DRAWS)
     count = min(step_length(model), STEPS)
     for c, channel in enumerate(record.inputs):
         basis = model.nonlinearities[c].basis
-        samples = record.experiments[0].u[:, c]
+        samples = np.concatenate([e.u[:, c] for e in record.experiments])
         low, high = basis.interval or (float(np.nanmin(samples)), float(np.nanmax(samples)))
         points = np.unique(np.append(np.linspace(low, high, POINTS), getattr(basis, "nodes", [])))
         span = np.array([low, high])
 
         def shown(model: Any, c: int = c, points: Array = points, span: Array = span) -> Array:
             f = model.nonlinearities[c]
-            step = model.step_response(count).reshape(count, model.l, -1)[:, 0, c] * np.diff(f(span))
-            return np.concatenate([static(model, c, points), step])
+            step = model.step_response(count).reshape(count, model.l, -1)[:, o, c] * np.diff(f(span))
+            return np.concatenate([static(model, c, points, o), step])
 
         value = shown(model)
         band = None if known is None else known.of(shown)
@@ -101,25 +105,26 @@ def characteristics(fit: Any, record: Data) -> list[dict[str, Any]]:
                 ("step", model.dt * np.arange(count), Axis("time"), [])):
             part = slice(0, points.size) if what == "static" else slice(points.size, None)
             series = [] if band is None else [Series("95 % band", at, band.upper[part], "area", lows=band.lower[part])]
-            title = f"Static characteristic of {channel}" if what == "static" else (
-                f"Step response to {channel} from {low:.3g} to {high:.3g}")
-            y = Axis(_named(record.outputs[0], record.output_units[0]))
+            title = f"Static characteristic of {f'{name} against ' if several else ''}{channel}"
+            if what == "step":
+                title = f"Step response {f'of {name} ' if several else ''}to {channel} from {low:.3g} to {high:.3g}"
+            y = Axis(_named(name, unit))
             found.append(coded(Chart(title, "", x, y, [*series, Series("fit", at, value[part], width=2.2), *extra],
                                      height=300)) | {"tool": what, "channel": channel if model.m > 1 else None,
-                                                     "dt": model.dt, "interval": [low, high]})
+                                                     "output": name if several else None, "dt": model.dt, "interval": [low, high]})
     return found
 
 
-def static(model: Any, c: int, points: Array) -> Array:
-    """Return the first output at rest with an input held at points (k,), the functions of the others at zero."""
+def static(model: Any, c: int, points: Array, o: int = 0) -> Array:
+    """Return an output at rest with an input held at points (k,), the functions of the others at zero."""
     if model.structure == "ss":
         rest = np.eye(model.nx) - model.A
-        gain = model.C[0] @ np.linalg.solve(rest, model.B[:, c]) + model.D[0, c]
-        level = model.C[0] @ np.linalg.solve(rest, model.offset_x) + model.offset_y[0]
+        gain = model.C[o] @ np.linalg.solve(rest, model.B[:, c]) + model.D[o, c]
+        level = model.C[o] @ np.linalg.solve(rest, model.offset_x) + model.offset_y[o]
         return level + gain * model.nonlinearities[c](points)
     rest = np.eye(model.l) + model.matrices.sum(axis=0)
-    gain = np.linalg.solve(rest, np.atleast_1d(np.sum(model.b[c], axis=0)))[0]
-    return np.linalg.solve(rest, np.atleast_1d(model.offset))[0] + gain * model.nonlinearities[c](points)
+    gain = np.linalg.solve(rest, np.atleast_1d(np.sum(model.b[c], axis=0)))[o]
+    return np.linalg.solve(rest, np.atleast_1d(model.offset))[o] + gain * model.nonlinearities[c](points)
 
 
 def judged(fit: Any) -> dict[str, Any]:
