@@ -3,8 +3,8 @@
 The server listens on 127.0.0.1. A page opens with the token of the server; every page has its own bench and its own
 secret, which it sends in a header with every request. A request under another host name (DNS rebinding), from another
 origin, or without the secret of a page is refused. No page of another origin can read a response, and the page itself
-may send requests to this server only. The browser is given a file that only this user can read and that redirects to the
-address, because other users can read the command line of the browser.
+may send requests to this server only. The browser is given a file that only this user can read and that redirects to
+the address, because other users can read the command line of the browser.
 """
 
 import json
@@ -63,6 +63,13 @@ class Server(ThreadingHTTPServer):
         """Names under which the server answers."""
         return f"127.0.0.1:{self.server_port}", f"localhost:{self.server_port}"
 
+    def redirect(self, folder: Path) -> Path:
+        """Write a file, readable by this user only, that redirects to the address."""
+        path = folder / "workbench.html"
+        path.touch(0o600)
+        path.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={self.address}">')
+        return path
+
     def opened(self) -> str:
         """Return the secret of a new page."""
         secret = secrets.token_urlsafe(24)
@@ -109,7 +116,7 @@ class _Handler(BaseHTTPRequestHandler):
         size = self.headers.get("Content-Length", "")
         if not self._own() or bench is None or not size.isdecimal() or int(size) > LARGEST:
             self.close_connection = True
-            return self._send(403, json.dumps({"error": "this page is unknown to the server: open the printed address again"}))
+            return self._send(403, json.dumps({"error": "the server does not know this page: open it again"}))
         try:
             asked = json.loads(self.rfile.read(int(size)))
             if not isinstance(asked, dict):
@@ -165,10 +172,7 @@ def serve(source: Source, port: int = 0, ready: Callable[[str, Path], None] = pr
                         f"{getattr(error, 'strerror', 'it must be 0 to 65535')}") from None
     with server, TemporaryDirectory(prefix="optid-") as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        redirect = Path(folder) / "workbench.html"
-        redirect.touch(0o600)
-        redirect.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={server.address}">')
-        ready(server.address, redirect)
+        ready(server.address, server.redirect(Path(folder)))
         try:
             server.serve_forever()
         except KeyboardInterrupt:

@@ -37,7 +37,8 @@ def quick(fit: Any, run: list[Array] | None, output: str | None = None) -> dict[
                   ["relative gap", summary.gap_text(fit.solution.gap)]],
         "tone": tone, "word": word, "sentence": sentence, "prices": prices, "findings": list(fit.findings),
         "objective": _finite(fit.solution.objective), "equation": model.equation(),
-        "charts": [*characteristics(fit, record, output), coded(charts.pole_chart({"": model.poles})) | {"tool": "poles"}],
+        "charts": [*characteristics(fit, record, output),
+                   coded(charts.pole_chart({"": model.poles})) | {"tool": "poles"}],
     }
 
 
@@ -109,9 +110,9 @@ def characteristics(fit: Any, record: Data, output: str | None = None) -> list[d
             if what == "step":
                 title = f"Step response {f'of {name} ' if several else ''}to {channel} from {low:.3g} to {high:.3g}"
             y = Axis(_named(name, unit))
-            found.append(coded(Chart(title, "", x, y, [*series, Series("fit", at, value[part], width=2.2), *extra],
-                                     height=300)) | {"tool": what, "channel": channel if model.m > 1 else None,
-                                                     "output": name if several else None, "dt": model.dt, "interval": [low, high]})
+            chart = Chart(title, "", x, y, [*series, Series("fit", at, value[part], width=2.2), *extra], height=300)
+            found.append(coded(chart) | {"tool": what, "channel": channel if model.m > 1 else None,
+                                         "output": name if several else None, "dt": model.dt, "interval": [low, high]})
     return found
 
 

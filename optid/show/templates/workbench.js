@@ -110,7 +110,7 @@ function withPins(chart) {
 function drawChart(figure, chart, key) {
   const hidden = new Set(), heading = element("h3", {}, chart.title), modes = element("div", { class: "modes", role: "group", "aria-label": `Tools of ${chart.title}` });
   const host = element("div", { class: "plot-host", "data-tool": chart.tool || "" }), kept = { chart, mode: "Zoom", pins: pins.length, figure };
-  figure.append(heading, ...(chart.tool ? [modes] : []), host);
+  figure.append(heading, modes, host);
   if (chart.caption) figure.append(element("figcaption", {}, chart.caption));
   for (const name of chart.tool ? ["Zoom", ...Object.keys(MODES[chart.tool])] : []) {
     modes.append(element("button", { type: "button", "aria-pressed": String(name === "Zoom"), onclick: (event) => {
@@ -130,7 +130,7 @@ function drawChart(figure, chart, key) {
     clearTimeout(waiting);
     waiting = setTimeout(async () => { const sent = request(), found = await ask("time"); if (!found.error && sent === request()) drawAll(at("time"), found); }, 120);
   };
-  addLegend(host, chart.title, series, hidden, () => kept.plot.draw());
+  addLegend(modes, chart.title, series, hidden, () => kept.plot.draw());
   kept.plot = makePlot(host, { ...chart, label: `${chart.title}. ${chart.caption}`, series, moved: chart.group ? moved : null,
     places: (axis) => (tool ? mine(kept.chart).map((c) => boxOf(c, kept.chart)).flatMap((b) => (axis ? [b.y0, b.y1] : [b.x0, b.x1])) : []),
     below: (f) => (tool ? hands(kept.chart, f) : []), grab: (event, x, y, f) => tool && grab(event, x, y, f, kept) }, hidden);
