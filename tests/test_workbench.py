@@ -2,13 +2,17 @@
 
 import http.client
 import json
+import os
 import signal
 import subprocess
 import sys
 import threading
+import time
 import urllib.request
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +26,7 @@ from formulations.constraints.responses import step_band
 from formulations.constraints.shape import value_range
 from optid.errors import DataError, StructureError
 from optid.examples import example
+from optid.workbench import views
 from optid.workbench.bench import Bench, Source
 from optid.workbench.request import Constraint, Request, suggested
 from optid.workbench.server import PAGES, Server, serve
@@ -64,6 +69,14 @@ def asked(server, method="POST", path="/fit", body="{}", **headers):
     return found
 
 
+def written(path):
+    """Wait for a file and return its text."""
+    end = time.monotonic() + 60
+    while not path.exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    return path.read_text()
+
+
 def test_strangers_are_refused():
     with served(source()) as server:
         first, second = server.opened(), server.opened()
@@ -83,6 +96,7 @@ def test_strangers_are_refused():
             asked(server, body=body, Host="evil.example", **known),
             asked(server, body=body, **host, **known, Origin="http://evil.example"),
             asked(server, body=body, **host, **known, **{"Sec-Fetch-Site": "cross-site"}),
+            asked(server, "GET", "/", **host, **{"Sec-Fetch-Site": "cross-site"}),
         ]
         assert [answer[0] for answer in refused] == [403] * len(refused)
         assert server.benches[first].fits and not server.benches[second].fits
@@ -132,24 +146,67 @@ def test_every_experiment_is_fitted_as_a_whole():
     bench = Bench(Source(record, "record", state))
     shown = bench.answer("fit", {"state": state})
     assert "experiment 1 of 3" in shown["time"][0]["title"]
+    third = bench.answer("time", {"state": state, "experiment": 2})
+    assert "experiment 3 of 3" in third[0]["title"]
+    assert third[0]["series"][1] != shown["time"][0]["series"][1]
+    assert "error" in bench.answer("time", {"state": state, "experiment": 3})
     assert next(iter(bench.fits.values()))[0].figures["candidates"] > record.n_samples - 20
     assert ".window" not in bench.answer("export", {"what": "script", "state": state})["text"]
     cut = bench.answer("export", {"what": "script", "state": {**state, "window": [5, 90]}})["text"]
     assert ".window(5, 90)" in cut
 
 
+def test_curves_are_drawn_for_the_output_chosen():
+    record = two_by_two()
+    state = {**suggested(record, {}), "formulation": "hammerstein_ss.sivid",
+             "arguments": {"nx": 2, "basis": "triangular:5"}, "constraints": []}
+    state = constrained(state, ("through", {"u": 0.2, "y": 0.5, "channel": "valve <1>", "output": 'temp "b"'}, "point"))
+    bench = Bench(Source(record, "record", state))
+    first, second = (bench.answer("fit", {"state": state, "output": name})["charts"][0] for name in record.outputs)
+    assert (first["output"], second["output"]) == record.outputs and first["title"] != second["title"]
+    assert second["y"]["title"] == 'temp "b" (°C)'
+    model = next(iter(bench.fits.values()))[0].model
+    assert views.static(model, 0, np.array([0.2]), 1) == pytest.approx(0.5)
+
+
+def test_requests_are_computed_one_at_a_time(monkeypatch):
+    of, running, most = source(), [], []
+
+    def slow(*_):
+        running.append(1)
+        most.append(len(running))
+        time.sleep(0.05)
+        running.pop()
+        return {}
+
+    monkeypatch.setattr(views, "judged", slow)
+    monkeypatch.setattr(views, "quick", slow)
+    bench = Bench(of)
+    with ThreadPoolExecutor(4) as pool:
+        found = [pool.submit(bench.answer, question, {"state": of.start}) for question in ("judge", "fit") * 3]
+        assert not any("error" in one.result() for one in found)
+    assert max(most) == 1 and len(most) == 6
+
+
 def test_the_command_serves_until_it_is_interrupted(tmp_path):
     table = np.column_stack([example("thruster").data.u, example("thruster").data.y])
     np.savetxt(tmp_path / "rig.csv", table, delimiter=",", header="u,y", comments="")
-    words = ["-m", "optid", "workbench", str(tmp_path / "rig.csv"), "--dt", "0.1", "--no-browser"]
-    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True) as process:
+    browser, opened = tmp_path / "browser", tmp_path / "opened"
+    browser.write_text(f'#!/bin/sh\necho "$@" > {opened}.part && mv {opened}.part {opened}\n')
+    browser.chmod(0o755)
+    words = ["-m", "optid", "workbench", str(tmp_path / "rig.csv"), "--dt", "0.1"]
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE, text=True,
+                          env={**os.environ, "BROWSER": str(browser)}) as process:
         assert process.stdout is not None
         said = process.stdout.readline() + process.stdout.readline()
         address = next(word for word in said.split() if word.startswith("http://127.0.0.1:"))
+        redirect = Path(written(opened).strip().removeprefix("file://"))
+        assert address in redirect.read_text() and redirect.stat().st_mode & 0o777 == 0o600
+        assert redirect.parent.stat().st_mode & 0o777 == 0o700
         with urllib.request.urlopen(address, timeout=30) as page:
             text = page.read().decode()
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0
+        assert process.wait(30) == 0 and not redirect.exists()
     begin = json.loads(text.partition('id="begin">')[2].partition("</script>")[0])
     assert begin["inputs"] == ["u"] and begin["samples"] == 600 and begin["secret"] not in address
 
@@ -284,18 +341,140 @@ def test_fits_follow_the_mouse(bench_page):
     assert all(url.startswith(f"http://127.0.0.1:{server.server_port}/") for url in browser.requests())
 
 
+RULES = {"through": {"u": 0.2, "y": 0.5}, "range": {"low": -50, "high": 50, "first": -0.5, "last": 0.5},
+         "dead_zone": {"low": -0.1, "high": 0.1}, "step_band": {"last": 10, "low": -99, "high": 99},
+         "disc": {"centre": 0, "radius": 0.95}, "monotone": {"direction": "increasing"}, "convex": {}, "concave": {},
+         "odd": {}, "even": {}, "saturation": {"low": -0.8, "high": 0.8}, "stable": {"radius": 0.98}}
+
+
+@pytest.mark.slow
+def test_the_page_offers_what_the_formulation_accepts(bench_page):
+    server, browser = bench_page
+    goto(browser, server)
+    tf, ss, both = {"nb": 2, "nk": 0, "basis": "triangular:4"}, {"nx": 2, "basis": "triangular:4"}, [*RULES]
+    polynomial = ("arx", "hammerstein_arx.exact", "hammerstein_arx.overparametrised")
+    cases = [(name, {**tf, "na": na}, outputs, both) for name in polynomial for outputs in (1, 2) for na in range(4)]
+    cases += [(f"hammerstein_ss.{name}", ss, outputs, both) for name in ("sivid", "asivid") for outputs in (1, 2)]
+    cases += [("hammerstein_oe.exact", {**tf, "na": 1}, 1, ["step_band", "stable"]),
+              ("hammerstein_ss.exact", ss, 1, ["step_band"])]
+    record = two_by_two(200).select(inputs="valve <1>")
+    for name, arguments, outputs, words in cases:
+        arguments = {key: value for key, value in arguments.items() if name != "arx" or key != "basis"}
+        data = record.select(outputs=list(record.outputs[:outputs]))
+        state = {**suggested(data, {}), "formulation": name, "arguments": arguments, "constraints": []}
+        browser.run(f"void (state = {json.dumps(state)})")
+        bench = Bench(Source(data, "", state))
+        for word in words:
+            more = {"output": data.outputs[-1]} if outputs > 1 and word in ("through", "range", "step_band") else {}
+            found = bench.answer("fit", {"state": constrained(state, (word, {**RULES[word], **more}, word))})
+            assert browser.run(f"accepts('{word}')") == ("error" not in found), (name, arguments, outputs, word, found)
+
+
+def choose(browser, selector, value):
+    count = browser.run("timings.length")
+    browser.run(f"(() => {{ const e = document.querySelector('{selector}'); e.value = {json.dumps(value)}; "
+                "e.dispatchEvent(new Event('change')); })()")
+    settled(browser, count)
+
+
+TOOLS = "[...document.querySelectorAll('.modes button')].filter((b) => b.checkVisibility()).map((b) => b.textContent)"
+
+
+@pytest.mark.slow
+def test_tools_and_ticks_follow_the_formulation(bench_page):
+    server, browser = bench_page
+    goto(browser, server)
+    assert {"Point", "Corridor", "Flat", "Band", "Disc", "Window"} < set(browser.run(TOOLS))
+    draw(browser, "step", "Band", (0.4, 0.9), (0.9, 0.4))
+    browser.click("#undo")
+    choose(browser, "#field-Formulation", "arx")
+    assert set(browser.run(TOOLS)) == {"Zoom", "Point", "Corridor", "Disc", "Window"}
+    assert browser.run("document.querySelector('[data-tool=step]').closest('figure')"
+                       ".querySelector('.modes [aria-pressed=true]').textContent") == "Zoom"
+    assert browser.run("[...document.querySelectorAll('#ticks input:disabled')]"
+                       ".map((e) => e.parentElement.textContent)") == ["odd", "even", "saturation"]
+    choose(browser, "#field-Formulation", "hammerstein_arx.exact")
+    assert "Band" in browser.run(TOOLS) and not browser.complaints()
+
+
+@pytest.mark.slow
+def test_an_empty_number_field_keeps_its_last_value(bench_page):
+    server, browser = bench_page
+    goto(browser, server)
+    draw(browser, "static", "Point", (0.8, 0.4), (0.8, 0.45))
+    before, fits = browser.run("JSON.stringify(state)"), browser.run("timings.length")
+    for field in ("#last", "#first", "#to", "#constraints .numbers input"):
+        value = browser.run(f"document.querySelector('{field}').value")
+        for text in ("", "-7.5" if field != "#constraints .numbers input" else ""):
+            browser.run(f"(() => {{ const e = document.querySelector('{field}'); e.focus(); e.value = {text!r}; "
+                        "e.dispatchEvent(new Event('change')); })()")
+            assert browser.run(f"document.querySelector('{field}').value") == value
+    assert browser.run("JSON.stringify(state)") == before and browser.run("span") == [0, 600]
+    assert browser.run("timings.length") == fits and not browser.complaints()
+
+
+@pytest.mark.slow
+def test_quick_edits_do_not_mix_their_answers(bench_page):
+    server, browser = bench_page
+    goto(browser, server)
+    first = browser.run("document.getElementById('cards').textContent")
+    browser.run("change((s) => { s.window = [0, 80]; }); judge(); change((s) => { s.constraints = []; }); judge()")
+    browser.wait("!document.documentElement.dataset.busy")
+    assert browser.run("document.getElementById('word').matches('.stale')")
+    browser.wait("document.documentElement.dataset.judged === JSON.stringify(state)")
+    assert not browser.run("document.querySelectorAll('.stale').length")
+    assert browser.run("document.getElementById('cards').textContent") != first
+    state = browser.run("state")
+    judged = Bench(server.source).answer("judge", {"state": state})
+    assert browser.run("document.getElementById('sentence').textContent") == judged["sentence"]
+    assert browser.run("shown.objective") == Bench(server.source).answer("fit", {"state": state})["objective"]
+
+
+@pytest.mark.slow
+def test_experiment_and_output_are_chosen(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    record = two_by_two()
+    start = {**suggested(record, {}), "formulation": "hammerstein_ss.sivid",
+             "arguments": {"nx": 2, "basis": "triangular:5"}}
+    titles = "[...document.querySelectorAll('#plots figure h3')].map((e) => e.textContent)"
+    with served(Source(record, "", start)) as server, Browser(tmp_path) as browser:
+        goto(browser, server)
+        before = browser.run(titles)
+        assert before[0] == "Output level_a, experiment 1 of 3"
+        choose(browser, "#field-Experiment", "2")
+        choose(browser, "#field-Output-drawn", record.outputs[1])
+        after = browser.run(titles)
+        assert after == [title.replace("experiment 1", "experiment 3").replace("of level_a", 'of temp "b"')
+                         if k != 1 else 'Output temp "b", experiment 3 of 3' for k, title in enumerate(before)]
+        draw(browser, "static", "Point", (0.8, 0.4), (0.8, 0.45))
+        assert browser.run("state.constraints[0].arguments.output") == record.outputs[1]
+        assert browser.run("document.querySelectorAll('.plot circle[data-constraint]').length") == 1
+        choose(browser, "#field-Output-drawn", record.outputs[0])
+        assert browser.run("document.querySelectorAll('.plot circle[data-constraint]').length") == 0
+        assert not browser.run(OVERLAPS) and not browser.run(CONTRAST) and not browser.complaints()
+
+
+@pytest.mark.slow
+def test_a_browser_follows_the_redirect(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    with served(source()) as server, Browser(tmp_path / "profile") as browser:
+        redirect = server.redirect(tmp_path)
+        browser.send("Page.navigate", url=redirect.as_uri())
+        browser.wait("document.documentElement?.dataset.ready")
+        assert browser.run("location.href") == server.address and not browser.complaints()
+
+
 @pytest.mark.slow
 def test_a_click_saves_a_script_that_repeats_the_page(bench_page, tmp_path):
     server, browser = bench_page
     goto(browser, server)
     draw(browser, "static", "Corridor", (0.4, 0.55), (0.6, 0.7))
+    browser.wait("document.documentElement.dataset.judged === JSON.stringify(state)")  # after it nothing moves
     browser.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     browser.click("[data-export=script]")
-    for _ in range(200):
-        if (tmp_path / "fit.py").exists():
-            break
-        browser.wait("new Promise((done) => setTimeout(() => done(true), 50))")
-    lines = (tmp_path / "fit.py").read_text() + "print('objective', repr(fit.solution.objective))\n"
+    lines = written(tmp_path / "fit.py") + "print('objective', repr(fit.solution.objective))\n"
     done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, check=True)
     assert float(done.stdout.split()[-1]) == browser.run("shown.objective")
     assert not browser.complaints()
@@ -335,6 +514,13 @@ def test_everything_can_be_read(bench_page, width, dark):
     assert browser.run("document.documentElement.scrollWidth") <= width
     assert not browser.run(OVERLAPS)
     assert not browser.run(CONTRAST)
+    assert not browser.run("""[...document.querySelectorAll("figure")].flatMap((figure) => {
+        const box = (e) => e.getBoundingClientRect(), zoom = box(figure.querySelector(".zoom"));
+        return [...figure.querySelectorAll("h3, .legend button, .modes button")].filter((e) => {
+            const b = box(e);
+            return b.width && b.bottom > zoom.top && b.top < zoom.bottom && b.right > zoom.left && b.left < zoom.right;
+        }).map((e) => e.textContent);
+    })""")
     assert not browser.complaints()
 
 

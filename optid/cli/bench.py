@@ -36,11 +36,11 @@ def workbench(data: Paths = None, example: str | None = None, *, how: dict[str, 
     expression = f"optid.examples.example({example!r}, seed={seed}).data" if example else reading(
         [str(Path(name).resolve()) for name in data or ()], words.reading(how))
 
-    def ready(address: str) -> None:
+    def ready(address: str, redirect: Path) -> None:
         say(f"The workbench is at {address}\nIt ends with Ctrl-C; nothing leaves this machine.")
         if browser:
             import webbrowser
 
-            webbrowser.open(address)
+            webbrowser.open(redirect.as_uri())
 
     serve(Source(record, expression, suggested(record, suggestion), plant), port, ready)

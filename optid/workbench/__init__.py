@@ -1,5 +1,5 @@
-"""The workbench: a page on this machine in which a record is fitted, constrained by hand, and diagnosed.
+"""The workbench: a local page to fit a record, draw constraints on the model, and diagnose faults.
 
-`request` reads the request, `bench` fits and judges it, `views` draws it, `diagnosis` searches for faults, `script`
-writes the Python that repeats it, `server` hands it to the browser.
+`request` describes a fit, `bench` fits and judges it, `views` draws it, `diagnosis` searches for faults, `script`
+writes the Python that repeats the fit, `server` serves the page.
 """

@@ -17,10 +17,10 @@ from optid.workbench.request import Request
 from optid.workbench.script import script
 
 KEPT = 40
-"""Fits that a page keeps, so that an undone change returns at once."""
+"""Fits that a page keeps, so that an undo needs no new fit."""
 
 SOLVING = threading.Lock()
-"""Held during a fit: CVXPY and the solvers serve one page at a time."""
+"""One request is computed at a time: the solvers, the fits of a page and the warning filters are shared."""
 
 
 @dataclass(frozen=True)
@@ -35,11 +35,11 @@ class Source:
 
 @dataclass
 class Bench:
-    """The state of one page; no other page has access to it."""
+    """The fits of one page; no other page can reach them."""
 
     source: Source
     fits: "OrderedDict[str, tuple[Any, Any]]" = field(default_factory=OrderedDict)
-    moving: tuple[str, Any] = ("", None)  # the last fit of a drag of a band, by the key without the band
+    moving: tuple[str, Any] = ("", None)  # last fit of a band being dragged, by the key without the band
 
     def answer(self, question: str, asked: Mapping[str, Any]) -> Any:
         """Respond to a request of the page; the response has the reason where a fit is impossible."""
@@ -48,16 +48,15 @@ class Bench:
             "diagnose": self._diagnose}
         if question not in known:
             raise DataError(f"the page sent an unknown request, {question!r}")
-        try:
-            return known[question](asked)
-        except OptidError as error:
-            return {"error": str(error)}
+        with SOLVING, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the findings contain them
+            try:
+                return known[question](asked)
+            except OptidError as error:
+                return {"error": str(error)}
 
     def _found(self, asked: Mapping[str, Any]) -> tuple[Any, Any]:
-        request = Request.parse(asked.get("state"), bool(asked.get("draft")))
-        with SOLVING, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the findings repeat them
-            return self._kept(request)
+        return self._kept(Request.parse(asked.get("state"), bool(asked.get("draft"))))
 
     def _kept(self, request: Request) -> tuple[Any, Any]:
         from optid.show.charts import free_run
@@ -81,14 +80,12 @@ class Bench:
     def _fit(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         started = time.thread_time()
         fit, run = self._found(asked)
-        found = views.quick(fit, run)
+        found = views.quick(fit, run, asked.get("output"))
         return {**found, "time": self._time(asked), "seconds": time.thread_time() - started}
 
     def _time(self, asked: Mapping[str, Any]) -> list[dict[str, Any]]:
         fit, run = self._found(asked)
-        record = fit.data.raw()
-        first, last = asked.get("view") or (0, record.experiments[0].n_samples)
-        return views.time_chart(record, run, int(first), int(last))
+        return views.time_chart(fit.data.raw(), run, int(asked.get("experiment", 0)), asked.get("view"))
 
     def _judge(self, asked: Mapping[str, Any]) -> dict[str, Any]:
         return views.judged(self._found(asked)[0])
@@ -111,5 +108,4 @@ class Bench:
         from optid.workbench.diagnosis import diagnosed
 
         fit = None if self.source.model is not None else self._found(asked)[0]
-        with SOLVING:
-            return diagnosed(self.source.model if fit is None else fit, self.source.data, asked)
+        return diagnosed(self.source.model if fit is None else fit, self.source.data, asked)

@@ -1,4 +1,4 @@
-"""A diagnosis on the page: the record, how likely every fault is by its onset, the set; and all that without some."""
+"""A diagnosis for the page: innovations, likelihood of every fault against its onset, and the possible faults."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -14,7 +14,7 @@ from optid.workbench.views import SHOWN
 
 TONES = {"healthy": "good", "faulty": "bad"}
 MOST = 8
-"""Candidates whose energy is drawn, those that explain most."""
+"""Candidates whose energy is drawn: those that explain most."""
 
 
 def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
     Args:
         source: a state-space model with noise covariances, or a fit of one.
         data: the whole record.
-        asked: ``window``, ``kinds`` of faults, ``without`` (labels taken out of the dictionary).
+        asked: ``experiment``, ``window``, ``kinds`` of faults, ``without`` (labels removed from the dictionary).
     """
     from optid.faults import diagnose, dictionary
     from optid.faults.diagnosis import words
@@ -41,8 +41,9 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
     if not kept:
         raise StructureError("no fault is left in the dictionary: keep at least one")
     faults = replace(whole, candidates=tuple(whole.candidates[i] for i in kept), sines=whole.sines[np.ix_(kept, kept)])
-    first, last = map(int, asked.get("window") or (0, data.experiments[0].n_samples))
-    record = data.select(inputs=list(model.inputs), outputs=list(model.outputs), experiments=0).window(first, last)
+    whole_record = data.select(list(model.inputs), list(model.outputs), int(asked.get("experiment", 0)))
+    first, last = map(int, asked.get("window") or (0, whole_record.n_samples))
+    record = whole_record.window(first, last)
     found = diagnose(source, record, faults)
     answers = [[answer.label, f"{answer.posterior:.3f}",
                 "; ".join(words.onset_words(f).removeprefix("onset ") for f in answer.faults),
@@ -60,7 +61,7 @@ def _charts(found: Any, first: int) -> list[dict[str, Any]]:
         r = np.where(seen.present[:, o], seen.r[:, o], np.nan)
         series = [Series("innovation", k, r, colour="muted", width=1.0)]
         if seen.fitted[:, o].any():
-            series.append(Series("the best answer", k, seen.fitted[:, o], colour="c1", width=2.0))
+            series.append(Series("best explanation", k, seen.fitted[:, o], colour="c1", width=2.0))
         charts.append(Chart(f"Whitened innovations of {name}", "Mostly between -2 and 2 when healthy.", Axis("sample"),
                             Axis("standard deviations"), series, "fault", height=220))
     if seen.labels:
@@ -68,6 +69,6 @@ def _charts(found: Any, first: int) -> list[dict[str, Any]]:
         order = [int(i) for i in np.argsort(-peaks)[:MOST] if np.isfinite(peaks[i])]
         series = [Series(seen.labels[i], k, seen.gains[i], colour=f"c{j}", width=1.8) for j, i in enumerate(order)]
         charts.append(Chart("Likelihood of each fault by its onset", "Energy that a fault explains beyond the "
-                            "threshold of an alarm: above zero a healthy plant hardly gets.", Axis("onset (sample)"),
+                            "alarm threshold; rarely above zero without a fault.", Axis("onset (sample)"),
                             Axis("energy beyond the threshold"), series, "fault", height=320))
     return [coded(one, SHOWN) for one in charts]

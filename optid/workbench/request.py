@@ -10,10 +10,10 @@ from optid.errors import DataError, StructureError
 from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, named_constraint
 
 BAND = "step_band"
-"""The constraint that is a tangent at a model where there are past outputs."""
+"""The constraint that is linearised at a model with past outputs."""
 
 PASSES = 3
-"""Fits around the model of the one before until the step response itself obeys a band."""
+"""Fits under a band, each linearised at the model of the previous fit."""
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,15 @@ class Request:
         return chosen if self.whole(data) else chosen.window(*self.window)
 
     def whole(self, data: Data) -> bool:
-        """Whether the window leaves nothing out: of several experiments it counts in the shortest."""
+        """Whether the window is the whole record: with several experiments, the whole shortest one."""
         return self.window == (0, shortest(data))
 
     def fit(self, data: Data, begun: Callable[["Request"], Any] | None = None) -> Any:
-        """Fit the record; a band of the step response by repeated fits, each around the model of the one before.
+        """Fit the record; with a band on the step response by repeated fits, each linearised at the previous model.
 
         Args:
             data: the whole record.
-            begun: returns the fit to begin with, that of the same request without bands, where it may be known.
+            begun: returns the first fit, that of the same request without bands, if it may be known.
         """
         from optid.identify.fitting import fit
 
@@ -108,7 +108,7 @@ def shortest(data: Data) -> int:
 
 
 def suggested(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the state a page begins with: that of a built-in example, or small orders for any record.
+    """Return the initial state of a page: that of a built-in example, or small orders for any record.
 
     Args:
         data: the record.

@@ -13,7 +13,7 @@ def script(request: Request, source: str, whole: bool = False) -> str:
     Args:
         request: what was fitted.
         source: expression that reads the whole record.
-        whole: whether its window leaves nothing out.
+        whole: whether its window is the whole record.
     """
     homes: dict[str, set[str]] = {}
     for c in request.constraints:
@@ -37,13 +37,13 @@ def script(request: Request, source: str, whole: bool = False) -> str:
     ]
     if repeated:
         around = ", ".join(_call(c, ", around=fit.model") for c in bands)
-        lines += [f"for _ in range({PASSES}):  # the band is a tangent at the model before",
+        lines += [f"for _ in range({PASSES}):  # the band is linearised at the previous model",
                   f"    fit = {fit % f'[*constraints, {around}]'}"]
     return "\n".join([*lines, "print(fit)", ""])
 
 
 def reading(files: list[str], how: Mapping[str, Any]) -> str:
-    """Write how files were read; what was left out is left out."""
+    """Write the call that reads files, without default options."""
     usual = {"delimiter": ",", "decimal": "."}
     given = {key: value for key, value in how.items() if value is not None and value != usual.get(key)}
     options = "".join(f", {key}={value!r}" for key, value in given.items())

@@ -1,9 +1,10 @@
-"""Serve the workbench to a browser on this machine only.
+"""Serve the workbench to browsers of this user on this machine only.
 
-The server listens on 127.0.0.1. A page opens with the token of the start; every page that opens gets its own bench
-under its own secret, which it sends in a header with every request. A request under another host name (DNS
-rebinding), from another origin, without the secret or with that of no page is refused. No answer may be read by a page
-of another origin, and the page itself may ask this server only.
+The server listens on 127.0.0.1. A page opens with the token of the server; every page has its own bench and its own
+secret, which it sends in a header with every request. A request under another host name (DNS rebinding), from another
+origin, or without the secret of a page is refused. No page of another origin can read a response, and the page itself
+may send requests to this server only. The browser is given a file that only this user can read and that redirects to
+the address, because other users can read the command line of the browser.
 """
 
 import json
@@ -13,6 +14,8 @@ import warnings
 from collections import OrderedDict
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -26,11 +29,11 @@ PAGES = 16
 """Pages that may be open at a time; the oldest is closed."""
 
 LARGEST = 1 << 20
-"""Bytes of a request."""
+"""Most bytes of a request."""
 
 SHOWN = ("arx", "hammerstein_arx.exact", "hammerstein_arx.overparametrised", "hammerstein_oe.exact",
          "hammerstein_ss.sivid", "hammerstein_ss.asivid", "hammerstein_ss.exact")
-"""Formulations that a page offers: those that are fitted during a drag, and the state-space ones for faults."""
+"""Formulations that a page offers: those fast enough for a drag, and the state-space ones for diagnosis."""
 
 
 class Server(ThreadingHTTPServer):
@@ -39,7 +42,7 @@ class Server(ThreadingHTTPServer):
     Attributes:
         source: the record.
         token: opens a page.
-        benches: by the secret of their page.
+        benches: benches by the secret of their page.
     """
 
     daemon_threads = True
@@ -52,13 +55,20 @@ class Server(ThreadingHTTPServer):
 
     @property
     def address(self) -> str:
-        """What to open in the browser."""
+        """The address of a new page, with the token."""
         return f"http://127.0.0.1:{self.server_port}/?token={self.token}"
 
     @property
     def hosts(self) -> tuple[str, ...]:
         """Names under which the server answers."""
         return f"127.0.0.1:{self.server_port}", f"localhost:{self.server_port}"
+
+    def redirect(self, folder: Path) -> Path:
+        """Write a file, readable by this user only, that redirects to the address."""
+        path = folder / "workbench.html"
+        path.touch(0o600)
+        path.write_text(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={self.address}">')
+        return path
 
     def opened(self) -> str:
         """Return the secret of a new page."""
@@ -76,7 +86,7 @@ class Server(ThreadingHTTPServer):
         data, script = self.source.data, scripts("plot.js", "parts.js", "workbench.js")
         begin = {
             "secret": secret, "start": self.source.start, "name": data.name or "record", "dt": data.dt,
-            "samples": shortest(data), "origin": data.experiments[0].start,
+            "samples": shortest(data), "origins": [e.start for e in data.experiments],
             "inputs": list(data.inputs), "outputs": list(data.outputs),
             "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
         lead = f"{data.n_samples} samples every {data.dt:g}"
@@ -92,11 +102,11 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
-        """Open a page for a request with the token."""
+        """Open a page, given the token; a redirect from a file counts as cross-site."""
         asked = urlsplit(self.path)
         token = parse_qs(asked.query).get("token", [""])[0].encode()
-        if not (self._own() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
-            return self._send(403, "Open the address that optid workbench has printed, with its token.", "text/plain")
+        if not (self._host() and asked.path == "/" and secrets.compare_digest(token, self.server.token.encode())):
+            return self._send(403, "Open the address that optid workbench printed, with its token.", "text/plain")
         body, policy = self.server.page(self.server.opened())
         self._send(200, body, "text/html", policy)
 
@@ -106,7 +116,7 @@ class _Handler(BaseHTTPRequestHandler):
         size = self.headers.get("Content-Length", "")
         if not self._own() or bench is None or not size.isdecimal() or int(size) > LARGEST:
             self.close_connection = True
-            return self._send(403, json.dumps({"error": "this page is not known here: open it again"}))
+            return self._send(403, json.dumps({"error": "the server does not know this page: open it again"}))
         try:
             asked = json.loads(self.rfile.read(int(size)))
             if not isinstance(asked, dict):
@@ -118,10 +128,13 @@ class _Handler(BaseHTTPRequestHandler):
             code, answer = 500, {"error": f"a defect of optid: {type(error).__name__}: {error}"}
         self._send(code, json.dumps(answer))
 
+    def _host(self) -> bool:
+        return self.headers.get("Host") in self.server.hosts
+
     def _own(self) -> bool:
-        """Whether a request was meant for this server, by a page of this server."""
+        """Whether a request to this server was sent by a page of this server."""
         origin = self.headers.get("Origin")
-        return self.headers.get("Host") in self.server.hosts and (
+        return self._host() and (
             origin is None or origin in [f"http://{host}" for host in self.server.hosts]) and (
             self.headers.get("Sec-Fetch-Site", "none") in ("none", "same-origin"))
 
@@ -138,28 +151,28 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Write no log to the terminal."""
+        """Print nothing."""
 
 
-def serve(source: Source, port: int = 0, ready: Callable[[str], None] = print) -> None:
+def serve(source: Source, port: int = 0, ready: Callable[[str, Path], None] = print) -> None:
     """Serve a record until it is interrupted.
 
     Args:
         source: the record.
         port: of 127.0.0.1; any free one by default.
-        ready: called with the address.
+        ready: called with the address, and with a file, readable by this user only, that redirects to it.
 
     Raises:
-        DataError: the port is in use or invalid.
+        DataError: the port is in use, or is not a port.
     """
     try:
         server = Server(source, port)
     except (OSError, OverflowError) as error:
         raise DataError(f"port {port} of 127.0.0.1 cannot be used: "
                         f"{getattr(error, 'strerror', 'it must be 0 to 65535')}") from None
-    with server, warnings.catch_warnings():
+    with server, TemporaryDirectory(prefix="optid-") as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        ready(server.address)
+        ready(server.address, server.redirect(Path(folder)))
         try:
             server.serve_forever()
         except KeyboardInterrupt:

@@ -1,21 +1,23 @@
-// The workbench: a state (channels, window, model, constraints) that hands change, and the fit that follows it.
+// The workbench: a state (channels, window, model, constraints) that the user changes, and the fit that follows it.
 
 const BEGIN = JSON.parse(document.getElementById("begin").textContent), at = (id) => document.getElementById(id);
 let state = structuredClone(BEGIN.start), shown = null, view = null, dragged = false;
+const look = { experiment: 0, output: state.outputs[0] }; // what is drawn
 const past = [], future = [], pins = [], drawn = new Map(), timings = [];
 const TICKS = [["rising", "monotone", { direction: "increasing" }], ["falling", "monotone", { direction: "decreasing" }], ["convex", "convex", {}],
   ["concave", "concave", {}], ["odd", "odd", {}], ["even", "even", {}], ["saturation", "saturation", null], ["stable", "stable", { radius: 0.98 }]];
 const ORDERS = { na: "Past outputs", nb: "Past inputs", nk: "Delay", nx: "States", basis: "Basis of f", prior: "Prior", ridge: "Ridge" };
 const TAKES = { arx: ["na", "nb", "nk", "prior"], ss: ["nx", "basis"], tf: ["na", "nb", "nk", "basis"] };
-const MODES = { static: ["Point", "Corridor", "Flat"], step: ["Band"], poles: ["Disc"], time: ["Window"] };
+const MODES = { static: { Point: "through", Corridor: "range", Flat: "dead_zone" }, step: { Band: "step_band" }, poles: { Disc: "disc" }, time: { Window: null } };
 const KINDS = ["bias", "loss", "stuck", "drift", "noise", "spike"];
 
-async function ask(question, body) {
-  const answer = await fetch("/" + question, { method: "POST", headers: { "X-Optid-Page": BEGIN.secret, "Content-Type": "application/json" }, body: JSON.stringify(body) });
-  return answer.json();
+const request = (more) => JSON.stringify({ state, view, ...look, ...more });
+function ask(question, more) {
+  return fetch("/" + question, { method: "POST", headers: { "X-Optid-Page": BEGIN.secret, "Content-Type": "application/json" }, body: request(more) })
+    .then((answer) => answer.json()).catch((error) => ({ error: `The workbench does not respond: ${error.message}` }));
 }
 
-// ---- the fit follows the state; while one is on its way the newest state waits
+// ---- the fit follows the state; during a fit the newest state waits
 
 let busy = false, wanted = false, later = 0;
 async function refit() {
@@ -26,7 +28,7 @@ async function refit() {
   document.documentElement.dataset.busy = "yes";
   while (wanted) {
     wanted = false;
-    const clock = performance.now(), asked = JSON.stringify(state), found = await ask("fit", { state, view, draft: dragged }).catch((error) => ({ error: String(error) }));
+    const clock = performance.now(), asked = JSON.stringify(state), found = await ask("fit", { draft: dragged });
     at("trouble").textContent = found.error || "";
     document.querySelectorAll("#plots, #verdict").forEach((one) => one.classList.toggle("stale", !!found.error));
     if (!found.error) { shown = { ...found, asked }; show(found); await new Promise(requestAnimationFrame); timings.push(performance.now() - clock); }
@@ -40,7 +42,7 @@ async function refit() {
 async function judge() {
   const asked = JSON.stringify(state);
   if (at("trouble").textContent || shown?.asked !== asked) return;
-  const found = await ask("judge", { state });
+  const found = await ask("judge");
   if (found.error || JSON.stringify(state) !== asked) return;
   at("verdict").className = `verdict ${found.tone}`;
   at("word").textContent = `The model is ${found.word}`;
@@ -48,15 +50,29 @@ async function judge() {
   at("parts").replaceChildren(...found.parts.map((part) => row(...part)));
   drawAll(at("testcharts"), found.charts);
   document.documentElement.dataset.judged = asked;
+  judgedOrStale();
   fitTables();
+}
+
+// The verdict and the tests of an earlier fit are dimmed until those of the fit shown arrive.
+function judgedOrStale() {
+  const { judged } = document.documentElement.dataset;
+  ["word", "sentence", "parts", "tests"].forEach((id) => at(id).classList.toggle("stale", !!judged && judged !== shown.asked));
 }
 
 const row = (first, ...cells) => element("tr", {}, element("th", { scope: "row" }, first), ...cells.map((cell) => element("td", {}, cell)));
 
 // ---- history
 
-function change(edit) { past.push(JSON.stringify(state)); future.length = 0; edit(state); settle(); }
-function settle() { view = dragged ? view : null; controls(); refit(); }
+function change(edit) {
+  const before = JSON.stringify(state);
+  edit(state);
+  if (JSON.stringify(state) === before) return;
+  past.push(before);
+  future.length = 0;
+  settle();
+}
+function settle() { view = dragged ? view : null; controls(); offer(); refit(); }
 function travel(from, to) { if (!from.length) return; to.push(JSON.stringify(state)); state = JSON.parse(from.pop()); settle(); }
 
 // ---- what is shown
@@ -65,8 +81,10 @@ function show(found) {
   at("cards").replaceChildren(...found.cards.map(([label, value]) => element("div", { class: "card" }, element("b", {}, value), element("span", {}, label))));
   at("optimum").textContent = `${found.word}. ${found.sentence} ${found.findings.join(" ")}`;
   if (!document.documentElement.dataset.judged) { at("word").textContent = "Fitted"; at("sentence").textContent = "The verdict follows."; }
+  judgedOrStale();
   drawAll(at("time"), found.time);
   drawAll(at("figures"), found.charts);
+  offer();
   constraintList();
 }
 
@@ -75,10 +93,10 @@ function drawAll(host, charts) {
   for (const figure of [...host.children]) if (!keys.includes(figure.dataset.key)) { drawn.delete(figure.dataset.key); figure.remove(); }
   charts.forEach((chart, k) => {
     const known = drawn.get(keys[k]);
-    if (known && dragged) return known.update(chart); // a hand is on it
+    if (known && dragged) return known.update(chart);
     if (known && known.chart.series.map((s) => s.name).join() === chart.series.map((s) => s.name).join() && known.pins === pins.length) return known.update(chart);
     const figure = element("figure", { "data-key": keys[k] }), old = host.querySelector(`[data-key="${CSS.escape(keys[k])}"]`);
-    old ? old.replaceWith(figure) : host.append(figure);
+    old ? old.replaceWith(figure) : host.insertBefore(figure, host.children[k] || null);
     drawn.set(keys[k], drawChart(figure, chart, keys[k]));
   });
 }
@@ -92,9 +110,9 @@ function withPins(chart) {
 function drawChart(figure, chart, key) {
   const hidden = new Set(), heading = element("h3", {}, chart.title), modes = element("div", { class: "modes", role: "group", "aria-label": `Tools of ${chart.title}` });
   const host = element("div", { class: "plot-host", "data-tool": chart.tool || "" }), kept = { chart, mode: "Zoom", pins: pins.length, figure };
-  figure.append(heading, ...(chart.tool ? [modes] : []), host);
+  figure.append(heading, modes, host);
   if (chart.caption) figure.append(element("figcaption", {}, chart.caption));
-  for (const name of chart.tool ? ["Zoom", ...MODES[chart.tool]] : []) {
+  for (const name of chart.tool ? ["Zoom", ...Object.keys(MODES[chart.tool])] : []) {
     modes.append(element("button", { type: "button", "aria-pressed": String(name === "Zoom"), onclick: (event) => {
       kept.mode = name;
       [...modes.children].forEach((one) => one.setAttribute("aria-pressed", String(one === event.currentTarget)));
@@ -110,9 +128,9 @@ function drawChart(figure, chart, key) {
     const first = Math.floor((low - origin()) / BEGIN.dt), last = Math.ceil((high - origin()) / BEGIN.dt) + 1;
     view = first <= 0 && last >= state.window[1] - state.window[0] ? null : [Math.max(first, 0), last];
     clearTimeout(waiting);
-    waiting = setTimeout(async () => { const found = await ask("time", { state, view }); if (!found.error) drawAll(at("time"), found); }, 120);
+    waiting = setTimeout(async () => { const sent = request(), found = await ask("time"); if (!found.error && sent === request()) drawAll(at("time"), found); }, 120);
   };
-  addLegend(host, chart.title, series, hidden, () => kept.plot.draw());
+  addLegend(modes, chart.title, series, hidden, () => kept.plot.draw());
   kept.plot = makePlot(host, { ...chart, label: `${chart.title}. ${chart.caption}`, series, moved: chart.group ? moved : null,
     places: (axis) => (tool ? mine(kept.chart).map((c) => boxOf(c, kept.chart)).flatMap((b) => (axis ? [b.y0, b.y1] : [b.x0, b.x1])) : []),
     below: (f) => (tool ? hands(kept.chart, f) : []), grab: (event, x, y, f) => tool && grab(event, x, y, f, kept) }, hidden);
@@ -120,9 +138,28 @@ function drawChart(figure, chart, key) {
   return kept;
 }
 
-const origin = () => BEGIN.origin + state.window[0] * BEGIN.dt;
+// Offer the tools whose rule the formulation accepts.
+function offer() {
+  for (const button of document.querySelectorAll(".modes button")) {
+    const word = MODES[button.closest("figure").querySelector(".plot-host").dataset.tool][button.textContent];
+    button.hidden = !!word && !accepts(word);
+    if (button.hidden && button.getAttribute("aria-pressed") === "true") button.parentElement.firstChild.click();
+  }
+}
 
-// ---- constraints on the plots: every one has a box in the units of its plot, and handles
+function accepts(word) {
+  const { formulation, outputs, arguments: { na } } = state, one = outputs.length === 1, space = formulation.includes("_ss");
+  if (word === "step_band") return space ? !formulation.endsWith(".exact") : one && formulation.startsWith("hammerstein_arx");
+  if (space) return true;
+  if (["dead_zone", "saturation", "odd", "even"].includes(word)) return formulation !== "arx";
+  if (["monotone", "convex", "concave"].includes(word)) return one || formulation === "hammerstein_arx.exact";
+  if (word === "stable") return one && na > 0;
+  return one && (word !== "disc" || na === 1 || na === 2);
+}
+
+const origin = () => BEGIN.origins[look.experiment] + state.window[0] * BEGIN.dt;
+
+// ---- constraints on the plots: each has a box in the units of its plot, and handles
 
 const round = (value) => Number(value.toPrecision(5));
 const REACH = { through: "static", range: "static", dead_zone: "static", saturation: "static", step_band: "step", disc: "poles" };
@@ -145,7 +182,7 @@ function setBox(c, b, chart) {
   else Object.assign(a, { low: round(clip(b.x0)), high: round(clip(b.x1)) });
 }
 const finite = (v) => (Number.isFinite(v) ? round(v) : null);
-const mine = (chart) => state.constraints.filter((c) => REACH[c.word] === chart.tool && (c.arguments.channel ?? null) === (chart.channel ?? null));
+const mine = (chart) => state.constraints.filter((c) => REACH[c.word] === chart.tool && ["channel", "output"].every((key) => (c.arguments[key] ?? chart[key]) === chart[key]));
 const priced = (c) => shown?.prices.find((p) => p.name === c.name);
 
 function pixels(c, chart, f) {
@@ -174,7 +211,7 @@ function hands(chart, f) {
   });
 }
 
-// What a press at a place takes hold of: [constraint, the edges that move].
+// Return what the mouse grabs at a place: [constraint, the edges that move].
 function held(chart, x, y, f) {
   for (const c of [...mine(chart)].reverse()) {
     const p = pixels(c, chart, f), mx = (p.x0 + p.x1) / 2, my = (p.y0 + p.y1) / 2, near = 8;
@@ -193,8 +230,10 @@ function grab(event, x, y, f, kept) {
   if (!c && mode === "Zoom") return false;
   if (!c && mode === "Window") range = ux;
   else if (!c) {
-    const word = { Point: "through", Corridor: "range", Flat: "dead_zone", Band: "step_band", Disc: "disc" }[mode], extra = chart.channel ? { channel: chart.channel } : {};
-    c = { word, name: fresh(mode.toLowerCase()), arguments: { ...extra } };
+    const word = MODES[chart.tool][mode];
+    c = { word, name: fresh(mode.toLowerCase()), arguments: {} };
+    if (chart.channel) c.arguments.channel = chart.channel;
+    if (chart.output && word !== "dead_zone") c.arguments.output = chart.output;
     setBox(c, { x0: ux, x1: ux, y0: uy, y1: uy }, chart);
     edges = word === "through" ? ["x0", "x1", "y0", "y1"] : word === "disc" ? ["radius"] : ["x1", "y1"];
     state.constraints.push(c);
@@ -221,7 +260,7 @@ function grab(event, x, y, f, kept) {
     svg.removeEventListener("pointercancel", end);
     dragged = false;
     if (range !== null) {
-      const ends = [range, fixed.unx(plot.place(e)[0])].sort((p, q) => p - q).map((v) => Math.round((v - BEGIN.origin) / BEGIN.dt));
+      const ends = [range, fixed.unx(plot.place(e)[0])].sort((p, q) => p - q).map((v) => Math.round((v - BEGIN.origins[look.experiment]) / BEGIN.dt));
       if (ends[1] - ends[0] > 9) change((s) => { s.window = [Math.max(ends[0], 0), Math.min(ends[1], BEGIN.samples)]; });
       return;
     }
@@ -235,7 +274,7 @@ function grab(event, x, y, f, kept) {
   return true;
 }
 
-// Whether a constraint is large enough to be meant.
+// Whether a constraint is large enough to be intended.
 function ready(c) {
   const a = c.arguments;
   return c.word === "through" || (c.word === "disc" ? a.radius > 0.01 : c.word === "dead_zone" ? a.low < a.high : c.word === "saturation" || (a.low < a.high && (c.word === "step_band" || a.first < a.last)));
@@ -255,19 +294,34 @@ function field(label, control) {
   return element("div", { class: "field" }, element("label", { for: id }, label), control);
 }
 
-function tick(label, on, act) { return element("label", {}, Object.assign(element("input", { type: "checkbox", onchange: (e) => act(e.target.checked) }), { checked: on }), label); }
+function tick(label, on, act, disabled = false) { return element("label", {}, Object.assign(element("input", { type: "checkbox", disabled, onchange: (e) => act(e.target.checked) }), { checked: on }), label); }
+
+// A list to choose from, where there are several.
+function selection(label, options, chosen, act) {
+  if (options.length < 2) return [];
+  return [field(label, element("select", { onchange: (e) => act(e.target.value) }, ...options.map(([value, name]) => element("option", { value, selected: value === chosen }, name))))];
+}
+
+// The number in a field; an empty or invalid field returns to its last valid value.
+function numberIn(box, last) {
+  if (box.value === "" || !box.validity.valid) box.value = last;
+  return Number(box.value);
+}
 
 function controls() {
   at("undo").disabled = !past.length;
   at("redo").disabled = !future.length;
-  if (document.activeElement?.closest("#controls") && document.activeElement.dataset.typing) return constraintList();
   const names = [["inputs", "Input"], ["outputs", "Output"]];
   at("channels").replaceChildren(...names.map(([key, label]) => element("div", { class: "field" }, element("span", {}, label),
     element("div", { class: "ticks", style: "grid-template-columns: 1fr" }, ...BEGIN[key].map((name) => tick(name, state[key].includes(name), (on) =>
       change((s) => { s[key] = BEGIN[key].filter((n) => (n === name ? on : s[key].includes(n))); })))))));
   [["first", 0], ["last", 1]].forEach(([id, k]) => { at(id).value = state.window[k]; at(id).max = BEGIN.samples; });
-  const choose = element("select", { onchange: (e) => change((s) => { s.formulation = e.target.value; s.arguments = fitting(s); }) }, ...BEGIN.formulations.map((name) => element("option", { value: name, selected: name === state.formulation }, name)));
-  at("model").replaceChildren(field("Formulation", choose), ...takes(state.formulation).map((key) => {
+  if (!state.outputs.includes(look.output)) look.output = state.outputs[0];
+  at("look").replaceChildren(
+    ...selection("Experiment", BEGIN.origins.map((_, k) => [k, `${k + 1} of ${BEGIN.origins.length}`]), look.experiment, (k) => { look.experiment = Number(k); view = null; refit(); }),
+    ...selection("Output drawn", state.outputs.map((name) => [name, name]), look.output, (name) => { look.output = name; refit(); }));
+  const formulation = selection("Formulation", BEGIN.formulations.map((name) => [name, name]), state.formulation, (name) => change((s) => { s.formulation = name; s.arguments = fitting(s); }));
+  at("model").replaceChildren(...formulation, ...takes(state.formulation).map((key) => {
     const value = state.arguments[key], box = element("input", { type: "text", value: value === undefined ? "" : Array.isArray(value) ? value.join(" ") : value, onchange: (e) => change((s) => { s.arguments[key] = read(e.target.value); }) });
     return field(ORDERS[key], box);
   }));
@@ -276,7 +330,7 @@ function controls() {
     return tick(label, state.constraints.some(same), (on) => change((s) => {
       s.constraints = s.constraints.filter((c) => !same(c));
       if (on) s.constraints.push({ word, name: label, arguments: given ? { ...given } : saturated() });
-    }));
+    }), !accepts(word) && !state.constraints.some(same));
   }));
   constraintList();
 }
@@ -306,7 +360,7 @@ function constraintList() {
       element("header", {}, c.name, element("button", { type: "button", "aria-label": `Remove ${c.name}`, onclick: () => change((s) => s.constraints.splice(k, 1)) }, "×")),
       element("div", { class: "price" }, says),
       element("div", { class: "numbers" }, ...numbers.map(([key, value]) => element("label", {}, key, element("input", { type: "number", step: "any", value, onchange: (e) => {
-        const typed = Number(e.target.value);
+        const typed = numberIn(e.target, value);
         e.target.blur();
         change((s) => { s.constraints[k].arguments[key] = typed; });
       } })))));
@@ -323,11 +377,12 @@ function pinList() {
 
 // ---- diagnosis
 
-const without = new Set(), kinds = new Set(["bias", "loss", "spike"]);
+const without = new Set(), kinds = new Set(["bias", "loss", "spike"]), span = [0, BEGIN.samples];
+let latest = 0;
 async function diagnose() {
   at("diagnose").disabled = true;
-  const asked = { state, kinds: [...kinds], without: [...without], window: [Number(at("from").value), Number(at("to").value)] };
-  const found = await ask("diagnose", asked).catch((error) => ({ error: String(error) }));
+  const number = ++latest, found = await ask("diagnose", { kinds: [...kinds], without: [...without], window: span });
+  if (number !== latest) return; // a newer diagnosis has been requested
   at("diagnose").disabled = false;
   at("faults").hidden = false;
   at("found").replaceChildren(...(found.error ? [element("p", { role: "alert" }, found.error)] : [
@@ -344,7 +399,7 @@ async function diagnose() {
 // ---- start
 
 async function save(what) {
-  const found = await ask("export", { what, state });
+  const found = await ask("export", { what });
   if (found.error) { at("trouble").textContent = found.error; return; }
   const link = element("a", { href: URL.createObjectURL(new Blob([found.text])), download: found.name });
   link.click();
@@ -355,9 +410,9 @@ themeButton();
 at("undo").addEventListener("click", () => travel(past, future));
 at("redo").addEventListener("click", () => travel(future, past));
 at("pin").addEventListener("click", () => { if (!shown) return; pins.push({ ...shown, name: `pin ${pins.length + 1}`, charts: [...shown.charts, ...shown.time] }); pinList(); show(shown); });
-[["first", 0], ["last", 1]].forEach(([id, k]) => at(id).addEventListener("change", (e) => change((s) => { s.window[k] = Number(e.target.value); })));
+[["first", 0], ["last", 1]].forEach(([id, k]) => at(id).addEventListener("change", (e) => change((s) => { s.window[k] = numberIn(e.target, s.window[k]); })));
+[["from", 0], ["to", 1]].forEach(([id, k]) => { at(id).value = span[k]; at(id).addEventListener("change", (e) => { span[k] = numberIn(e.target, span[k]); }); });
 document.querySelectorAll("[data-export]").forEach((one) => one.addEventListener("click", () => save(one.dataset.export)));
-at("from").value = 0; at("to").value = BEGIN.samples;
 at("kinds").replaceChildren(...KINDS.map((kind) => tick(kind, kinds.has(kind), (on) => (on ? kinds.add(kind) : kinds.delete(kind)))));
 at("diagnose").addEventListener("click", diagnose);
 ["from", "to", "kinds"].forEach((id) => at(id).addEventListener("change", () => at("faults").hidden || diagnose()));
