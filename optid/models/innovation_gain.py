@@ -7,7 +7,8 @@ likelihood (Fisher scoring).
 """
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -26,40 +27,103 @@ NUMBERS = 200_000  # entries of the sensitivities formed at a time
 NO_FUNCTIONS = tabulated(())
 
 
-def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequence[Array] | None = None,
-            arrived: float = ARRIVED) -> tuple[Array, Array]:
-    """Return the gain (n, l) that minimises the determinant of the covariance (l, l) of its innovations, and this one.
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """A gain, and the innovations of a record under it from the initial states that fit best."""
+
+    gain: Array  # (n, l)
+    radius: float  # spectral radius of A - K C
+    parts: Parts
+    # (n,) of every experiment, in units of the residuals; None where they were found in others
+    starts: list[Array] | None
+    errors: list[Array]  # innovations (N, l) of every experiment
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (l, l) of the innovations."""
+        return covariance_of(self.errors)
+
+    @cached_property
+    def log_determinant(self) -> float:
+        """Logarithm of its determinant, ``-inf`` where that is not positive."""
+        sign, value = np.linalg.slogdet(self.covariance)
+        return float(value) if sign > 0 else -np.inf
+
+    @cached_property
+    def root(self) -> Array:
+        """Matrix (l, l) that whitens the innovations."""
+        return _whitening(self.covariance)
+
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """Likelihood of the gain of a model (A, C), the initial state of every experiment eliminated."""
+
+    A: Array  # (n, n)
+    C: Array  # (l, n)
+    rest: Sequence[Array]  # (N, l) what the known signals leave of the outputs, one per experiment; NaN = missing
+
+    @cached_property
+    def root(self) -> Array:
+        """Diagonal matrix (l, l) that divides every output by the size of its residuals."""
+        return _whitening(np.diag(np.maximum(np.diag(covariance_of(self.rest)), np.finfo(float).tiny)))
+
+    def at(self, gain: Array, before: Predictor | None = None) -> Predictor:
+        """Return the predictor of a gain (n, l); innovations beyond the range of numbers are a `DataError`.
+
+        With the predictor before a step, an unstable gain is replaced by the stable one of the same spectrum, and the
+        initial states minimise the squared innovations in units of that predictor's covariance, in place of the size
+        of the residuals. The units of a single output cancel.
+        """
+        radius = spectral_radius(self.A - gain @ self.C)
+        if before is not None and radius >= 1:
+            gain = _stable(self.A, self.C, gain, before.covariance)
+            radius = spectral_radius(self.A - gain @ self.C)
+        parts = _parts(self.A, self.C, gain)
+        starts = _initial(parts, radius, self.rest, self.root if before is None else before.root)
+        return Predictor(gain, radius, parts, starts if before is None or len(self.C) == 1 else None,
+                         innovations(parts, self.rest, starts))
+
+    def equations(self, found: Predictor) -> tuple[Array, Array]:
+        """Return the normal equations of a step in the gain (row by row), states eliminated, errors whitened."""
+        n, size = found.gain.shape[0], found.gain.size
+        total = np.zeros((size + 1, size + 1))
+        starts = found.starts or _initial(found.parts, found.radius, self.rest, self.root)
+        for r, x0 in zip(self.rest, starts):
+            moments = _moments(found.parts, r, x0, found.root, size)
+            total += moments[n:, n:] - moments[n:, :n] @ _solved(moments[:n, :n], moments[:n, n:])
+        return total[:-1, :-1], -total[:-1, -1]
+
+
+def refined(likelihood: Likelihood, found: Predictor, part: Likelihood | None = None, arrived: float = ARRIVED
+            ) -> Predictor:
+    """Return the predictor whose gain minimises the determinant of the covariance of its innovations.
 
     A step (Levenberg-Marquardt) that makes the predictor unstable is replaced by the stable gain of the same spectrum.
 
     Args:
-        A: (n, n).
-        C: (l, n).
-        gain: (n, l) start.
-        rest: (N, l) what the known signals leave of the outputs, one array per experiment; NaN = missing.
-        part: of rest, whose mean information about the gain serves at every step, near an optimum.
+        likelihood: of the gain.
+        found: predictor to start from.
+        part: likelihood of a part of the record, whose mean information serves at every step, near an optimum.
         arrived: gain of the log-likelihood still to be expected at which the search ends.
     """
-    errors = whitened(A, C, gain, rest)
-    best, damping, before = covariance_of(errors), 1e-4, 0.0
-    half = sum(np.count_nonzero(~np.isnan(r)) for r in rest) / (2 * len(C))
+    damping, before = 1e-4, 0.0
+    half = sum(np.count_nonzero(~np.isnan(r)) for r in likelihood.rest) / (2 * len(likelihood.C))
     if part is not None:
-        normal, _ = _equations(A, C, gain, part, innovations_covariance(A, C, gain, part))
-        normal *= sum(map(len, rest)) / sum(map(len, part))
+        normal, _ = part.equations(part.at(found.gain))
+        normal *= sum(map(len, likelihood.rest)) / sum(map(len, part.rest))
     for _ in range(STEPS):
         if part is None:
-            normal, right = _equations(A, C, gain, rest, best)
+            normal, right = likelihood.equations(found)
         else:
-            right = _slope(A, C, gain, errors)
+            right = _slope(likelihood.A, likelihood.C, found.gain, found.errors)
         promised, gained = np.inf, 0.0
         while not gained > 0 and promised > arrived:
             step = _solved(normal + damping * np.diag(np.diag(normal)), right)
             promised = 0.5 * float(right @ step)
-            trial = _stable(A, C, gain + step.reshape(gain.shape), best)
             try:
-                errors = whitened(A, C, trial, rest, best)
-                covariance = covariance_of(errors)
-                gained = half * (log_determinant(best) - log_determinant(covariance))
+                trial = likelihood.at(found.gain + step.reshape(found.gain.shape), found)
+                gained = half * (found.log_determinant - trial.log_determinant)
             except DataError:  # stable, but not before its run has left the range of numbers
                 gained = -np.inf
             if gained > 0.75 * promised:
@@ -68,23 +132,12 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequen
                 damping = max(10 * damping, FIRM)
         if not gained > 0:
             break
-        gain, best = trial, covariance
+        found = trial
         rate = promised / before if before and damping < FIRM else 1.0  # undamped steps shrink at a rate, or faster
         if promised * rate < arrived:
             break
         before = promised
-    return gain, best
-
-
-def innovations_covariance(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
-    """Covariance (l, l) of the innovations under a gain."""
-    return covariance_of(whitened(A, C, gain, rest))
-
-
-def whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
-    """Innovations (N, l) of every experiment under a gain, with the initial state that fits best, see `_initial`."""
-    parts = _parts(A, C, gain)
-    return innovations(parts, rest, _initial(parts, rest, covariance))
+    return found
 
 
 def innovations(parts: Parts, rest: Sequence[Array], starts: Sequence[Array]) -> list[Array]:
@@ -100,6 +153,8 @@ def covariance_of(signals: Sequence[Array]) -> Array:
     """
     sums, pairs = _products(signals)
     found = sums / np.maximum(pairs, 1.0)
+    if len(found) == 1:
+        return found
     found = (found + found.T) / 2
     values = np.linalg.eigvalsh(found)
     if values[0] < -1e-12 * abs(values[-1]):
@@ -123,16 +178,8 @@ def _products(signals: Sequence[Array]) -> tuple[Array, Array]:
     return sums, pairs
 
 
-def log_determinant(covariance: Array) -> float:
-    """Logarithm of the determinant, ``-inf`` where it is not positive."""
-    sign, value = np.linalg.slogdet(covariance)
-    return float(value) if sign > 0 else -np.inf
-
-
 def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
     """Return the gain of the same spectrum that makes A - K C stable."""
-    if spectral_radius(A - gain @ C) < 1:
-        return gain
     try:
         level = covariance + 1e-12 * np.trace(covariance) * np.eye(len(C))
         return np.array(kalman_gain(A, C, gain @ level @ gain.T, level, gain @ level).K)
@@ -164,15 +211,14 @@ def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
     return outputs
 
 
-def _initial(parts: Parts, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
-    """Initial states (n,) that minimise the squared innovations, which are affine in them.
+def _initial(parts: Parts, radius: float, rest: Sequence[Array], root: Array) -> list[Array]:
+    """Initial states (n,) that minimise the squared innovations times a root (l, l), which are affine in them.
 
-    The innovations are in units of a covariance (l, l); without one every output counts by the size of its residuals.
+    The spectral radius of A - K C tells after how many samples they are forgotten.
     """
-    if covariance is None:
-        covariance = np.diag(np.maximum(np.diag(covariance_of(rest)), np.finfo(float).tiny))
-    n, radius, root = len(parts.A), spectral_radius(parts.A - parts.K @ parts.C), _whitening(covariance)
-    settled = None if radius >= 1 else n + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
+    n, settled = len(parts.A), None
+    if radius < 1:
+        settled = n + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
     with np.errstate(over="ignore", invalid="ignore"):
         found = [_moments(parts, r[:settled], np.zeros(n), root, 0) for r in rest]
     if not np.all(np.isfinite(found)):
@@ -202,16 +248,6 @@ def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
         _run(adjoint, np.where(missing, np.nan, present @ weight), np.zeros(len(A)), states)
         slope += states.T @ present
     return slope.ravel()
-
-
-def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array) -> tuple[Array, Array]:
-    """Normal equations of a step in the gain (row by row), errors in units of their covariance, states eliminated."""
-    parts, root, n = _parts(A, C, gain), _whitening(covariance), len(A)
-    total = np.zeros((gain.size + 1, gain.size + 1))
-    for r, x0 in zip(rest, _initial(parts, rest)):
-        moments = _moments(parts, r, x0, root, gain.size)
-        total += moments[n:, n:] - moments[n:, :n] @ _solved(moments[:n, :n], moments[:n, n:])
-    return total[:-1, :-1], -total[:-1, -1]
 
 
 def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array:
