@@ -183,7 +183,8 @@ def _block(raw: Array, frame: Frame, expand: Expand, centre: Array, chunk: int) 
             np.subtract(expand(raw[part]), centre, out=inner[part])
         elif not missing[part].all():
             inner[part][~missing[part]] = expand(raw[part][~missing[part]]) - centre
-    valid = np.pad(rows_present([missing], frame.lags, frame.reach), frame.reach)
+    valid = np.zeros(len(raw) + frame.reach, dtype=bool)
+    valid[frame.reach : len(raw)] = rows_present([missing], frame.lags, frame.reach)
     return Block(frame, (Signals.dense(padded),), valid, None, 0)
 
 
