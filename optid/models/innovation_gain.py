@@ -24,6 +24,7 @@ STEPS = 50  # steps at most
 FIRM = 0.01
 ARRIVED = 2e-5  # gain of the log-likelihood of no account; half a unit is one standard error of a parameter
 NUMBERS = 200_000  # entries of the sensitivities formed at a time
+TINY = np.finfo(float).tiny
 NO_FUNCTIONS = tabulated(())
 
 
@@ -66,7 +67,7 @@ class Likelihood:
     @cached_property
     def root(self) -> Array:
         """Diagonal matrix (l, l) that divides every output by the size of its residuals."""
-        return _whitening(np.diag(np.maximum(np.diag(covariance_of(self.rest)), np.finfo(float).tiny)))
+        return _whitening(np.diag(np.maximum(np.diag(covariance_of(self.rest)), TINY)))
 
     def at(self, gain: Array, before: Predictor | None = None) -> Predictor:
         """Return the predictor of a gain (n, l); innovations beyond the range of numbers are a `DataError`.
@@ -263,10 +264,14 @@ def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array
     for first in range(0, len(r), length):
         y = r[first : first + length]
         missing, states, block = np.isnan(y), np.empty((len(y), n)), np.empty((len(y), l, n + size + 1))
-        error = np.where(missing, 0.0, _run(parts, y, x, states) - y)
-        returned = np.where(missing[:, None], 0.0, -parts.K)
+        error, returned = _run(parts, y, x, states) - y, np.empty((len(y), n, l))
+        returned[:] = -parts.K
+        if missing.any():
+            error[missing], returned.swapaxes(1, 2)[missing] = 0.0, 0.0
         sensitivities(parts, direct, Signals(returned, np.zeros((len(y), 0)), -error), turn, block)
-        block[missing], block[:, :, -1] = 0.0, error
+        block[:, :, -1] = error
+        if missing.any():
+            block[missing] = 0.0
         rows = (root @ block).reshape(-1, n + size + 1)
         total += rows.T @ rows
     return total
@@ -281,5 +286,7 @@ def _entries_of_gain(n: int, l: int, size: int) -> Direct:  # noqa: E741
 
 def _solved(matrix: Array, right: Array) -> Array:
     """Solve a symmetric system; directions without information stay at zero."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    return (np.linalg.lstsq(matrix / np.outer(scale, scale), (right.T / scale).T, rcond=1e-12)[0].T / scale).T
+    from scipy.linalg.lapack import dgelss  # pyright: ignore[reportAttributeAccessIssue]
+
+    scale = np.sqrt(np.maximum(matrix.diagonal(), TINY))
+    return (dgelss(matrix / np.outer(scale, scale), (right.T / scale).T, cond=1e-12)[1].T / scale).T
