@@ -19,7 +19,7 @@ from optid.identify.noise import (
     with_noise,
 )
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import Likelihood, _parts, _slope, covariance_of, innovations, refined
+from optid.models.innovation_gain import Likelihood, _parts, _run, _slope, covariance_of, refined
 from optid.models.kalman import NoiseCovariances, kalman_gain
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
@@ -229,7 +229,8 @@ def test_the_slope_of_the_likelihood_by_finite_differences(missing):
     count = np.mean(np.sum(~np.isnan(np.vstack(rest)), axis=0))
 
     def errors(flat):  # the initial states stand still
-        return innovations(_parts(A, C, flat.reshape(3, 2)), rest, states)
+        parts = _parts(A, C, flat.reshape(3, 2))
+        return [r - _run(parts, r, x0.copy(), np.empty((0, 3))) for r, x0 in zip(rest, states)]
 
     def loss(flat):
         return count / 2 * np.linalg.slogdet(covariance_of(errors(flat)))[1]

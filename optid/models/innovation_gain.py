@@ -9,6 +9,7 @@ likelihood (Fisher scoring).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,32 +29,16 @@ TINY = np.finfo(float).tiny
 NO_FUNCTIONS = tabulated(())
 
 
-@dataclass(frozen=True, eq=False)
-class Predictor:
+class Predictor(NamedTuple):
     """A gain, and the innovations of a record under it from the initial states that fit best."""
 
     gain: Array  # (n, l)
     radius: float  # spectral radius of A - K C
     parts: Parts
-    # (n,) of every experiment, in units of the residuals; None where they were found in others
-    starts: list[Array] | None
+    starts: list[Array] | None  # initial states (n,) found in units of the residuals; None: in other units
     errors: list[Array]  # innovations (N, l) of every experiment
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (l, l) of the innovations."""
-        return covariance_of(self.errors)
-
-    @cached_property
-    def log_determinant(self) -> float:
-        """Logarithm of its determinant, ``-inf`` where that is not positive."""
-        sign, value = np.linalg.slogdet(self.covariance)
-        return float(value) if sign > 0 else -np.inf
-
-    @cached_property
-    def root(self) -> Array:
-        """Matrix (l, l) that whitens the innovations."""
-        return _whitening(self.covariance)
+    covariance: Array  # (l, l) of the innovations
+    log_determinant: float  # of the covariance, -inf where its determinant is not positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,26 +57,28 @@ class Likelihood:
     def at(self, gain: Array, before: Predictor | None = None) -> Predictor:
         """Return the predictor of a gain (n, l); innovations beyond the range of numbers are a `DataError`.
 
-        With the predictor before a step, an unstable gain is replaced by the stable one of the same spectrum, and the
-        initial states minimise the squared innovations in units of that predictor's covariance, in place of the size
-        of the residuals. The units of a single output cancel.
+        After a step from a predictor an unstable gain is replaced by the stable one of the same spectrum, and the unit
+        of the squared innovations is the covariance of that predictor, not the size of the residuals.
         """
         radius = spectral_radius(self.A - gain @ self.C)
         if before is not None and radius >= 1:
             gain = _stable(self.A, self.C, gain, before.covariance)
             radius = spectral_radius(self.A - gain @ self.C)
         parts = _parts(self.A, self.C, gain)
-        starts = _initial(parts, radius, self.rest, self.root if before is None else before.root)
-        return Predictor(gain, radius, parts, starts if before is None or len(self.C) == 1 else None,
-                         innovations(parts, self.rest, starts))
+        starts = _initial(parts, radius, self.rest, self.root if before is None else _whitening(before.covariance))
+        errors = [r - _run(parts, r, x0.copy(), np.empty((0, x0.size))) for r, x0 in zip(self.rest, starts)]
+        same, covariance = before is None or len(self.C) == 1, covariance_of(errors)  # the unit of one output cancels
+        sign, value = np.linalg.slogdet(covariance)
+        return Predictor(gain, radius, parts, starts if same else None, errors, covariance,
+                         float(value) if sign > 0 else -np.inf)
 
     def equations(self, found: Predictor) -> tuple[Array, Array]:
         """Return the normal equations of a step in the gain (row by row), states eliminated, errors whitened."""
-        n, size = found.gain.shape[0], found.gain.size
+        n, size, root = found.gain.shape[0], found.gain.size, _whitening(found.covariance)
         total = np.zeros((size + 1, size + 1))
         starts = found.starts or _initial(found.parts, found.radius, self.rest, self.root)
         for r, x0 in zip(self.rest, starts):
-            moments = _moments(found.parts, r, x0, found.root, size)
+            moments = _moments(found.parts, r, x0, root, size)
             total += moments[n:, n:] - moments[n:, :n] @ _solved(moments[:n, :n], moments[:n, n:])
         return total[:-1, :-1], -total[:-1, -1]
 
@@ -100,13 +87,9 @@ def refined(likelihood: Likelihood, found: Predictor, part: Likelihood | None = 
             ) -> Predictor:
     """Return the predictor whose gain minimises the determinant of the covariance of its innovations.
 
-    A step (Levenberg-Marquardt) that makes the predictor unstable is replaced by the stable gain of the same spectrum.
-
-    Args:
-        likelihood: of the gain.
-        found: predictor to start from.
-        part: likelihood of a part of the record, whose mean information serves at every step, near an optimum.
-        arrived: gain of the log-likelihood still to be expected at which the search ends.
+    The search (Levenberg-Marquardt) starts from ``found``, near an optimum where a ``part`` of the record is given,
+    whose mean information serves at every step. It ends where the gain of the log-likelihood still to be expected is
+    below ``arrived``.
     """
     damping, before = 1e-4, 0.0
     half = sum(np.count_nonzero(~np.isnan(r)) for r in likelihood.rest) / (2 * len(likelihood.C))
@@ -139,11 +122,6 @@ def refined(likelihood: Likelihood, found: Predictor, part: Likelihood | None = 
             break
         before = promised
     return found
-
-
-def innovations(parts: Parts, rest: Sequence[Array], starts: Sequence[Array]) -> list[Array]:
-    """Innovations (N, l) of every experiment under a gain from initial states (n,)."""
-    return [r - _run(parts, r, x0.copy(), np.empty((0, x0.size))) for r, x0 in zip(rest, starts)]
 
 
 def covariance_of(signals: Sequence[Array]) -> Array:
@@ -188,13 +166,16 @@ def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
         return np.zeros_like(gain)
 
 
-def _parts(A: Array, C: Array, gain: Array, injection: Array | None = None) -> Parts:
-    """A model x+ = A x + L y + K e, y = C x + e as the compiled recursions read it."""
-    n, l = gain.shape  # noqa: E741
-    injected = np.zeros((n, l)) if injection is None else compact(injection)
-    none = [np.zeros(shape) for shape in ((n, 0), (l, 0), (n, 0), (n, 0), (l, 0), (0, n))]
-    matrices = compact(A), none[0], compact(C), none[1], none[2], injected, compact(gain), *none[3:]
-    return Parts._make([*matrices, np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
+def _parts(A: Array, C: Array, gain: Array) -> Parts:
+    """A model x+ = A x + K e, y = C x + e as the compiled recursions read it."""
+    return _without_functions(*gain.shape)._replace(A=compact(A), C=compact(C), K=compact(gain))
+
+
+@cache
+def _without_functions(n: int, l: int) -> Parts:  # noqa: E741
+    """Parts of n states and l outputs that are all zero."""
+    shapes = (n, n), (n, 0), (l, n), (l, 0), (n, 0), (n, l), (n, l), (n, 0), (l, 0), (0, n)
+    return Parts._make([*map(np.zeros, shapes), np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
 
 
 def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
@@ -241,7 +222,8 @@ def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
     sums, pairs = _products(errors)
     root = _whitening(sums / np.maximum(pairs, 1.0))
     weight = root.T @ root * np.mean(np.diag(pairs)) / np.maximum(pairs, 1.0)
-    adjoint, slope = _parts((A - gain @ C).T, gain.T, np.zeros_like(gain), C.T), np.zeros_like(gain)
+    adjoint = _parts((A - gain @ C).T, gain.T, np.zeros_like(gain))._replace(L=compact(C.T))
+    slope = np.zeros_like(gain)
     for e in errors:
         backwards, states = np.ascontiguousarray(e[::-1]), np.empty((len(e), len(A)))
         missing = np.isnan(backwards)
