@@ -19,18 +19,7 @@ from optid.identify.noise import (
     with_noise,
 )
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import (
-    _equations,
-    _initial,
-    _parts,
-    _slope,
-    covariance_of,
-    innovations,
-    innovations_covariance,
-    log_determinant,
-    refined,
-    whitened,
-)
+from optid.models.innovation_gain import Likelihood, _parts, _run, _slope, covariance_of, refined
 from optid.models.kalman import NoiseCovariances, kalman_gain
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
@@ -107,7 +96,7 @@ def test_no_other_gain_predicts_better():
     rest = residuals(bare(model), data)
 
     def loss(gain):
-        return np.linalg.slogdet(innovations_covariance(A, C, gain.reshape(3, 2), rest))[1]
+        return Likelihood(A, C, rest).at(gain.reshape(3, 2)).log_determinant
 
     slope = approx_fprime(found.K.ravel(), loss, 1e-6)
     assert np.abs(slope).max() < 1e-3
@@ -121,9 +110,9 @@ def test_the_normal_equations_are_those_of_a_formed_jacobian():
     model = truth(7)
     data = record(model, (400, 150), missing=0.1)
     rest, gain = residuals(bare(model), data), 0.5 * model.K
-    covariance = innovations_covariance(A, C, gain, rest)
-    weight = np.linalg.inv(np.linalg.cholesky(covariance))
-    starts = _initial(_parts(A, C, gain), rest)
+    likelihood = Likelihood(A, C, rest)
+    found = likelihood.at(gain)
+    weight = np.linalg.inv(np.linalg.cholesky(found.covariance))
 
     def errors(flat):
         e = []
@@ -133,10 +122,10 @@ def test_the_normal_equations_are_those_of_a_formed_jacobian():
                 x = A @ x + flat[:6].reshape(3, 2) @ e[-1]
         return (np.array(e) @ weight.T).ravel()
 
-    start = np.concatenate([gain.ravel(), *starts])
+    start = np.concatenate([gain.ravel(), *found.starts])
     jacobian = np.column_stack([(errors(start + h) - errors(start - h)) / 2e-6 for h in 1e-6 * np.eye(12)])
     step = np.linalg.lstsq(jacobian, -errors(start), rcond=None)[0][:6]
-    assert np.linalg.solve(*_equations(A, C, gain, rest, covariance)) == pytest.approx(step, rel=1e-4, abs=1e-7)
+    assert np.linalg.solve(*likelihood.equations(found)) == pytest.approx(step, rel=1e-4, abs=1e-7)
     weight = np.diag(1 / np.sqrt(np.diag(covariance_of(rest))))  # in which the initial states fit best
     best = np.linalg.norm(errors(start))
     assert all(np.linalg.norm(errors(start + sign * h)) > best for h in 0.01 * np.eye(12)[6:] for sign in (-1, 1))
@@ -236,13 +225,17 @@ def test_missing_inputs_cut_the_record():
 def test_the_slope_of_the_likelihood_by_finite_differences(missing):
     model = truth(7)
     rest, gain = residuals(bare(model), record(model, (3000, 1500), missing=missing)), 0.5 * model.K
-    states = _initial(_parts(A, C, gain), rest)
+    states = Likelihood(A, C, rest).at(gain).starts
     count = np.mean(np.sum(~np.isnan(np.vstack(rest)), axis=0))
 
     def errors(flat):  # the initial states stand still
-        return innovations(_parts(A, C, flat.reshape(3, 2)), rest, states)
+        parts = _parts(A, C, flat.reshape(3, 2))
+        return [r - _run(parts, r, x0.copy(), np.empty((0, 3))) for r, x0 in zip(rest, states)]
 
-    slope = approx_fprime(gain.ravel(), lambda flat: count / 2 * log_determinant(covariance_of(errors(flat))), 1e-7)
+    def loss(flat):
+        return count / 2 * np.linalg.slogdet(covariance_of(errors(flat)))[1]
+
+    slope = approx_fprime(gain.ravel(), loss, 1e-7)
     assert _slope(A, C, gain, errors(gain.ravel())) == pytest.approx(-slope, rel=1e-4, abs=1e-2)
 
 
@@ -260,12 +253,11 @@ def test_the_search_in_a_part_first_ends_where_the_search_in_all_does(lengths, m
     part = _part(rest, C.size)
     assert 3000 < sum(map(len, part)) < 0.5 * sum(lengths)
     assert all(any(np.shares_memory(p, r) for r in rest) for p in part)
-    searched = _most_likely(A, C, rest)
-    whole = [refined(A, C, gain, rest) for gain in (model.K, np.zeros((3, 2)))]
-    best = min(log_determinant(innovations_covariance(A, C, gain, rest)) for gain, _ in whole)
-    found = log_determinant(innovations_covariance(A, C, searched[0], rest))
-    assert sum(lengths) / 2 * (found - best) < 0.01
-    assert np.max(np.abs(np.linalg.eigvals(A - searched[0] @ C))) < 1
+    searched, likelihood = _most_likely(A, C, rest).gain, Likelihood(A, C, rest)
+    whole = [refined(likelihood, likelihood.at(gain)).gain for gain in (model.K, np.zeros((3, 2)))]
+    found, *others = (likelihood.at(gain).log_determinant for gain in (searched, *whole))
+    assert sum(lengths) / 2 * (found - min(others)) < 0.01
+    assert np.max(np.abs(np.linalg.eigvals(A - searched @ C))) < 1
 
 
 def test_a_part_that_shows_too_little_is_not_searched():
@@ -292,10 +284,11 @@ def test_the_autoregression_of_the_errors_of_an_observer_shows_the_gain():
 
 def test_a_stable_gain_whose_run_leaves_the_range_of_numbers_is_refused():
     A, C, rest = np.array([[0.0, 1e200], [0.0, 0.0]]), np.array([[1.0, 1.0]]), [np.ones((20, 1))]
-    refuses(DataError, "range of numbers", whitened, A, C, np.zeros((2, 1)), rest)
+    refuses(DataError, "range of numbers", Likelihood(A, C, rest).at, np.zeros((2, 1)))
 
 
 def test_a_start_whose_innovations_leave_the_range_of_numbers_is_left_out():
     """Without a gain the state of a plant of pole 1.5 grows beyond all numbers; with those of observers it does not."""
-    starts = _starts(np.array([[1.5]]), np.array([[1.0]]), [np.random.default_rng(0).normal(size=(3000, 1))])
-    assert starts and all(abs(1.5 - float(gain[0, 0])) < 1 for gain in starts)
+    rest = [np.random.default_rng(0).normal(size=(3000, 1))]
+    starts = _starts(Likelihood(np.array([[1.5]]), np.array([[1.0]]), rest))
+    assert starts and all(abs(1.5 - float(found.gain[0, 0])) < 1 for found in starts)

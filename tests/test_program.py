@@ -173,6 +173,7 @@ def test_a_programme_that_is_not_stated_is_judged_as_one_that_is(gauge):
     found, twin = (fit(record(noise=0.1), "hammerstein_arx.exact", na=2, nb=2, nk=1, basis=Polynomial(3), gauge=gauge)
                    for _ in range(2))
     program, at, stated = found.program, found.solution.values, replace(twin.program)
+    assert (program.kind, program.size) == (stated.kind, stated.size)
     assert found.solution.proof and stated.is_stated and not program.is_stated and program.shapes == stated.shapes
     for point in (at, {**at, "b": 1.1 * at["b"]}, {**at, "mu": at["mu"] + 0.1}, {**at, "a": at["a"] - 0.05}):
         (values, value, ours), (others, same, theirs) = (judge(one, point, {}) for one in (program, stated))

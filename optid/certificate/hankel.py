@@ -13,6 +13,7 @@ errors below it, and a free run feeds its own outputs back, for which phi is not
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -82,8 +83,10 @@ def hankel_bounds(records: Sequence[Array], expand: Expand | None, *, inputs: Se
         raise StructureError(f"the bound needs at least two block rows; got {block_rows!r}")
     scales = np.ones(len(outputs)) if weights is None else np.asarray(weights, dtype=float)
     values, energy = np.zeros((len(tried), largest + 1)), -1.0
+    centre: Any = "mean"
     for position, alpha in enumerate(tried):
-        statistics = hankel_statistics(records, alpha, expand, centre="mean")
+        statistics = hankel_statistics(records, alpha, expand, centre=centre)
+        centre = statistics.centre
         known = np.concatenate([[0], statistics.at(inputs), statistics.at(feedback, range(alpha - 1))]).astype(int)
         order = np.concatenate([known, statistics.at(outputs)])
         if statistics.windows <= known.size:

@@ -11,7 +11,7 @@ determine the spectrum, hence K and Re.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from operator import itemgetter
+from operator import attrgetter
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,8 +24,9 @@ from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.lazy import public_names
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import covariance_of, log_determinant, refined, whitened
+from optid.models.innovation_gain import Likelihood, Predictor, covariance_of, refined
 from optid.models.kalman import NoiseCovariances, kalman_gain
+from optid.models.roots import spectral_radius
 from optid.models.state_space import StateSpace
 from optid.statistics.coloured import long_autoregression, response_of
 from optid.statistics.hankel import complete_runs
@@ -40,6 +41,7 @@ TRIED = 2  # observers whose errors are whitened, and then starts that are refin
 BLOCK, BLOCKS, PER_ENTRY = 2048, 2, 50
 # gain of the log-likelihood that is negligible in a part of a record, and difference between two optima of it
 NEARLY, ELSEWHERE = 0.1, 1.0
+LIKELIEST = attrgetter("log_determinant")  # key of predictors
 
 
 def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
@@ -54,10 +56,12 @@ def with_noise(model: HammersteinSS, data: Data) -> HammersteinSS:
     """
     observer = _observer(model)
     data = between_gaps(data.without_transform(), 2 * model.nx + 1)
-    rest = residuals(replace(model, K=observer, noise=None), data)
+    bare = model.noise is None and np.array_equal(model.K, observer)
+    rest = residuals(model if bare else replace(model, K=observer, noise=None), data)
     gain, covariance = np.zeros_like(observer), covariance_of(rest)
     if _largest(rest) > ROUNDING * _largest([e.y for e in data.experiments]):
-        gain, covariance = _most_likely(model.A - observer @ model.C, model.C, rest)
+        found = _most_likely(model.A - observer @ model.C, model.C, rest)
+        gain, covariance = found.gain, found.covariance
     return replace(model, K=observer + gain, noise=NoiseCovariances.of_innovations(observer + gain, covariance))
 
 
@@ -131,19 +135,18 @@ def _largest(signals: Sequence[Array]) -> float:
     return max(float(np.nanmax(np.abs(s), initial=0.0)) for s in signals)
 
 
-def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> tuple[Array, Array]:
-    """Gain and covariance of the innovations of the largest likelihood; a long record is first searched in part."""
-    part = _part(rest, C.size)
-    starts = _starts(A, C, part)[:TRIED]
-    if part is rest:
-        found = [refined(A, C, gain, rest) for gain in starts]
+def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> Predictor:
+    """Predictor of the largest likelihood; a long record is first searched in part."""
+    part, whole = Likelihood(A, C, _part(rest, C.size)), Likelihood(A, C, rest)
+    starts = _starts(part)[:TRIED]
+    if part.rest is rest:
+        found = [refined(part, start) for start in starts]
     else:
-        found = [refined(A, C, gain, part, arrived=NEARLY) for gain in starts]
-        found.sort(key=lambda pair: log_determinant(pair[1]))
-        same = log_determinant(found[0][1]) + 2 * ELSEWHERE / sum(map(len, part))
-        optima = [found[0][0], *(gain for gain, covariance in found[1:] if log_determinant(covariance) > same)]
-        found = [refined(A, C, gain, rest, part) for gain in optima]
-    return min(found, key=lambda pair: log_determinant(pair[1]))
+        found = sorted((refined(part, start, arrived=NEARLY) for start in starts), key=LIKELIEST)
+        same = found[0].log_determinant + 2 * ELSEWHERE / sum(map(len, part.rest))
+        optima = [found[0], *(other for other in found[1:] if other.log_determinant > same)]
+        found = [refined(whole, whole.at(optimum.gain), part) for optimum in optima]
+    return min(found, key=LIKELIEST)
 
 
 def _part(rest: Sequence[Array], entries: int) -> Sequence[Array]:
@@ -156,12 +159,9 @@ def _part(rest: Sequence[Array], entries: int) -> Sequence[Array]:
     return part if total > 2 * wanted and shown else rest
 
 
-def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
-    """Gains to start from, the best first: of observers, and from the whitening of the errors of the best of them."""
-    def measured(gain: Array) -> tuple[float, Array, list[Array]]:
-        errors = whitened(A, C, gain, rest)
-        return log_determinant(covariance_of(errors)), gain, errors
-
+def _starts(likelihood: Likelihood) -> list[Predictor]:
+    """Predictors to start from, the best first: observers, and the whitening of the errors of the best of them."""
+    A, C = likelihood.A, likelihood.C
     observers: list[Array] = [np.zeros((len(A), len(C)))]
     for ratio in RATIOS:
         with suppress(StructureError):
@@ -169,14 +169,14 @@ def _starts(A: Array, C: Array, rest: Sequence[Array]) -> list[Array]:
     found = []
     for gain in observers:
         with suppress(DataError):  # innovations that leave the range of numbers
-            found.append(measured(gain))
+            found.append(likelihood.at(gain))
     if not found:
         raise DataError("the noise model is not determined: the innovations leave the range of numbers")
-    found.sort(key=itemgetter(0))
-    for _, gain, errors in found[:TRIED]:
+    found.sort(key=LIKELIEST)
+    for observer in found[:TRIED]:
         with suppress(StructureError, DataError, ValueError):  # too few in a row, or a zero on the unit circle
-            found.append(measured(whitening_gain(A, C, gain, errors)))
-    return [gain for _, gain, _ in sorted(found, key=itemgetter(0))]
+            found.append(likelihood.at(whitening_gain(A, C, observer.gain, observer.errors)))
+    return sorted(found, key=LIKELIEST)
 
 
 def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
@@ -197,6 +197,8 @@ def whitening_gain(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> 
     unit = np.tile(spread, lags)[:, None]
     change = np.linalg.lstsq(np.vstack(powers) / unit, response[1:].reshape(-1, l) / unit, rcond=None)[0]
     K, covariance = gain + change, root.T @ root
+    if spectral_radius(A - K @ C) < 1:  # the Riccati equation has the solution zero
+        return K
     return np.array(kalman_gain(A, C, K @ covariance @ K.T, covariance, K @ covariance).K)
 
 

@@ -72,7 +72,8 @@ def state_like(x0: Any, shape: tuple[int, ...]) -> Array:
 
 def signal_units(y: Array) -> Array:
     """Standard deviation (l,) of every output, missing samples aside; one where it is zero or unknown."""
-    units = np.array([np.nanstd(column) if np.isfinite(column).any() else 0.0 for column in y.T])
+    present = [column[np.isfinite(column)] for column in y.T]
+    units = np.array([column.std() if column.size else 0.0 for column in present])
     units[units == 0] = 1.0
     return units
 

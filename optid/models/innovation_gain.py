@@ -7,7 +7,9 @@ likelihood (Fisher scoring).
 """
 
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,43 +25,89 @@ STEPS = 50  # steps at most
 FIRM = 0.01
 ARRIVED = 2e-5  # negligible gain of the log-likelihood; half a unit is one standard error of a parameter
 NUMBERS = 200_000  # entries of the sensitivities formed at a time
+TINY = np.finfo(float).tiny
 NO_FUNCTIONS = tabulated(())
 
 
-def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequence[Array] | None = None,
-            arrived: float = ARRIVED) -> tuple[Array, Array]:
-    """Return the gain (n, l) that minimises the determinant of the covariance (l, l) of its innovations, and this one.
+class Predictor(NamedTuple):
+    """A gain, and the innovations of a record under it from the initial states that fit best."""
 
-    A step (Levenberg-Marquardt) that makes the predictor unstable is replaced by the stable gain of the same spectrum.
+    gain: Array  # (n, l)
+    radius: float  # spectral radius of A - K C
+    parts: Parts
+    starts: list[Array] | None  # initial states (n,) found in units of the residuals; None: in other units
+    errors: list[Array]  # innovations (N, l) of every experiment
+    covariance: Array  # (l, l) of the innovations
+    log_determinant: float  # of the covariance, -inf where its determinant is not positive
 
-    Args:
-        A: (n, n).
-        C: (l, n).
-        gain: (n, l) start.
-        rest: (N, l) what the known signals leave of the outputs, one array per experiment; NaN = missing.
-        part: of rest, whose mean information about the gain serves at every step, near an optimum.
-        arrived: gain of the log-likelihood still to be expected at which the search ends.
+
+@dataclass(frozen=True, eq=False)
+class Likelihood:
+    """Likelihood of the gain of a model (A, C), the initial state of every experiment eliminated."""
+
+    A: Array  # (n, n)
+    C: Array  # (l, n)
+    rest: Sequence[Array]  # (N, l) what the known signals leave of the outputs, one per experiment; NaN = missing
+
+    @cached_property
+    def root(self) -> Array:
+        """Diagonal matrix (l, l) that divides every output by the size of its residuals."""
+        return _whitening(np.diag(np.maximum(np.diag(covariance_of(self.rest)), TINY)))
+
+    def at(self, gain: Array, before: Predictor | None = None) -> Predictor:
+        """Return the predictor of a gain (n, l); innovations beyond the range of numbers are a `DataError`.
+
+        After a step from a predictor an unstable gain is replaced by the stable one of the same spectrum, and the unit
+        of the squared innovations is the covariance of that predictor, not the size of the residuals.
+        """
+        radius = spectral_radius(self.A - gain @ self.C)
+        if before is not None and radius >= 1:
+            gain = _stable(self.A, self.C, gain, before.covariance)
+            radius = spectral_radius(self.A - gain @ self.C)
+        parts = _parts(self.A, self.C, gain)
+        starts = _initial(parts, radius, self.rest, self.root if before is None else _whitening(before.covariance))
+        errors = [r - _run(parts, r, x0.copy(), np.empty((0, x0.size))) for r, x0 in zip(self.rest, starts)]
+        same, covariance = before is None or len(self.C) == 1, covariance_of(errors)  # the unit of one output cancels
+        sign, value = np.linalg.slogdet(covariance)
+        return Predictor(gain, radius, parts, starts if same else None, errors, covariance,
+                         float(value) if sign > 0 else -np.inf)
+
+    def equations(self, found: Predictor) -> tuple[Array, Array]:
+        """Return the normal equations of a step in the gain (row by row), states eliminated, errors whitened."""
+        n, size, root = found.gain.shape[0], found.gain.size, _whitening(found.covariance)
+        total = np.zeros((size + 1, size + 1))
+        starts = found.starts or _initial(found.parts, found.radius, self.rest, self.root)
+        for r, x0 in zip(self.rest, starts):
+            moments = _moments(found.parts, r, x0, root, size)
+            total += moments[n:, n:] - moments[n:, :n] @ _solved(moments[:n, :n], moments[:n, n:])
+        return total[:-1, :-1], -total[:-1, -1]
+
+
+def refined(likelihood: Likelihood, found: Predictor, part: Likelihood | None = None, arrived: float = ARRIVED
+            ) -> Predictor:
+    """Return the predictor whose gain minimises the determinant of the covariance of its innovations.
+
+    The search (Levenberg-Marquardt) starts from ``found``, near an optimum where a ``part`` of the record is given,
+    whose mean information serves at every step. It ends where the gain of the log-likelihood still to be expected is
+    below ``arrived``.
     """
-    errors = whitened(A, C, gain, rest)
-    best, damping, before = covariance_of(errors), 1e-4, 0.0
-    half = sum(np.count_nonzero(~np.isnan(r)) for r in rest) / (2 * len(C))
+    damping, before = 1e-4, 0.0
+    half = sum(np.count_nonzero(~np.isnan(r)) for r in likelihood.rest) / (2 * len(likelihood.C))
     if part is not None:
-        normal, _ = _equations(A, C, gain, part, innovations_covariance(A, C, gain, part))
-        normal *= sum(map(len, rest)) / sum(map(len, part))
+        normal, _ = part.equations(part.at(found.gain))
+        normal *= sum(map(len, likelihood.rest)) / sum(map(len, part.rest))
     for _ in range(STEPS):
         if part is None:
-            normal, right = _equations(A, C, gain, rest, best)
+            normal, right = likelihood.equations(found)
         else:
-            right = _slope(A, C, gain, errors)
+            right = _slope(likelihood.A, likelihood.C, found.gain, found.errors)
         promised, gained = np.inf, 0.0
         while not gained > 0 and promised > arrived:
             step = _solved(normal + damping * np.diag(np.diag(normal)), right)
             promised = 0.5 * float(right @ step)
-            trial = _stable(A, C, gain + step.reshape(gain.shape), best)
             try:
-                errors = whitened(A, C, trial, rest, best)
-                covariance = covariance_of(errors)
-                gained = half * (log_determinant(best) - log_determinant(covariance))
+                trial = likelihood.at(found.gain + step.reshape(found.gain.shape), found)
+                gained = half * (found.log_determinant - trial.log_determinant)
             except DataError:  # stable, but not before its run has left the range of numbers
                 gained = -np.inf
             if gained > 0.75 * promised:
@@ -68,28 +116,12 @@ def refined(A: Array, C: Array, gain: Array, rest: Sequence[Array], part: Sequen
                 damping = max(10 * damping, FIRM)
         if not gained > 0:
             break
-        gain, best = trial, covariance
+        found = trial
         rate = promised / before if before and damping < FIRM else 1.0  # undamped steps shrink at a rate, or faster
         if promised * rate < arrived:
             break
         before = promised
-    return gain, best
-
-
-def innovations_covariance(A: Array, C: Array, gain: Array, rest: Sequence[Array]) -> Array:
-    """Covariance (l, l) of the innovations under a gain."""
-    return covariance_of(whitened(A, C, gain, rest))
-
-
-def whitened(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
-    """Innovations (N, l) of every experiment under a gain, with the initial state that fits best, see `_initial`."""
-    parts = _parts(A, C, gain)
-    return innovations(parts, rest, _initial(parts, rest, covariance))
-
-
-def innovations(parts: Parts, rest: Sequence[Array], starts: Sequence[Array]) -> list[Array]:
-    """Innovations (N, l) of every experiment under a gain from initial states (n,)."""
-    return [r - _run(parts, r, x0.copy(), np.empty((0, x0.size))) for r, x0 in zip(rest, starts)]
+    return found
 
 
 def covariance_of(signals: Sequence[Array]) -> Array:
@@ -100,6 +132,8 @@ def covariance_of(signals: Sequence[Array]) -> Array:
     """
     sums, pairs = _products(signals)
     found = sums / np.maximum(pairs, 1.0)
+    if len(found) == 1:
+        return found
     found = (found + found.T) / 2
     values = np.linalg.eigvalsh(found)
     if values[0] < -1e-12 * abs(values[-1]):
@@ -123,16 +157,8 @@ def _products(signals: Sequence[Array]) -> tuple[Array, Array]:
     return sums, pairs
 
 
-def log_determinant(covariance: Array) -> float:
-    """Logarithm of the determinant, ``-inf`` where it is not positive."""
-    sign, value = np.linalg.slogdet(covariance)
-    return float(value) if sign > 0 else -np.inf
-
-
 def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
     """Return the gain of the same spectrum that makes A - K C stable."""
-    if spectral_radius(A - gain @ C) < 1:
-        return gain
     try:
         level = covariance + 1e-12 * np.trace(covariance) * np.eye(len(C))
         return np.array(kalman_gain(A, C, gain @ level @ gain.T, level, gain @ level).K)
@@ -140,13 +166,16 @@ def _stable(A: Array, C: Array, gain: Array, covariance: Array) -> Array:
         return np.zeros_like(gain)
 
 
-def _parts(A: Array, C: Array, gain: Array, injection: Array | None = None) -> Parts:
-    """A model x+ = A x + L y + K e, y = C x + e as the compiled recursions read it."""
-    n, l = gain.shape  # noqa: E741
-    injected = np.zeros((n, l)) if injection is None else compact(injection)
-    none = [np.zeros(shape) for shape in ((n, 0), (l, 0), (n, 0), (n, 0), (l, 0), (0, n))]
-    matrices = compact(A), none[0], compact(C), none[1], none[2], injected, compact(gain), *none[3:]
-    return Parts._make([*matrices, np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
+def _parts(A: Array, C: Array, gain: Array) -> Parts:
+    """A model x+ = A x + K e, y = C x + e as the compiled recursions read it."""
+    return _without_functions(*gain.shape)._replace(A=compact(A), C=compact(C), K=compact(gain))
+
+
+@cache
+def _without_functions(n: int, l: int) -> Parts:  # noqa: E741
+    """Parts of n states and l outputs that are all zero."""
+    shapes = (n, n), (n, 0), (l, n), (l, 0), (n, 0), (n, l), (n, l), (n, 0), (l, 0), (0, n)
+    return Parts._make([*map(np.zeros, shapes), np.zeros(0, dtype=np.int64), NO_FUNCTIONS])
 
 
 def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
@@ -164,15 +193,14 @@ def _run(parts: Parts, y: Array, x: Array, states: Array) -> Array:
     return outputs
 
 
-def _initial(parts: Parts, rest: Sequence[Array], covariance: Array | None = None) -> list[Array]:
-    """Initial states (n,) that minimise the squared innovations, which are affine in them.
+def _initial(parts: Parts, radius: float, rest: Sequence[Array], root: Array) -> list[Array]:
+    """Initial states (n,) that minimise the squared innovations times a root (l, l), which are affine in them.
 
-    The innovations are in units of a covariance (l, l); without one every output counts by the size of its residuals.
+    The spectral radius of A - K C tells after how many samples they are forgotten.
     """
-    if covariance is None:
-        covariance = np.diag(np.maximum(np.diag(covariance_of(rest)), np.finfo(float).tiny))
-    n, radius, root = len(parts.A), spectral_radius(parts.A - parts.K @ parts.C), _whitening(covariance)
-    settled = None if radius >= 1 else n + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
+    n, settled = len(parts.A), None
+    if radius < 1:
+        settled = n + 10 + int(np.log(1e-10) / np.log(max(radius, 0.1)))
     with np.errstate(over="ignore", invalid="ignore"):
         found = [_moments(parts, r[:settled], np.zeros(n), root, 0) for r in rest]
     if not np.all(np.isfinite(found)):
@@ -194,7 +222,8 @@ def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
     sums, pairs = _products(errors)
     root = _whitening(sums / np.maximum(pairs, 1.0))
     weight = root.T @ root * np.mean(np.diag(pairs)) / np.maximum(pairs, 1.0)
-    adjoint, slope = _parts((A - gain @ C).T, gain.T, np.zeros_like(gain), C.T), np.zeros_like(gain)
+    adjoint = _parts((A - gain @ C).T, gain.T, np.zeros_like(gain))._replace(L=compact(C.T))
+    slope = np.zeros_like(gain)
     for e in errors:
         backwards, states = np.ascontiguousarray(e[::-1]), np.empty((len(e), len(A)))
         missing = np.isnan(backwards)
@@ -202,16 +231,6 @@ def _slope(A: Array, C: Array, gain: Array, errors: Sequence[Array]) -> Array:
         _run(adjoint, np.where(missing, np.nan, present @ weight), np.zeros(len(A)), states)
         slope += states.T @ present
     return slope.ravel()
-
-
-def _equations(A: Array, C: Array, gain: Array, rest: Sequence[Array], covariance: Array) -> tuple[Array, Array]:
-    """Normal equations of a step in the gain (row by row), errors in units of their covariance, states eliminated."""
-    parts, root, n = _parts(A, C, gain), _whitening(covariance), len(A)
-    total = np.zeros((gain.size + 1, gain.size + 1))
-    for r, x0 in zip(rest, _initial(parts, rest)):
-        moments = _moments(parts, r, x0, root, gain.size)
-        total += moments[n:, n:] - moments[n:, :n] @ _solved(moments[:n, :n], moments[:n, n:])
-    return total[:-1, :-1], -total[:-1, -1]
 
 
 def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array:
@@ -227,10 +246,14 @@ def _moments(parts: Parts, r: Array, x0: Array, root: Array, size: int) -> Array
     for first in range(0, len(r), length):
         y = r[first : first + length]
         missing, states, block = np.isnan(y), np.empty((len(y), n)), np.empty((len(y), l, n + size + 1))
-        error = np.where(missing, 0.0, _run(parts, y, x, states) - y)
-        returned = np.where(missing[:, None], 0.0, -parts.K)
+        error, returned = _run(parts, y, x, states) - y, np.empty((len(y), n, l))
+        returned[:] = -parts.K
+        if missing.any():
+            error[missing], returned.swapaxes(1, 2)[missing] = 0.0, 0.0
         sensitivities(parts, direct, Signals(returned, np.zeros((len(y), 0)), -error), turn, block)
-        block[missing], block[:, :, -1] = 0.0, error
+        block[:, :, -1] = error
+        if missing.any():
+            block[missing] = 0.0
         rows = (root @ block).reshape(-1, n + size + 1)
         total += rows.T @ rows
     return total
@@ -245,5 +268,7 @@ def _entries_of_gain(n: int, l: int, size: int) -> Direct:  # noqa: E741
 
 def _solved(matrix: Array, right: Array) -> Array:
     """Solve a symmetric system; directions without information stay at zero."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    return (np.linalg.lstsq(matrix / np.outer(scale, scale), (right.T / scale).T, rcond=1e-12)[0].T / scale).T
+    from scipy.linalg.lapack import dgelss  # pyright: ignore[reportAttributeAccessIssue]
+
+    scale = np.sqrt(np.maximum(matrix.diagonal(), TINY))
+    return (dgelss(matrix / np.outer(scale, scale), (right.T / scale).T, cond=1e-12)[1].T / scale).T

@@ -22,6 +22,7 @@ STEPS = 50
 SETTLED = 1e-20  # a step with a smaller predicted share of the squared error is the last one
 DIGITS = 1e-15  # of the outputs; a step with a smaller predicted reduction than their square is the last one, too
 ROUNDING = 1e-14
+NOTHING = Direct.of()  # what unknowns besides the initial state change
 SIMULATORS = ("predict", "measured_feedback", "free")
 
 
@@ -135,7 +136,6 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
     x, turn, length = np.array(x0, dtype=float), np.eye(n), max(64, STRETCH // (n * outputs + 1))
-    nothing = Direct.of()  # besides the initial state
     for first in range(0, len(job.u), length):
         if not (informs or whole):
             break
@@ -147,7 +147,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
             cost += float(np.sum(error[present] ** 2))
         if informs:
             jacobian = np.empty((len(states), outputs, n))
-            sensitivities(job.model.parts, nothing, signals(job, stretch, states, simulated), turn, jacobian)
+            sensitivities(job.model.parts, NOTHING, signals(job, stretch, states, simulated), turn, jacobian)
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
             if not (np.all(np.isfinite(rows)) and np.isfinite(cost)):
                 raise DataError(

@@ -152,6 +152,8 @@ class Program:
         Raises:
             StructureError: naming the part that is neither convex nor smooth.
         """
+        if self.structure is not None and self.structure.kind and not self.is_stated:
+            return self.structure.kind
         if self.problem.is_dcp():
             return _convex_class(self.problem)
         for name, part in self._parts():
@@ -319,6 +321,8 @@ class Program:
     @property
     def size(self) -> int:
         """Number of scalar unknowns."""
+        if self.structure is not None and not self.is_stated:
+            return sum(np.size(value) for value in self.structure.complete(self, self.start)[0].values())
         return sum(v.size for v in self.variables.values())
 
 

@@ -19,10 +19,12 @@ class Structure:
     Attributes:
         word: its name in messages and in the list of solvers.
         constrained: whether its methods accept constraints of the user.
+        kind: class of a programme of this structure without them (`Program.kind`); empty where its statement decides.
     """
 
     word: ClassVar[str]
     constrained: ClassVar[bool] = False
+    kind: ClassVar[str] = ""
 
     @property
     def about(self) -> str:

@@ -27,8 +27,7 @@ def root_of_gram(gram: Array, n: int) -> Array:
     depends on those before it, rows of R are zero. What remains of the last columns may be singular, as for data
     without noise.
     """
-    from scipy.linalg import solve_triangular
-    from scipy.linalg.lapack import dpotrf  # pyright: ignore[reportAttributeAccessIssue]
+    from scipy.linalg.lapack import dpotrf, dtrtrs  # pyright: ignore[reportAttributeAccessIssue]
 
     scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
     scale[scale == 0] = 1.0
@@ -37,11 +36,12 @@ def root_of_gram(gram: Array, n: int) -> Array:
     inner, info = dpotrf(scaled[:n, :n], lower=0, clean=1)
     sound = n if info == 0 else int(info) - 1
     root[:sound, :sound] = inner[:sound, :sound]
-    if sound:
-        root[:sound, sound:] = solve_triangular(inner[:sound, :sound], scaled[:sound, sound:], trans=1)
-    remainder = scaled[n:, n:] - root[:n, n:].T @ root[:n, n:]
-    values, vectors = np.linalg.eigh(remainder)
-    root[n:, n:] = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r")
+    if 0 < sound < len(gram):
+        root[:sound, sound:] = dtrtrs(inner[:sound, :sound], scaled[:sound, sound:], trans=1)[0]
+    if n < len(gram):
+        remainder = scaled[n:, n:] - root[:n, n:].T @ root[:n, n:]
+        values, vectors = np.linalg.eigh(remainder)
+        root[n:, n:] = np.linalg.qr((vectors * np.sqrt(np.maximum(values, 0.0))).T, mode="r")
     return _nonnegative_diagonal(root) * scale
 
 

@@ -147,13 +147,13 @@ def hankel_statistics(records: Sequence[Array], rows: int, expand: Expand | None
         raise RankError(f"no window of {rows} samples is complete: every one touches a missing sample. Use fewer block "
                         "rows or data with fewer gaps.")
     expand = expand or np.asarray
-    d = expand(runs[0][:1]).shape[1]
+    if isinstance(centre, str):  # a centre has to be near, no more
+        centre = np.concatenate([expand(run[:: 1 + len(run) // chunk]) for run in runs]).mean(axis=0)
+    middle = np.zeros(expand(runs[0][:1]).shape[1]) if centre is None else np.asarray(centre, dtype=float)
+    d = middle.size
     names = tuple(names) if names is not None else tuple(f"s{c + 1}" for c in range(d))
     if len(names) != d:
         raise StructureError(f"{len(names)} names for {d} signals.")
-    if isinstance(centre, str):  # a centre has to be near, no more
-        centre = np.concatenate([expand(run[:: 1 + len(run) // chunk]) for run in runs]).mean(axis=0)
-    middle = np.zeros(d) if centre is None else np.asarray(centre, dtype=float)
     columns = np.arange(1, 1 + rows * d, dtype=np.int32).reshape(rows, d)
     frame = Frame((range(rows),), (columns[::-1],), 0)  # row i of a window lies rows - 1 - i samples before its last
 
@@ -183,7 +183,8 @@ def _block(raw: Array, frame: Frame, expand: Expand, centre: Array, chunk: int) 
             np.subtract(expand(raw[part]), centre, out=inner[part])
         elif not missing[part].all():
             inner[part][~missing[part]] = expand(raw[part][~missing[part]]) - centre
-    valid = np.pad(rows_present([missing], frame.lags, frame.reach), frame.reach)
+    valid = np.zeros(len(raw) + frame.reach, dtype=bool)
+    valid[frame.reach : len(raw)] = rows_present([missing], frame.lags, frame.reach)
     return Block(frame, (Signals.dense(padded),), valid, None, 0)
 
 

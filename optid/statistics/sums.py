@@ -212,7 +212,7 @@ class Sums(Total):
         gram, n = np.zeros_like(self._gram), self.frame.n
         entries = 1 + sum(group.weights.shape[1] * len(lags) for group, lags in zip(block.groups, self.frame.lags))
         sparse = 3 * entries**2 < n**2 and not self._is_small(rows.size, SMALL)
-        for part in np.split(rows, range(FORMED, rows.size, FORMED)):
+        for part in (rows[start : start + FORMED] for start in range(0, rows.size, FORMED)):
             weights = np.ones(part.size) if block.weights is None else block.weights[part]
             if sparse:
                 from optid.statistics import kernels

@@ -82,6 +82,7 @@ class LinearStructure(LeastSquaresStructure):
     """Least squares without products, which a matrix factorisation solves."""
 
     word: ClassVar[str] = "linear"
+    kind: ClassVar[str] = "QP"
 
     @property
     def about(self) -> str:
@@ -94,6 +95,7 @@ class RankOneStructure(LeastSquaresStructure):
     """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate."""
 
     word: ClassVar[str] = "rank-one"
+    kind: ClassVar[str] = "NLP"
     constrained: ClassVar[bool] = True
     problem: RankOne
 
