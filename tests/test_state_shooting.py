@@ -63,7 +63,7 @@ def test_ipopt_finds_the_optimum_of_the_descents(case):
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("case", CASES)
-@pytest.mark.filterwarnings("ignore:The functions of latent signals have no effect")
+@pytest.mark.filterwarnings("ignore:The functions of latent signals have no significant effect")
 def test_subspace_starts_without_a_descent(case):
     data = record(case, noise=0.5, seed=1)
     name, options = CASES[case]
