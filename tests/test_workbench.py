@@ -166,7 +166,7 @@ def test_curves_are_drawn_for_the_output_chosen():
     assert (first["output"], second["output"]) == record.outputs and first["title"] != second["title"]
     assert second["y"]["title"] == 'temp "b" (°C)'
     model = next(iter(bench.fits.values()))[0].model
-    assert views.static(model, 0, np.array([0.2]), 1) == pytest.approx(0.5)
+    assert model.static_curve(0, np.array([0.2]))[:, 1] == pytest.approx(0.5)
 
 
 def test_requests_are_computed_one_at_a_time(monkeypatch):

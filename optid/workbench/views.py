@@ -44,6 +44,7 @@ def quick(fit: Any, run: list[Array] | None, output: str | None = None) -> dict[
 def time_chart(record: Data, run: list[Array] | None, experiment: int = 0,
                view: Sequence[float] | None = None) -> list[dict[str, Any]]:
     """Return outputs, measured and simulated, and inputs of an experiment (from 0) between two samples (all)."""
+    record.select(experiments=experiment)  # an unknown one is refused
     part = slice(None) if view is None else slice(max(int(view[0]), 0), int(view[1]))
     shown = charts.time_charts(record, experiment, [("simulated", run, {"width": 1.9})], "time", part=part,
                                heights=(250, 150))
