@@ -215,17 +215,14 @@ class Decisions:
     def _noisy_sensor(self, now: int, window: Window) -> Event | None:
         """The sensor whose noise has most likely increased; the statistic is twice the log-likelihood gained.
 
-        More noise of one sensor increases the whitened innovations along one direction alone, about an unchanged mean:
-        a shift of the mean is no noise, so that the variance about the mean counts.
+        More noise of one sensor increases the whitened innovations along one direction alone.
         """
         r, root = window.recent(min(int(window.clock[0]), window.length)), window.steady.root
         l, n = r.shape[1], np.arange(1, len(r) + 1)[:, None]  # noqa: E741
-        signal = r @ (root / np.linalg.norm(root, axis=0))
-        along, total = np.cumsum(signal**2, axis=0), np.cumsum(np.sum(r**2, axis=1))[:, None]
-        free = np.maximum(n - 1, 1)
-        share = (along - np.cumsum(signal, axis=0) ** 2 / n) / free
+        along = np.cumsum((r @ (root / np.linalg.norm(root, axis=0))) ** 2, axis=0)
+        share, total = along / n, np.cumsum(np.sum(r**2, axis=1))[:, None]
         alike = (l == 1) | (excess(total - along, np.maximum((l - 1) * n, 1)) < RULES["odd"])
-        gain = np.where((share > 1) & (n >= FEWEST) & alike, free * (share - 1 - np.log(np.maximum(share, 1.0))), 0.0)
+        gain = np.where((share > 1) & (n >= FEWEST) & alike, n * (share - 1 - np.log(np.maximum(share, 1.0))), 0.0)
         if not gain.any():
             return None
         k, o = np.unravel_index(int(np.argmax(gain)), gain.shape)
