@@ -179,25 +179,21 @@ def test_parameters_that_vary_with_the_operating_point_enlarge_the_covariance():
         inject(replace(model, B=gain * model.B), u, seed=0)[100 * k : 100 * k + 100] for k, gain in enumerate(gains)])
     found = model_uncertainty(model, Data(u, varying))
     assert found.inflation > 5
-    spread, noise = (np.trace(one.predictor.covariance) for one in (found, steady[0]))
-    assert 0.8 < spread / noise < 1.3  # the variation is not counted as noise
 
 
 def test_the_variation_between_sections_is_estimated():
     rng, q = np.random.default_rng(0), 8
     S = np.linalg.qr(rng.standard_normal((6000, q)))[0].reshape(10, 600, q)
     grams = [part.T @ part for part in S]
-    for ratio, noise in ((1.0, 1.0), (40.0, 0.9)):
+    for ratio in (1.0, 40.0):
         estimates = []
         for _ in range(20):
             moved = np.sqrt(ratio - 1) * rng.standard_normal((10, q, 1))
-            r = np.sqrt(noise) * (rng.standard_normal((10, 600)) + (S @ moved)[:, :, 0])
+            r = rng.standard_normal((10, 600)) + (S @ moved)[:, :, 0]
             fitted = np.einsum("kni,kn->i", S, r)
             r -= S @ fitted
-            estimates.append(overdispersion(
-                [(gram, part.T @ left, float(left @ left), 600) for gram, part, left in zip(grams, S, r)]))
-        factors, scales = np.array(estimates).T
-        assert abs(np.mean(factors) / ratio - 1) < 0.15 and abs(np.mean(scales) / noise - 1) < 0.01
+            estimates.append(overdispersion(grams, [part.T @ left for part, left in zip(S, r)]))
+        assert abs(np.mean(estimates) / ratio - 1) < 0.15
 
 
 def whiten_with(model, data, identified, uncertainty=None):

@@ -18,11 +18,10 @@ A plant outside the model class has no true parameters: those that fit best vary
 P. The record of identification is therefore cut into sections. Let S be the sensitivity of a section. Parameters that
 vary between the sections with the covariance (c - 1) P give the innovations along S P S' (eigenvalues s^2 < 1) the
 variance 1 + (c - 2) s^2: one s^2 less than in a later record, because the parameters were fitted to this one. P is
-multiplied by the estimate of c (overdispersion) where c = 1 is rejected; the innovations that are orthogonal to S then
-give the scale of the noise, in which this variation is not contained.
+multiplied by the estimate of c (overdispersion) where c = 1 is rejected.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -168,7 +167,7 @@ def model_uncertainty(
     gained = replace(model, K=steady.K)
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
-    sections: list[tuple[Array, Array, float, int]] = []
+    sections: list[tuple[Array, Array]] = []
     length = max(count // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(gained, steady, data):
         by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
@@ -180,11 +179,7 @@ def model_uncertainty(
         left = white - basis @ (basis.T @ white)
         energy += float(np.sum(left**2))
         edges = np.linspace(0, len(rest), max(round(len(part.y) / length), 1) + 1).astype(int)
-        lost = steady.silent * int(present.all(axis=1).sum()) / max(int(present.sum()), 1)
-        for a, b in zip(edges, edges[1:]):
-            part_of = rest[a:b]
-            seen = int(present.ravel()[a:b].sum() * (1 - lost))
-            sections.append((part_of.T @ part_of, part_of.T @ left[a:b], float(np.sum(left[a:b] ** 2)), seen))
+        sections += [(rest[a:b].T @ rest[a:b], rest[a:b].T @ left[a:b]) for a, b in zip(edges, edges[1:])]
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0] = 1.0
     values, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
@@ -195,44 +190,39 @@ def model_uncertainty(
             f"covariance of the model: {int(known.sum())} directions change its predictions. Use a longer record."
         )
     scale = np.sqrt(energy / (readings - int(known.sum())))
-    unit, factor = axes[:, known] / np.sqrt(values[known]) / sizes[:, None], 1.0
-    if healthy is None:
-        projected = [(unit.T @ gram @ unit, unit.T @ along / scale, energy / scale**2, seen)
-                     for gram, along, energy, seen in sections]
-        factor, share = overdispersion(projected)
-        scale *= np.sqrt(share)
+    root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
-    found = ModelUncertainty(gained, steady, np.sqrt(factor) * scale * unit, readings, factor)
-    return found if healthy is None else _inflated(found, healthy)
+    found = ModelUncertainty(gained, steady, root, readings)
+    if healthy is not None:
+        return _inflated(found, healthy)
+    unit = root / scale
+    factor = overdispersion([unit.T @ gram @ unit for gram, _ in sections],
+                            [unit.T @ along / scale for _, along in sections])
+    return replace(found, root=np.sqrt(factor) * root, inflation=factor)
 
 
-def overdispersion(sections: Sequence[tuple[Array, Array, float, int]]) -> tuple[float, float]:
-    """Return the factor c of the covariance of parameters that vary between sections, and the scale of the noise.
-
-    Both are 1 where equal parameters are not rejected.
+def overdispersion(grams: list[Array], correlations: list[Array]) -> float:
+    """Return the factor c of the covariance of parameters that vary between sections; 1 where they need not vary.
 
     Args:
-        sections: for each S'S (q, q), S the sensitivity to parameters of unit covariance, whose sum is at most I; S'r
-            (q,) with its whitened innovations r; their energy, and their number.
+        grams: for each section S'S (q, q), the sensitivity S to parameters of unit covariance; their sum is at most I.
+        correlations: for each section S'r (q,) with its whitened innovations r.
     """
-    spreads, squares, rest, free = [], [], 0.0, 0
-    for gram, along, energy, seen in sections:
+    spreads, squares = [], []
+    for gram, along in zip(grams, correlations):
         values, axes = np.linalg.eigh(gram)
         known = values > KNOWN
         spreads.append(values[known])
         squares.append((axes[:, known].T @ along) ** 2 / values[known])
-        rest += energy - float(squares[-1].sum())
-        free += seen - int(known.sum())
     s2, z2 = np.concatenate(spreads), np.concatenate(squares)
     score = s2 @ (z2 - 1 + s2)
-    if free <= 0 or score <= REJECTED * np.sqrt(2) * np.linalg.norm(s2 * (1 - s2)):
-        return 1.0, 1.0
-    noise = min(rest / free, 1.0)
+    if score <= REJECTED * np.sqrt(2) * np.linalg.norm(s2 * (1 - s2)):
+        return 1.0
     factor = 1.0
     for _ in range(ITERATIONS):
         weights = s2 / (1 + factor * s2) ** 2
-        factor = max(1.0, float(2 + weights @ (z2 / noise - 1) / (weights @ s2)))
-    return factor, noise
+        factor = max(1.0, float(2 + weights @ (z2 - 1) / (weights @ s2)))
+    return factor
 
 
 def _inflated(found: ModelUncertainty, healthy: Data) -> ModelUncertainty:
