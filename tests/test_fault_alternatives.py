@@ -116,6 +116,17 @@ def test_a_partial_loss_about_another_zero_is_a_loss_and_a_stuck_actuator_is_stu
     assert answer.size_interval[1, 0] <= 0.8 <= answer.size_interval[1, 1]
 
 
+def test_a_partial_loss_is_a_loss_beside_a_second_fault_too():
+    u, second = levels(COUNT, 0) + 0.5, Fault.step("sensor:y2", 110, 1.5)
+    for first, label in ((Fault.loss("actuator:u1", 70, 0.5, bias=-0.5), "actuator:u1 loss"),
+                         (Fault.stuck("actuator:u1", 70, value=0.8), "actuator:u1 stuck")):
+        y = inject(small(), u, [first, second], seed=1)
+        answer = diagnose(small(), (u, y), dictionary(small(), kinds=["bias", "loss", "stuck"]), max_faults=2)
+        assert answer.best.label == f"{label} + sensor:y2"
+        share = answer.best.faults[0].size[0]
+        assert share == pytest.approx(1.0 if "stuck" in label else 0.5, abs=0.15)
+
+
 def test_a_leak_without_its_direction_is_not_named_as_an_actuator():
     model, leak = small(), {"leak": [0.1, 0.6, -0.7]}
     answer = said(Fault.step("process:leak", 80, 0.9), process=leak)

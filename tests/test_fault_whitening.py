@@ -12,7 +12,7 @@ from test_fault_injection import small
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import Fault, health, inject, model_uncertainty, predictor, whiten
-from optid.faults.nuisance import largest_factor
+from optid.faults.nuisance import largest_factor, overdispersion
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.kalman import kalman_gain
 
@@ -167,6 +167,33 @@ def test_a_healthy_record_enlarges_a_covariance_that_is_too_small():
         noise = NoiseCovariances.of_innovations(wrong.K, claimed.predictor.covariance)
         factors.append(model_uncertainty(replace(wrong, noise=noise), origin, healthy=healthy).inflation)
     assert np.median(factors) > 3
+
+
+def test_parameters_that_vary_with_the_operating_point_enlarge_the_covariance():
+    """A plant whose parameters change every 100 samples; a plant of the model class leaves the covariance as it is."""
+    model, u = small(), levels(1000, 0)
+    steady = [model_uncertainty(model, Data(u, inject(model, u, seed=seed))) for seed in range(5)]
+    assert [one.inflation for one in steady] == [1.0] * 5
+    gains = 1 + 0.2 * np.random.default_rng(1).standard_normal(10)
+    varying = np.concatenate([
+        inject(replace(model, B=gain * model.B), u, seed=0)[100 * k : 100 * k + 100] for k, gain in enumerate(gains)])
+    found = model_uncertainty(model, Data(u, varying))
+    assert found.inflation > 5
+
+
+def test_the_variation_between_sections_is_estimated():
+    rng, q = np.random.default_rng(0), 8
+    S = np.linalg.qr(rng.standard_normal((6000, q)))[0].reshape(10, 600, q)
+    grams = [part.T @ part for part in S]
+    for ratio in (1.0, 40.0):
+        estimates = []
+        for _ in range(20):
+            moved = np.sqrt(ratio - 1) * rng.standard_normal((10, q, 1))
+            r = rng.standard_normal((10, 600)) + (S @ moved)[:, :, 0]
+            fitted = np.einsum("kni,kn->i", S, r)
+            r -= S @ fitted
+            estimates.append(overdispersion(grams, [part.T @ left for part, left in zip(S, r)]))
+        assert abs(np.mean(estimates) / ratio - 1) < 0.15
 
 
 def whiten_with(model, data, identified, uncertainty=None):

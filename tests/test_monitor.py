@@ -278,6 +278,16 @@ def test_noise_that_grows_is_named_although_jumps_of_the_state_explain_a_few_sam
         assert abs(named.onset - 300) <= 2 and 2 < named.size[0] < 8
 
 
+def test_parameters_confounded_with_the_initial_state_do_not_raise_the_thresholds():
+    """A plant that nearly integrates: a monitor has long forgotten the start, an error there is no effect."""
+    model = noisy(np.diag([0.9995, 0.8]), np.array([[0.02, 0], [0.1, 0.5]]), np.eye(2), 1e-4 * np.eye(2),
+                  0.01 * np.eye(2))
+    u = levels(1500, 3)
+    data = Data(u, inject(model, u, seed=9, x0="rest"))
+    monitor = Monitor(model, listed(model, "bias"), arl0=1000, uncertainty=data)
+    assert np.all(monitor.calibration.q < 25)
+
+
 def test_what_no_candidate_explains_is_unknown():
     model = plant()
     found, u = listed(model, "bias"), levels(300, 6)

@@ -13,6 +13,12 @@ forgets a deviation: measurement noise is added, n / N of the covariance of the 
 The covariance is that of the linearised predictions; the errors of a maximum-likelihood model from a short record are
 larger. With a later healthy record, `model_uncertainty(model, data, healthy=...)` multiplies P by the largest factor
 that this record allows.
+
+A plant outside the model class has no true parameters: those that fit best vary with the operating point, by more than
+P. The record of identification is therefore cut into sections. Let S be the sensitivity of a section. Parameters that
+vary between the sections with the covariance (c - 1) P give the innovations along S P S' (eigenvalues s^2 < 1) the
+variance 1 + (c - 2) s^2: one s^2 less than in a later record, because the parameters were fitted to this one. P is
+multiplied by the estimate of c (overdispersion) where c = 1 is rejected.
 """
 
 from collections.abc import Callable, Iterator
@@ -46,6 +52,15 @@ CONFIDENCE = 0.95
 
 FACTORS = 1.0, 1000.0, 300
 """The smallest factor, the largest, and their number."""
+
+SECTIONS = 10
+"""Sections of the record of identification between which the parameters may vary."""
+
+REJECTED = 3.0
+"""Standard deviations of the score at which equal parameters of all sections are rejected."""
+
+ITERATIONS = 30
+"""Iterations of the estimate of their variation."""
 
 DRAWS = 4000
 """Simulated energies behind the bound of the factor."""
@@ -84,7 +99,7 @@ class ModelUncertainty:
         predictor: of the noise with the corrections for a short record; used for windows.
         root: (parameters, q) with covariance root root'.
         readings: number of readings behind it, less one for each initial state estimated.
-        inflation: factor of the covariance from a healthy record; 1 without one.
+        inflation: factor of the covariance, from a healthy record or from the sections of the identification.
     """
 
     model: "HammersteinSS"
@@ -135,7 +150,8 @@ def model_uncertainty(
         model: with noise covariances.
         data: the record it was identified from.
         healthy: a later healthy record, which was not used to identify it. The covariance is multiplied by the upper
-            bound (`CONFIDENCE`) of the factor of this record, at least one.
+            bound (`CONFIDENCE`) of the factor of this record, at least one. Without it, the covariance is multiplied
+            by the variation of the parameters between the sections of `data`, where that is significant.
         decoupled: a predictor decoupled from declared disturbances, in place of that of the model.
 
     Raises:
@@ -151,6 +167,8 @@ def model_uncertainty(
     gained = replace(model, K=steady.K)
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
+    sections: list[tuple[Array, Array]] = []
+    length = max(count // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(gained, steady, data):
         by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
@@ -158,7 +176,10 @@ def model_uncertainty(
         rest = by_parameter - basis @ (basis.T @ by_parameter)
         information += rest.T @ rest
         readings += int(present.sum()) - basis.shape[1] - steady.silent * int(present.all(axis=1).sum())
-        energy += float(np.sum((white - basis @ (basis.T @ white)) ** 2))
+        left = white - basis @ (basis.T @ white)
+        energy += float(np.sum(left**2))
+        edges = np.linspace(0, len(rest), max(round(len(part.y) / length), 1) + 1).astype(int)
+        sections += [(rest[a:b].T @ rest[a:b], rest[a:b].T @ left[a:b]) for a, b in zip(edges, edges[1:])]
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0] = 1.0
     values, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
@@ -172,7 +193,36 @@ def model_uncertainty(
     root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
     found = ModelUncertainty(gained, steady, root, readings)
-    return found if healthy is None else _inflated(found, healthy)
+    if healthy is not None:
+        return _inflated(found, healthy)
+    unit = root / scale
+    factor = overdispersion([unit.T @ gram @ unit for gram, _ in sections],
+                            [unit.T @ along / scale for _, along in sections])
+    return replace(found, root=np.sqrt(factor) * root, inflation=factor)
+
+
+def overdispersion(grams: list[Array], correlations: list[Array]) -> float:
+    """Return the factor c of the covariance of parameters that vary between sections; 1 where they need not vary.
+
+    Args:
+        grams: for each section S'S (q, q), the sensitivity S to parameters of unit covariance; their sum is at most I.
+        correlations: for each section S'r (q,) with its whitened innovations r.
+    """
+    spreads, squares = [], []
+    for gram, along in zip(grams, correlations):
+        values, axes = np.linalg.eigh(gram)
+        known = values > KNOWN
+        spreads.append(values[known])
+        squares.append((axes[:, known].T @ along) ** 2 / values[known])
+    s2, z2 = np.concatenate(spreads), np.concatenate(squares)
+    score = s2 @ (z2 - 1 + s2)
+    if score <= REJECTED * np.sqrt(2) * np.linalg.norm(s2 * (1 - s2)):
+        return 1.0
+    factor = 1.0
+    for _ in range(ITERATIONS):
+        weights = s2 / (1 + factor * s2) ** 2
+        factor = max(1.0, float(2 + weights @ (z2 - 1) / (weights @ s2)))
+    return factor
 
 
 def _inflated(found: ModelUncertainty, healthy: Data) -> ModelUncertainty:

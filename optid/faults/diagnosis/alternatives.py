@@ -53,43 +53,54 @@ def extended(found: Dictionary) -> Dictionary | None:
 
 
 def parted(found: Explanation, listed: Sequence[Candidate]) -> list[Explanation]:
-    """Return a broken actuator as a stuck one and as one that lost a share, of the listed kinds; others unchanged."""
+    """Return a broken actuator as a stuck one and as one that lost a share, of the listed kinds; others unchanged.
+
+    Of several faults every broken actuator is taken apart, in all combinations.
+    """
     family = found.candidates[0]
     if len(found.candidates) == 1 and family.kind == "loss" and family.columns and not family.constants:
-        return [found._replace(logs=np.logaddexp(found.logs, _all_lost(found)) - np.log(2))]
-    if len(found.candidates) != 1 or family.kind != "stuck":
-        return [found]
-    kinds = {c.kind: c for c in listed if c.name == family.name}
-    result = []
-    if "stuck" in kinds:
-        result.append(_stuck(found))
-    if "loss" in kinds and kinds["loss"].zero is None:
-        lost = replace(family, kind="loss", constants=True, members=(f"{family.name} loss",))
-        result.append(found._replace(candidates=(lost,), entry=family))
+        return [found._replace(logs=np.logaddexp(found.logs, _all_lost(found, 0)) - np.log(2))]
+    result, first = [found], 0
+    for number, family in enumerate(found.candidates):
+        if family.kind == "stuck":
+            result = [part for one in result for part in _kinds(one, number, first, listed)]
+        first += family.dimension
     return result
 
 
-def _all_lost(found: Explanation) -> Array:
-    """Logarithm (K,) of the marginal likelihood with the share fixed to one."""
-    share, variance = found.sizes[:, 0], np.maximum(found.covariances[:, 0, 0], EXACT)
+def _kinds(found: Explanation, number: int, first: int, listed: Sequence[Candidate]) -> list[Explanation]:
+    """Return the kinds of a broken actuator, one of the candidates, whose share is the magnitude `first`."""
+    family, entries = found.candidates[number], found.entries or found.candidates
+    kinds = {c.kind: c for c in listed if c.name == family.name}
+    result = []
+    if "stuck" in kinds:
+        result.append(_stuck(found, first)._replace(entries=entries))
+    if "loss" in kinds and kinds["loss"].zero is None:
+        lost = replace(family, kind="loss", constants=True, members=(f"{family.name} loss",))
+        candidates = (*found.candidates[:number], lost, *found.candidates[number + 1 :])
+        result.append(found._replace(candidates=candidates, entries=entries))
+    return result
+
+
+def _all_lost(found: Explanation, first: int) -> Array:
+    """Logarithm (K,) of the marginal likelihood with a share fixed to one."""
+    share, variance = found.sizes[:, first], np.maximum(found.covariances[:, first, first], EXACT)
     free = found.logs - np.log(share_bound(share, variance))
     density = np.sqrt(2 * np.pi * variance) * share_prior(np.sqrt(variance))
     return free - (1 - share) ** 2 / (2 * variance) - np.log(density)
 
 
-def _stuck(found: Explanation) -> Explanation:
-    """The explanation with the share fixed to one, and the constants conditional on it."""
-    share, variance = found.sizes[:, 0], np.maximum(found.covariances[:, 0, 0], EXACT)
-    logs = _all_lost(found)
-    slope = found.covariances[:, 1:, 0] / variance[:, None]
-    sizes = np.hstack([np.ones((len(share), 1)), found.sizes[:, 1:] + slope * (1 - share)[:, None]])
-    covariances = np.zeros_like(found.covariances)
-    covariances[:, 0, 0] = EXACT
-    covariances[:, 1:, 1:] = found.covariances[:, 1:, 1:] - np.einsum(
-        "ki,kj,k->kij", slope, slope, found.covariances[:, 0, 0])
+def _stuck(found: Explanation, first: int) -> Explanation:
+    """The explanation with a share fixed to one, and the other magnitudes conditional on it."""
+    share, variance = found.sizes[:, first], np.maximum(found.covariances[:, first, first], EXACT)
+    slope = found.covariances[:, :, first] / variance[:, None]
+    slope[:, first] = 1.0
+    covariances = found.covariances - np.einsum(
+        "ki,kj,k->kij", slope, slope, found.covariances[:, first, first])
+    covariances[:, first, first] = EXACT
     return found._replace(
-        logs=logs, sizes=sizes, covariances=covariances, energies=found.energies - (1 - share) ** 2 / variance,
-        entry=found.candidates[0],
+        logs=_all_lost(found, first), sizes=found.sizes + slope * (1 - share)[:, None], covariances=covariances,
+        energies=found.energies - (1 - share) ** 2 / variance,
     )
 
 

@@ -63,7 +63,7 @@ class Explanation(NamedTuple):
         search: with the signatures; None for candidates without one.
         course: in place of signatures, the fit to the window for an onset.
         error: of the signature, due to the uncertainty of an identified model.
-        entry: the candidate of the search of which the candidate is a special case.
+        entries: the candidates of the search of which the candidates are special cases; empty where they are the same.
     """
 
     candidates: tuple[Candidate, ...]
@@ -75,7 +75,7 @@ class Explanation(NamedTuple):
     search: "Scan | None" = None
     course: Callable[[int], Explained] | None = None
     error: Nuisance | None = None
-    entry: Candidate | None = None
+    entries: tuple[Candidate, ...] = ()
 
     def likely(self) -> "Explanation":
         """Return the explanation without onsets of negligible probability."""
@@ -91,8 +91,7 @@ class Explanation(NamedTuple):
         if self.course is not None:
             return self.course(int(onsets[0]))
         assert self.search is not None
-        own = self.candidates if self.entry is None else (self.entry,)
-        traces = [self.search.signature(candidate, int(onset)) for candidate, onset in zip(own, onsets)]
+        traces = [self.search.signature(c, int(onset)) for c, onset in zip(self.entries or self.candidates, onsets)]
         fitted = np.concatenate(traces, axis=2) @ sizes
         return Explained(fitted, self.search.whitened.r - fitted, sizes.size)
 

@@ -153,7 +153,11 @@ def singles(seen: RecordSearch) -> list[Explanation]:
 def _several(seen: RecordSearch, found: SubsetSearch, reach: int = 1) -> list[Explanation]:
     """Explanations by several candidates with a gain near the best, over the onsets around them."""
     near = [s for s in found.ranked if len(s.labels) > 1 and not set(seen.lost) & set(s.labels)]
-    return [_around(seen, s.labels, s.onsets, reach) for s in near if s.gain > near[0].gain - FAR]
+    result: list[Explanation] = []
+    for subset in near:
+        if subset.gain > near[0].gain - FAR:
+            result += parted(_around(seen, subset.labels, subset.onsets, reach), seen.dictionary.candidates)
+    return result
 
 
 def _around(seen: RecordSearch, labels: Sequence[str], onsets: Sequence[int], reach: int = 1) -> Explanation:
@@ -190,8 +194,8 @@ def _fit(seen: RecordSearch, explanation: Explanation, probability: float) -> Fi
         gains[np.isnan(seen.gains)] = np.nan
         further = further_fault(gains, limits.false_alarm)
         if explanation.search is search:
-            entries = [explanation.entry] if explanation.entry is not None else explanation.candidates
-            penalty = float(np.nansum([limits.q[search.index(c)] for c in entries]))
+            own = explanation.entries or explanation.candidates
+            penalty = float(np.nansum([limits.q[search.index(c)] for c in own]))
         elif explanation.search is not None:
             penalty = float(np.nanmax(limits.q))
     left = left_over(seen.whitened, rest, seen.dictionary.model.nx + made.magnitudes, further)

@@ -33,7 +33,8 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     """Return signatures (T, l, q) of uncertain parameters of unit variance, and the functions of the inputs (T, r).
 
     The innovations are those of the record of the identification, whitened by the predictor of the uncertainty or by
-    that with the colour of a healthy record.
+    that with the colour of a healthy record, less what an initial state explains: where the predictor forgets slowly, a
+    parameter that is confounded with it has a large effect that no monitor sees after its start.
     """
     raw = in_units_of(known.model, data)
     given = known.model.initial_state(raw, "predict")
@@ -41,7 +42,8 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     for part, x0 in zip(raw.experiments, as_list(given)):
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
-        by_parameter, _ = sensitivities(known.model, known.predictor, here, x0, there, known.root)
+        by_parameter, by_start = sensitivities(known.model, known.predictor, here, x0, there, known.root)
+        by_parameter -= by_start @ np.linalg.lstsq(by_start, by_parameter, rcond=None)[0]
         raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
         effect, taps = raw_effect.copy(), steady.C[:, known.model.nx :]  # the last states are past innovations
         for lag in range(1, taps.shape[1] // here.y.shape[1] + 1):
