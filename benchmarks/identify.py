@@ -161,9 +161,11 @@ def plant(kind: str, seed: int, samples: int = 1500) -> tuple[optid.Data, str]:
     y, expected = np.zeros(samples), "linear"
     if "feedback" in kind:
         expected, gain = "feedback", rng.uniform(0.8, 1.2)
-        for k in range(2, samples):  # an oscillator whose spring hardens
+        # an oscillator whose spring hardens, so much that the errors of a linear model have 1.4 to 3.6 times the energy
+        # of the noise: the search asks for 1.22
+        for k in range(2, samples):
             driven = gain * (u[k - 1] + 0.5 * u[k - 2])
-            y[k] = driven - a[1] * y[k - 1] - a[2] * y[k - 2] - 0.12 * np.tanh(y[k - 1]) ** 3
+            y[k] = driven - a[1] * y[k - 1] - a[2] * y[k - 2] - 0.3 * np.tanh(y[k - 1]) ** 3
     else:
         expected = "linear" if drive is u else "input functions"
         for k in range(samples):
