@@ -36,7 +36,7 @@ class Predictor(NamedTuple):
     radius: float  # spectral radius of A - K C
     parts: Parts
     starts: list[Array] | None  # initial states (n,) found in units of the residuals; None: in other units
-    errors: list[Array]  # innovations (N, l) of every experiment
+    errors: Sequence[Array]  # innovations (N, l) of every experiment
     covariance: Array  # (l, l) of the innovations
     log_determinant: float  # of the covariance, -inf where its determinant is not positive
 
