@@ -20,7 +20,7 @@ Named variables: ``A``, ``C``, ``offset``, ``x0`` ((n,), or (n, experiments)), `
 signal ``mu latent``, ``b latent`` (= [Ez_i; Fz_i]) and ``z`` (= [Cz_i, Dz_i, constant]), and the affine expressions
 ``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` (P, n + l) about the iterate. With several channels the names carry the channel,
 as in ``mu[valve]``. Without feedback and latent signals the static curves (`shape.gain`, `shape.value_range`, ...) are
-constrained to first order about the iterate as well.
+constrained to first order about the iterate as well. Rules about poles read ``P`` (held) and ``Q = A P``.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -151,10 +151,12 @@ class StateSpaceFit(TangentFit):
         functions = {f"mu latent[{z}]": one.vectors @ variables[self.criterion.key("c", i)]
                      for i, (z, one) in enumerate(latent.items()) if one.row is None}
         bases = dict(zip(expansion.input_names, outer_bases(expansion.inputs, units)))
-        weight = modal_weight(values["A"])
-        view = View({**variables, "P": cp.Constant(weight), "Q": variables["A"] @ weight, **functions,
-                     **self._products(variables, values)}, iterate=True, gauge="norm",
-                    channels=expansion.input_names, outputs=expansion.output_names, reference=values, units=units,
+        regions = {}
+        if self.constraints:
+            weight = modal_weight(values["A"])
+            regions = {"P": cp.Constant(weight), "Q": variables["A"] @ weight}
+        view = View({**variables, **self._products(variables, values), **functions, **regions}, iterate=True,
+                    gauge="norm", channels=expansion.input_names, outputs=expansion.output_names, reference=values, units=units,
                     bases=bases | {z: one.basis for z, one in latent.items()},
                     spans={z: one.vectors for z, one in latent.items()})
         program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
