@@ -156,8 +156,8 @@ class StateSpaceFit(TangentFit):
             weight = modal_weight(values["A"])
             regions = {"P": cp.Constant(weight), "Q": variables["A"] @ weight}
         view = View({**variables, **self._products(variables, values), **functions, **regions}, iterate=True,
-                    gauge="norm", channels=expansion.input_names, outputs=expansion.output_names, reference=values, units=units,
-                    bases=bases | {z: one.basis for z, one in latent.items()},
+                    gauge="norm", channels=expansion.input_names, outputs=expansion.output_names, reference=values,
+                    units=units, bases=bases | {z: one.basis for z, one in latent.items()},
                     spans={z: one.vectors for z, one in latent.items()})
         program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
                           {**values, "residual": errors}, self.recover, view, frozenset(structural),
