@@ -16,6 +16,8 @@ from optid.arrays import Array
 LONGEST = 3  # outliers in a row that still count as isolated
 WINDOW = 15  # samples of the running median
 SHORT = 10_000  # samples up to which sorting every window takes less time than the import of scipy.ndimage
+SAMPLED, GOLDEN = 2000, 0.6180339887  # samples from which the scale is first estimated, and the spacing of them
+CAREFUL = 0.9  # share of this estimate that the scale of the whole record is not below
 MOST = 0.12  # largest share of outliers that is considered
 LEAST_SAMPLES = 50  # samples of a channel below which there is no test
 FAR = 6.0  # smallest deviation of an outlier, in robust standard deviations
@@ -80,6 +82,32 @@ def _additive(r: Array, signature: Array, critical: float) -> np.ndarray:
     return peak & (size > np.maximum(critical, np.maximum(rival[:n] * (1 + TIE), later))[:, None])
 
 
+def _may_hold(parts: Sequence[Array]) -> bool:
+    """Whether a long record may have outliers, by its jumps and a sample of its deviations: 8 times as fast.
+
+    An outlier is `FAR` robust standard deviations off the running median, and over `FAR` / `STEP` off a neighbour.
+    """
+    if min(x.size for x in parts) <= SHORT:
+        return True
+    half = WINDOW // 2
+
+    def deviations(x: Array, at: np.ndarray) -> Array:
+        windows = np.lib.stride_tricks.sliding_window_view(x, WINDOW)
+        return np.abs(x[at] - np.partition(windows[at - half], half, axis=1)[:, half])
+
+    spread = (np.arange(SAMPLED) * GOLDEN) % 1  # even, and in step with no period of the record
+    some = [deviations(x, half + ((x.size - 2 * half) * spread).astype(int)) for x in parts]
+    least = CAREFUL * FAR * float(np.median(np.concatenate(some))) / NORMAL_MEDIAN
+    for x in parts:
+        jumps = np.flatnonzero(np.abs(np.diff(x)) > least / STEP)
+        edge = jumps[(jumps < half) | (jumps >= x.size - half - LONGEST)]
+        runs = jumps[:-1][np.diff(jumps) <= LONGEST]  # there and back
+        near = runs[:, None] + np.arange(1, 1 + LONGEST)
+        if edge.size or near.size > SHORT or near.size and np.max(deviations(x, near.ravel())) > least:
+            return True
+    return False
+
+
 def _deviations(x: Array) -> Array:
     """Distance of every sample from the running median, extrapolated linearly at the ends."""
     if x.size < WINDOW:
@@ -101,6 +129,8 @@ def _deviations(x: Array) -> Array:
 def _outlying(parts: Sequence[Array]) -> list[np.ndarray]:
     """Mark the outliers of every experiment, by the deviations of all experiments together."""
     none = [np.zeros(x.size, dtype=bool) for x in parts]
+    if not _may_hold(parts):
+        return none
     d = np.concatenate([_deviations(x) for x in parts])
     edges = np.cumsum([x.size for x in parts])[:-1]
     if d.size < LEAST_SAMPLES:
