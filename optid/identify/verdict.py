@@ -148,7 +148,8 @@ def _structure(model: Any, data: Data) -> list[Finding]:
     if found is None:
         return []
     saved = "" if found.passed else f", which saves {100 * found.saving:.2g} % of the residual variance"
-    return [Finding("structure", f"{found.finding}{saved} (p = {found.p_value:.2g})", found.passed,
+    word = "not rejected" if found.passed else found.finding
+    return [Finding("structure", f"{word}{saved} (p = {found.p_value:.2g})", found.passed,
                     found.saving > STRUCTURE)]
 
 
