@@ -22,7 +22,7 @@ from optid.structures.rank_one import matrices
 
 BLOCK = 32  # samples whose responses are one product with a Toeplitz matrix
 TINY = 1e-150  # states below it are zero: denormal numbers would make every product with them slow
-CHUNK = 8192  # samples whose regressors are formed at once
+CHUNK = 4096  # samples whose regressors are formed at once
 MANY = 10  # rows per column from which their Gram matrix is formed first
 HELD = 1 << 22  # numbers held at once at most: models with many functions and states take shorter chunks
 
