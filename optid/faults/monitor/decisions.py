@@ -1,6 +1,6 @@
 """The decisions of a monitor: raise an alarm, isolate, carry and clear a fault."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from optid.faults.monitor.search_kernel import DRIFT
 
 RULES = {
     "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
-    "forgiven": 0.3, "odd": 4.3,
+    "forgiven": 0.3, "odd": 4.3, "beyond": 4.0,
 }
 """Numbers of the decisions.
 
@@ -22,6 +22,10 @@ samples with all statistics below `release` of their thresholds. An isolated fau
 A transient ends when its energy falls to `faded`. A carried fault is no longer estimated when the error of its size has
 the energy `learned` in a window, and is cleared when its significance falls below the share `forgiven` of the
 threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
+
+While an input was outside its identified range in the last window, the thresholds of an uncertain model are multiplied
+by its distance from the middle of the range, relative to half the range, to the power `beyond`: what a model of a smooth
+plant lacks grows with the square of the distance, and its energy with the fourth power.
 """
 
 FEWEST = 4
@@ -51,14 +55,33 @@ class Decisions:
     named_at: int = 0  # sample at which it was isolated
     quiet: int = 0  # consecutive samples with statistics below the release level
     begun: int = 0  # first sample after the last unknown input
+    # [sample, factor of the thresholds] of inputs outside their range in the last window, the factors falling
+    raised: list[list[float]] = field(default_factory=list)
     kept: list[Array] | None = None  # the statistics (T, C) of all samples, where they are requested
 
-    KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "passing"
+    KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing"
+
+    @property
+    def thresholds(self) -> Array:
+        """(C,) thresholds at this sample."""
+        return self.q * (self.raised[0][1] if self.raised else 1.0)
 
     @property
     def limit(self) -> Array:
         """(C,) energies at which the search must stop for a decision."""
-        return self.q if self.phase == WATCHING else np.zeros(len(self.q))
+        return self.thresholds if self.phase == WATCHING else np.zeros(len(self.q))
+
+    def leave_range(self, now: int, distance: float) -> None:
+        """Raise the thresholds for inputs so many half ranges from the middle of their range at the sample `now`."""
+        factor = distance ** self.rules["beyond"]
+        while self.raised and self.raised[-1][1] <= factor:
+            self.raised.pop()
+        self.raised.append([now, factor])
+
+    def forget_range(self, oldest: int) -> None:
+        """Discard inputs outside their range before the sample `oldest`."""
+        while self.raised and self.raised[0][0] < oldest:
+            self.raised.pop(0)
 
     @property
     def waiting(self) -> bool:
@@ -67,7 +90,7 @@ class Decisions:
 
     def count_quiet(self, statistic: Array) -> None:
         """Count the samples at the end of a block with all statistics (T, C) below the release level."""
-        loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.q, axis=1))
+        loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.thresholds, axis=1))
         self.quiet = self.quiet + len(statistic) if not loud.size else len(statistic) - 1 - int(loud[-1])
         if self.kept is not None:
             self.kept.append(statistic)
@@ -90,7 +113,7 @@ class Decisions:
 
     def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
         """Return the event of the last sample; no fault is isolated while a sensor repeats its reading (`hold`)."""
-        gains = np.where(window.peak > 0, window.statistic - self.q, -np.inf)
+        gains = np.where(window.peak > 0, window.statistic - self.thresholds, -np.inf)
         best, watching = int(np.argmax(gains)), self.phase == WATCHING
         if self.phase in (WATCHING, LOST) and gains[best] > 0:
             self.phase, self.alarm = NAMING, now
@@ -110,7 +133,7 @@ class Decisions:
     def _name(self, now: int, best: int, gains: Array, window: Window, plant: RunningFilter) -> Event | None:
         rule, noise = self.rules, self._noisy_sensor(now, window)
         # increased noise is an answer, too, and the likely one where no candidate explained the alarm before
-        louder = (0.0 if noise is None else noise.statistic) - float(self.q.min()) * (self.named != AGAIN)
+        louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.min()) * (self.named != AGAIN)
         share = np.exp(np.clip(np.append(gains, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
         chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is isolated
@@ -156,7 +179,7 @@ class Decisions:
         window.restart()
         if said:
             return None
-        if noise is not None and noise.statistic > self.q.min():
+        if noise is not None and noise.statistic > self.thresholds.min():
             return noise
         return Event("isolated", now, (("unknown", 1.0),), onset, (), energy, "no candidate explains it")
 

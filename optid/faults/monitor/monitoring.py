@@ -110,7 +110,8 @@ class Monitor:
                 warnings.warn(self.remark, DataWarning, stacklevel=2)
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
-        self._set(found, int(window), seed, {**RULES, **rules} | ({} if found.unknown else {"odd": np.inf}))
+        rules = {**RULES, **({"beyond": 0.0} if known is None else {}), **rules}  # an exact model has no errors
+        self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}))
         for c in found.candidates:
             if c.label in self.skipped and c.kind != "loss":  # the gains of sensors are among the kinds by default
                 warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
@@ -246,12 +247,17 @@ class Monitor:
         alone = np.isnan(y).any(axis=1) | screened.unsure.any(axis=1) | screened.repeating | frozen
         stops, events, k = np.append(np.flatnonzero(alone), count), list(screened.events), 0
         while k < count:
+            self.decisions.forget_range(self.samples - self.window)
             clean = int(stops[np.searchsorted(stops, k)])
+            if self.decisions.raised:  # the thresholds stay the same up to here
+                clean = min(clean, k + int(self.decisions.raised[0][0]) + self.window + 1 - self.samples)
             if clean > k and self.plant.certain and self.decisions.waiting:
                 k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
                 continue
             if k in screened.frozen:
                 self._excuse(screened.frozen[k])
+            if screened.distance[k] > 1:
+                self.decisions.leave_range(self.samples, float(screened.distance[k]))
             self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
             k += 1
         return sorted(events, key=lambda e: e.sample)

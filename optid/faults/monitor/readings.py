@@ -24,6 +24,7 @@ class Screened(NamedTuple):
 
     y: Array  # (T, l) readings; those of frozen sensors are missing
     unsure: np.ndarray  # (T, m) inputs that are missing or outside their range
+    distance: Array  # (T,) largest distance of such an input from the middle of its range, in half ranges; at least one
     repeating: np.ndarray  # (T,) whether a sensor repeats the reading of the sample before
     events: list[Event]  # in the order of their samples
     frozen: dict[int, int]  # {sample of the block: onset in samples of the stream} of the sensors found frozen
@@ -50,7 +51,9 @@ class ReadingChecks:
     def screen(self, u: Array, y: Array, start: int) -> Screened:
         """Check a block of inputs (T, m) and readings (T, l) that begins at the sample `start` of the stream."""
         outside, blind = np.asarray((u < self.low) | (u > self.high)), np.asarray(np.isnan(u).any(axis=1))
-        found = Screened(y.copy(), outside | np.isnan(u), np.zeros(len(y), dtype=bool), [], {})
+        distance, (at, c) = np.ones(len(u)), np.nonzero(outside)
+        np.maximum.at(distance, at, np.abs(2 * u[at, c] - self.low[c] - self.high[c]) / (self.high[c] - self.low[c]))
+        found = Screened(y.copy(), outside | np.isnan(u), distance, np.zeros(len(y), dtype=bool), [], {})
         for c in range(u.shape[1]):
             self._range(c, u[:, c], outside[:, c], start, found.events)
         for o in range(y.shape[1]):
