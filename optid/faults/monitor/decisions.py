@@ -24,8 +24,8 @@ the energy `learned` in a window, and is cleared when its significance falls bel
 threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
 
 While an input was outside its identified range in the last window, the thresholds of an uncertain model are multiplied
-by its distance from the middle of the range, relative to half the range, to the power `beyond`: what a model of a smooth
-plant lacks grows with the square of the distance, and its energy with the fourth power.
+by its distance from the middle of the range, relative to half the range, to the power `beyond`: what a model of a
+smooth plant lacks grows with the square of the distance, and its energy with the fourth power.
 """
 
 FEWEST = 4
