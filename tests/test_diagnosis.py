@@ -382,6 +382,28 @@ def test_the_uncertainty_of_an_identified_model_counts_or_is_refused(found, limi
     np.testing.assert_allclose(used.size_interval, unsure.size_interval, rtol=1e-9)
 
 
+def test_where_outputs_leave_the_identified_range_the_model_is_less_certain(found):
+    long = inputs(300, 7)
+    known = model_uncertainty(small(), Data(long, inject(small(), long, seed=8)))
+    low, high = known.levels
+    faulty = record(Fault.step("sensor:y2", 60, 2 * high[1]))
+    inside = replace(known, levels=10 * known.levels)
+    sure, rough = (diagnose(small(), faulty, found, model_uncertainty=one) for one in (inside, known))
+    assert "outside" not in sure.status and "y2 is outside the identified range" in rough.status
+    assert sure.best.label == rough.best.label == "sensor:y2"
+    widths = [float(np.diff(answer.size_interval[0])[0]) for answer in (sure, rough)]
+    assert widths[1] > widths[0]
+    assert len(rough.candidates) >= len(sure.candidates)
+
+    y = np.tile((low + high) / 2, (40, 1))
+    y[10, 0], y[20:25, 1], y[22, 0] = 9 * high[0], high[1] + 3 * (high[1] - low[1]) / 2, np.nan
+    expected = np.ones(y.shape)
+    expected[21:24, 1] = 4.0  # an outlier and a missing reading are at no distance
+    np.testing.assert_allclose(known.distance(y), expected)
+    assert [note.partition(" in ")[2] for note in known.extrapolated(y)] == [
+        "3 samples, first in sample 21: the model is less certain there."]
+
+
 # -- bad input -------------------------------------------------------------------------------------------------------
 
 

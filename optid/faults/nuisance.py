@@ -19,6 +19,10 @@ P. The record of identification is therefore cut into sections. Let S be the sen
 vary between the sections with the covariance (c - 1) P give the innovations along S P S' (eigenvalues s^2 < 1) the
 variance 1 + (c - 2) s^2: one s^2 less than in a later record, because the parameters were fitted to this one. P is
 multiplied by the estimate of c (overdispersion) where c = 1 is rejected.
+
+A fault can drive the plant far from where it was identified. What a model of a smooth plant lacks grows with the square
+of the distance: where a reading is d half ranges from the middle of its range, d > 1, the effect of the parameters on
+it is multiplied by d^2.
 """
 
 from collections.abc import Callable, Iterator
@@ -62,6 +66,9 @@ REJECTED = 3.0
 ITERATIONS = 30
 """Iterations of the estimate of their variation."""
 
+BEYOND = 1.1
+"""Distance of the readings from the middle of their range, in half ranges, from which the model extrapolates."""
+
 DRAWS = 4000
 """Simulated energies behind the bound of the factor."""
 
@@ -100,6 +107,7 @@ class ModelUncertainty:
         root: (parameters, q) with covariance root root'.
         readings: number of readings behind it, less one for each initial state estimated.
         inflation: factor of the covariance, from a healthy record or from the sections of the identification.
+        levels: (2, l) lowest and highest readings of the identification; None for a model that is exact.
     """
 
     model: "HammersteinSS"
@@ -107,11 +115,35 @@ class ModelUncertainty:
     root: Array
     readings: int
     inflation: float = 1.0
+    levels: Array | None = None
 
     @cached_property
     def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
         """Two models beside the model along every column of root, and the factor of their difference."""
         return list(moved_models(self.model, self.root))
+
+    def distance(self, y: Array) -> Array:
+        """Return how far readings (N, l) are from the middle of their identified range, in half ranges, at least one.
+
+        A single reading far out is an outlier: the smallest of three neighbours counts.
+        """
+        from scipy.ndimage import minimum_filter1d
+
+        if self.levels is None:
+            return np.ones(y.shape)
+        low, high = self.levels
+        return minimum_filter1d(np.fmax(np.abs(2 * y - low - high) / (high - low), 1.0), 3, axis=0, mode="nearest")
+
+    def extrapolated(self, y: Array) -> list[str]:
+        """State the outputs whose readings (N, l) leave the range they were identified over, and since when."""
+        if self.levels is None:
+            return []
+        far, notes = self.distance(y) > BEYOND, []
+        for name, low, high, samples in zip(self.model.outputs, *self.levels, map(np.flatnonzero, far.T)):
+            if samples.size:
+                notes.append(f"{name} is outside the identified range [{low:.4g}, {high:.4g}] in {samples.size} "
+                             f"samples, first in sample {samples[0]}: the model is less certain there.")
+        return notes
 
     def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
         """Return the effect of the uncertainty on the whitened innovations of a record.
@@ -123,7 +155,7 @@ class ModelUncertainty:
             free_start: whether the initial state is unknown, because it was estimated from this record.
         """
         by_parameter, by_start = sensitivities(self.model, self.predictor, part, x0, present, self.root)
-        columns = [by_parameter]
+        columns = [self.distance(part.y).reshape(-1, 1) ** 2 * by_parameter]
         if free_start:
             sizes = np.linalg.norm(by_start, axis=0)
             columns.append(DIFFUSE * by_start / np.where(sizes > 0, sizes, 1.0))
@@ -168,6 +200,8 @@ def model_uncertainty(
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
     sections: list[tuple[Array, Array]] = []
+    readings_of = np.vstack([part.y for part in in_units_of(gained, data).experiments])
+    levels = np.array([np.nanmin(readings_of, axis=0), np.nanmax(readings_of, axis=0)])
     length = max(count // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(gained, steady, data):
         by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
@@ -192,7 +226,7 @@ def model_uncertainty(
     scale = np.sqrt(energy / (readings - int(known.sum())))
     root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
-    found = ModelUncertainty(gained, steady, root, readings)
+    found = ModelUncertainty(gained, steady, root, readings, levels=levels)
     if healthy is not None:
         return _inflated(found, healthy)
     unit = root / scale

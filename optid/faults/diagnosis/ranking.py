@@ -39,6 +39,10 @@ STRETCH = 100
 BEFORE = 25
 """Samples of this section before the best onset."""
 
+TEMPERED = 0.5
+"""Power of the likelihoods where outputs leave the range of the identification: the likelihood of a model that is
+wrong there says too much (J. W. Miller, D. B. Dunson, J. American Statistical Association 114, 2019)."""
+
 NOTHING = Certificate("none", float("nan"))
 
 
@@ -178,6 +182,7 @@ def ranked(seen: RecordSearch, explanations: Sequence[Explanation]) -> Ranking:
     # a further fault beside one is as rare as a false alarm
     rare = np.array([np.log(seen.asked.false_alarm) * (len(e.candidates) - 1) for e in best])
     logs = rare + [np.logaddexp.reduce([e.log_evidence for e in group]) for group in named.values()]
+    logs = logs * (TEMPERED if seen.extrapolated else 1.0)
     posterior = np.exp(logs - np.logaddexp.reduce(logs))
     largest = np.sort(logs[np.isfinite(logs)])
     odds = float(2 * (largest[-1] - largest[-2])) if largest.size > 1 else np.inf

@@ -107,6 +107,11 @@ class RecordSearch:
         return [c for c, gains in zip(self.dictionary.candidates, self.gains) if not np.isnan(gains).all()]
 
     @cached_property
+    def extrapolated(self) -> bool:
+        """Whether outputs leave the range over which an uncertain model was identified."""
+        return bool(self.noise["uncertainty"].extrapolated(self.part.y))
+
+    @cached_property
     def p_value(self) -> float:
         """p-value of the healthy plant; there is an alarm at or below the false-alarm probability."""
         values = [1.0]
