@@ -12,7 +12,7 @@ from test_fault_injection import small
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
 from optid.faults import Fault, health, inject, model_uncertainty, predictor, whiten
-from optid.faults.nuisance import largest_factor, overdispersion
+from optid.faults.nuisance import largest_factor, overdispersion, parameters, sensitivities
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.kalman import kalman_gain
 
@@ -109,8 +109,6 @@ def test_bad_input():
 
 def drawn(uncertainty, seed):
     """A model of the distribution."""
-    from optid.faults.nuisance import parameters
-
     theta, _, back = parameters(uncertainty.model)
     return back(theta + uncertainty.root @ np.random.default_rng(seed).standard_normal(uncertainty.root.shape[1]))
 
@@ -154,7 +152,7 @@ def test_the_largest_factor_is_an_upper_bound():
 
 
 def test_a_healthy_record_enlarges_a_covariance_that_is_too_small():
-    """Models drawn from the covariance they claim, and from four times as much."""
+    """A plant that stayed as it was, and plants that changed by twice what the covariance claims."""
     model = small()
     long, u = levels(400, 0), levels(300, 1)
     origin = Data(long, inject(model, long))
@@ -165,8 +163,27 @@ def test_a_healthy_record_enlarges_a_covariance_that_is_too_small():
     for seed in range(7):
         wrong = drawn(replace(claimed, root=2 * claimed.root), seed)
         noise = NoiseCovariances.of_innovations(wrong.K, claimed.predictor.covariance)
-        factors.append(model_uncertainty(replace(wrong, noise=noise), origin, healthy=healthy).inflation)
+        wrong = replace(wrong, noise=noise)
+        factors.append(model_uncertainty(wrong, Data(long, inject(wrong, long)), healthy=healthy).inflation)
     assert np.median(factors) > 3
+
+
+def test_parameters_that_are_not_the_most_likely_ones_deviate_by_what_their_record_shows():
+    """A model moved by twenty standard deviations: the covariance gets this displacement, as predictions see it."""
+    model, u = small(), levels(1000, 0)
+    data = Data(u, inject(model, u))
+    right = model_uncertainty(model, data)
+    theta, _, back = parameters(right.model)
+    moved = back(theta + 20 * right.root[:, -1])
+    moved = replace(moved, noise=NoiseCovariances.of_innovations(moved.K, right.predictor.covariance))
+    found = model_uncertainty(moved, data)
+    assert found.root.shape[1] == right.root.shape[1] + 1 and found.inflation == 1.0
+    part, present = data.experiments[0], np.ones((1000, model.l), dtype=bool)
+    displacement = np.column_stack([20 * right.root[:, -1], found.root[:, -1]])
+    seen, _ = sensitivities(right.model, right.predictor, part, np.zeros(model.nx), present, displacement)
+    # the true parameters are not the most likely ones either: sqrt(q) standard deviations off
+    assert np.linalg.norm(seen[:, 0] - seen[:, 1]) < 2 * np.sqrt(right.root.shape[1])
+    assert np.linalg.norm(seen[:, 0]) > 19
 
 
 def test_parameters_that_vary_with_the_operating_point_enlarge_the_covariance():

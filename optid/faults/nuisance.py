@@ -14,6 +14,9 @@ The covariance is that of the linearised predictions; the errors of a maximum-li
 larger. With a later healthy record, `model_uncertainty(model, data, healthy=...)` multiplies P by the largest factor
 that this record allows.
 
+Parameters that are not the most likely ones, such as those of a subspace fit, deviate from these by d = P Psi' r, r the
+innovations of the record of identification: d d' is added to P where it is significant.
+
 A plant outside the model class has no true parameters: those that fit best vary with the operating point, by more than
 P. The record of identification is therefore cut into sections. Let S be the sensitivity of a section. Parameters that
 vary between the sections with the covariance (c - 1) P give the innovations along S P S' (eigenvalues s^2 < 1) the
@@ -226,13 +229,15 @@ def model_uncertainty(
     scale = np.sqrt(energy / (readings - int(known.sum())))
     root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
-    found = ModelUncertainty(gained, steady, root, readings, levels=levels)
-    if healthy is not None:
-        return _inflated(found, healthy)
     unit = root / scale
-    factor = overdispersion([unit.T @ gram @ unit for gram, _ in sections],
-                            [unit.T @ along / scale for _, along in sections])
-    return replace(found, root=np.sqrt(factor) * root, inflation=factor)
+    grams = [unit.T @ gram @ unit for gram, _ in sections]
+    scores = [unit.T @ along / scale for _, along in sections]
+    score, deviation = np.sum(scores, axis=0), np.zeros((size, 0))
+    if score @ score > len(score) + REJECTED * np.sqrt(2 * len(score)):
+        scores, deviation = [s - gram @ score for s, gram in zip(scores, grams)], root @ score[:, None]
+    factor = overdispersion(grams, scores) if healthy is None else 1.0
+    found = ModelUncertainty(gained, steady, np.hstack([np.sqrt(factor) * root, deviation]), readings, factor, levels)
+    return found if healthy is None else _inflated(found, healthy)
 
 
 def overdispersion(grams: list[Array], correlations: list[Array]) -> float:
