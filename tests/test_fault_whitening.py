@@ -178,6 +178,8 @@ def test_parameters_that_are_not_the_most_likely_ones_deviate_by_what_their_reco
     moved = replace(moved, noise=NoiseCovariances.of_innovations(moved.K, right.predictor.covariance))
     found = model_uncertainty(moved, data)
     assert found.root.shape[1] == right.root.shape[1] + 1 and found.inflation == 1.0
+    assert 15 < found.deviation < 25 and "hammerstein_ss.exact" in found.remark
+    assert right.deviation == 0 and right.remark == ""
     part, present = data.experiments[0], np.ones((1000, model.l), dtype=bool)
     displacement = np.column_stack([20 * right.root[:, -1], found.root[:, -1]])
     seen, _ = sensitivities(right.model, right.predictor, part, np.zeros(model.nx), present, displacement)

@@ -111,6 +111,7 @@ class ModelUncertainty:
         readings: number of readings behind it, less one for each initial state estimated.
         inflation: factor of the covariance, from a healthy record or from the sections of the identification.
         levels: (2, l) lowest and highest readings of the identification; None for a model that is exact.
+        deviation: of the parameters from the most likely ones, in standard deviations; 0 where it is not significant.
     """
 
     model: "HammersteinSS"
@@ -119,11 +120,21 @@ class ModelUncertainty:
     readings: int
     inflation: float = 1.0
     levels: Array | None = None
+    deviation: float = 0.0
 
     @cached_property
     def moves(self) -> "list[tuple[HammersteinSS, HammersteinSS, float]]":
         """Two models beside the model along every column of root, and the factor of their difference."""
         return list(moved_models(self.model, self.root))
+
+    @property
+    def remark(self) -> str:
+        """Advice where the parameters are not the most likely ones; empty otherwise."""
+        if not self.deviation:
+            return ""
+        return (f"The parameters are {self.deviation:.0f} standard deviations from the most likely ones, so that small "
+                "faults stay hidden: fit the model by its prediction errors (hammerstein_ss.exact with "
+                "criterion=prediction).")
 
     def distance(self, y: Array) -> Array:
         """Return how far readings (N, l) are from the middle of their identified range, in half ranges, at least one.
@@ -232,11 +243,15 @@ def model_uncertainty(
     unit = root / scale
     grams = [unit.T @ gram @ unit for gram, _ in sections]
     scores = [unit.T @ along / scale for _, along in sections]
-    score, deviation = np.sum(scores, axis=0), np.zeros((size, 0))
-    if score @ score > len(score) + REJECTED * np.sqrt(2 * len(score)):
-        scores, deviation = [s - gram @ score for s, gram in zip(scores, grams)], root @ score[:, None]
-    factor = overdispersion(grams, scores) if healthy is None else 1.0
-    found = ModelUncertainty(gained, steady, np.hstack([np.sqrt(factor) * root, deviation]), readings, factor, levels)
+    score = np.sum(scores, axis=0)
+    deviation = float(np.linalg.norm(score))
+    if deviation**2 <= len(score) + REJECTED * np.sqrt(2 * len(score)):
+        deviation, score = 0.0, 0 * score
+    factor = 1.0
+    if healthy is None:
+        factor = overdispersion(grams, [one - gram @ score for one, gram in zip(scores, grams)])
+    both = np.column_stack([np.sqrt(factor) * root, root @ score]) if deviation else np.sqrt(factor) * root
+    found = ModelUncertainty(gained, steady, both, readings, factor, levels, deviation)
     return found if healthy is None else _inflated(found, healthy)
 
 

@@ -105,7 +105,7 @@ def uncertainty_of(
                 "The predictor of this uncertainty is not decoupled from the declared disturbances: pass the fit in "
                 "place of the model, or model_uncertainty(faults.model, data, decoupled=faults.predictor)."
             )
-        return wanted, ""
+        return wanted, wanted.remark
     if wanted not in (None, "use", "ignore"):
         raise StructureError(f"model_uncertainty={wanted!r}: it must be 'use', 'ignore' or a ModelUncertainty.")
     if wanted == "use" and data is None:
@@ -117,7 +117,7 @@ def uncertainty_of(
     if wanted == "ignore" or data is None:
         return None, ""
     found = model_uncertainty(model, data, decoupled=decoupled)
-    return found, "The uncertainty of the identified model is treated as noise."
+    return found, f"The uncertainty of the identified model is treated as noise. {found.remark}".strip()
 
 
 def without_flat_lines(record: Data, number: int) -> tuple[Experiment, tuple[FlatLine, ...]]:

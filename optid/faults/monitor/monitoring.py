@@ -54,7 +54,7 @@ class Monitor:
         calibration: the thresholds and their basis.
         window: samples of the window.
         seed: of the simulation.
-        remark: on the noise of the healthy records; empty without.
+        remark: on the parameters of the model and the noise of the healthy records; empty without.
         source: origin of the stream in JSON types, kept with the state.
     """
 
@@ -89,7 +89,8 @@ class Monitor:
             DataError: a simulation too short for the ARL0; a healthy record that is too short.
 
         Warns:
-            DataWarning: candidates that a monitor cannot search for; a healthy record with other noise than the model.
+            DataWarning: candidates that a monitor cannot search for; a healthy record with other noise than the model;
+                a model whose parameters are not the most likely ones.
         """
         found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
         if found.model is not model:
@@ -100,14 +101,17 @@ class Monitor:
         unknown = set(rules) - set(RULES)
         if unknown:
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
-        self.remark, effect, inputs, known = "", None, None, uncertainty
+        effect, inputs, known, remarks = None, None, uncertainty, []
         if known is not None:
             known = known if isinstance(known, ModelUncertainty) else model_uncertainty(model, known)
             found = replace(found, predictor=known.predictor)
+            remarks.append(known.remark)
         if healthy is not None:
-            found, self.remark = observed(found, healthy)
-            if self.remark:
-                warnings.warn(self.remark, DataWarning, stacklevel=2)
+            found, remark = observed(found, healthy)
+            remarks.append(remark)
+        for remark in filter(None, remarks):
+            warnings.warn(remark, DataWarning, stacklevel=2)
+        self.remark = " ".join(filter(None, remarks))
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
         rules = {**RULES, **({"beyond": 0.0} if known is None else {}), **rules}  # an exact model has no errors
