@@ -239,18 +239,17 @@ def test_outside_the_identified_range_thresholds_grow_for_a_window(tmp_path):
     u[100:103, 0], u[110:160, 0] = 3.0, 1.8
     y = inject(model, u, Fault.step("sensor:y2", 130, 0.7), seed=2)
 
-    def watching(exponent):
-        return watch(model, found, 40, 20.0, beyond=exponent)
+    def watching(most):
+        return watch(model, found, 40, 20.0, beyond=most)
 
-    plain, blocks, steps = watching(0.0), watching(4.0), watching(4.0)
+    plain, blocks, steps = watching(1.0), watching(5.0), watching(5.0)
     single, raised = [], []
     for a, b in zip(u, y):
         single += steps.step(a, b)
         raised.append(steps.decisions.thresholds[0] / 20.0)
     half = (steps.checks.high[0] - steps.checks.low[0]) / 2
-    far, near = 3.0 / half, 1.8 / half
-    assert raised[99] == raised[201] == 1
-    assert raised[142] == pytest.approx(far**4) and raised[143] == raised[199] == pytest.approx(near**4)
+    assert raised[99] == raised[201] == 1 and raised[142] == 5  # 3.0 is far out
+    assert raised[143] == raised[199] == pytest.approx((1.8 / half) ** 4)
     first = blocks.run(u[:180], y[:180])
     restored = Monitor.load(blocks.save(tmp_path / "monitor.npz"))
     assert single == first + restored.run(u[180:], y[180:])

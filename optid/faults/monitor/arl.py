@@ -103,7 +103,7 @@ def calibrate(
         samples: samples to simulate; enough for `ALARMS` false alarms by default, `LONGEST` at most.
         seed: of the simulation.
         extrapolate: whether the tail may be extrapolated where the simulation is too short.
-        effect: (T, l, q) signatures of uncertain parameters of unit variance in the innovations along f.
+        effect: of uncertain parameters on the innovations along f, as of `parameter_effect`.
     """
     if not (np.isfinite(arl0) and arl0 >= window):
         raise StructureError(f"arl0={arl0!r}: it must be at least the window, {window} samples.")
@@ -125,7 +125,7 @@ def calibrate(
             rows = (place + np.arange(-1, length + window)) % period
             r = rng.standard_normal((length + window, l))
             if effect is not None:  # every stretch has a model of its own
-                r += effect[rows[1:]] @ rng.standard_normal(effect.shape[2])
+                r += effect[rows[1:]] @ np.append(rng.standard_normal(effect.shape[2] - 1), 1.0)
             inputs = f[rows] if len(f) else np.zeros((len(rows), f.shape[1]))
             _, statistic, _ = Window(columns, window, len(steady.A), steady).advance(
                 columns.signals(inputs[:-1], inputs[1:]), r, np.full(len(columns.size), np.inf))

@@ -13,7 +13,7 @@ from optid.faults.monitor.search_kernel import DRIFT
 
 RULES = {
     "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
-    "forgiven": 0.3, "odd": 4.3, "beyond": 4.0,
+    "forgiven": 0.3, "odd": 4.3, "beyond": 2.0,
 }
 """Numbers of the decisions.
 
@@ -24,8 +24,8 @@ the energy `learned` in a window, and is cleared when its significance falls bel
 threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
 
 While an input was outside its identified range in the last window, the thresholds of an uncertain model are multiplied
-by its distance from the middle of the range, relative to half the range, to the power `beyond`: what a model of a
-smooth plant lacks grows with the square of the distance, and its energy with the fourth power.
+by the fourth power of its distance from the middle of the range, relative to half the range, and by `beyond` at most:
+what a model of a smooth plant lacks grows with the square of the distance, and its energy with the fourth power.
 """
 
 FEWEST = 4
@@ -73,7 +73,7 @@ class Decisions:
 
     def leave_range(self, now: int, distance: float) -> None:
         """Raise the thresholds for inputs so many half ranges from the middle of their range at the sample `now`."""
-        factor = distance ** self.rules["beyond"]
+        factor = min(distance**4, self.rules["beyond"])
         while self.raised and self.raised[-1][1] <= factor:
             self.raised.pop()
         self.raised.append([now, factor])

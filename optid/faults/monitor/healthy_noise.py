@@ -30,7 +30,10 @@ LONGEST = 3000
 
 
 def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> tuple[Array, Array]:
-    """Return signatures (T, l, q) of uncertain parameters of unit variance, and the functions of the inputs (T, r).
+    """Return the effect of uncertain parameters (T, l, q + 1), and the functions of the inputs (T, r).
+
+    The effect consists of signatures of parameters of unit variance and, last, that of their deviation from the most
+    likely ones.
 
     The innovations are those of the record of the identification, whitened by the predictor of the uncertainty or by
     that with the colour of a healthy record, less what an initial state explains: where the predictor forgets slowly, a
@@ -50,7 +53,10 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
             effect[lag:] -= taps[:, (lag - 1) * len(taps) : lag * len(taps)] @ raw_effect[:-lag]
         effects.append(steady.root @ effect)
         inputs.append(known.model.expanded(here.u))
-    return np.concatenate(effects), np.nan_to_num(np.concatenate(inputs))
+    effect = np.concatenate(effects)
+    if not known.deviation:
+        effect = np.concatenate([effect, np.zeros((*effect.shape[:2], 1))], axis=2)
+    return effect, np.nan_to_num(np.concatenate(inputs))
 
 
 def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:

@@ -114,7 +114,7 @@ class Monitor:
         self.remark = " ".join(filter(None, remarks))
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
-        rules = {**RULES, **({"beyond": 0.0} if known is None else {}), **rules}  # an exact model has no errors
+        rules = {**RULES, **({"beyond": 1.0} if known is None else {}), **rules}  # an exact model has no errors
         self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}))
         for c in found.candidates:
             if c.label in self.skipped and c.kind != "loss":  # the gains of sensors are among the kinds by default
