@@ -149,6 +149,9 @@ def test_a_scheduled_change_is_the_difference_of_two_predictors(gaps):
         there = ~np.isnan(row)
         assert there[:55].all()
         np.testing.assert_allclose(row[there], np.array(energies)[there], rtol=1e-7)
+    without = scan(dictionary(model, state_jump=False), white, u)  # the others are what they are without a schedule
+    same = [result.index(label) for label in without.labels]
+    np.testing.assert_allclose(result.statistic[same], without.statistic, rtol=1e-9, atol=1e-9)
     limits = thresholds(found, white, u=u, draws=5000)
     gains = result.gains(limits)
     c, onset = np.unravel_index(np.nanargmax(gains), gains.shape)
