@@ -154,7 +154,8 @@ def _verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution
     bound: Bound | None = None
     if status in (Status.LOCAL, Status.INACCURATE) and prove:
         point, bound = _proof(program, back_end, settings, point, separate)
-        outside = point.residuals is not None and point.residuals.violation > tolerance(settings.accuracy)
+        assert point.residuals is not None
+        outside = point.residuals.violation > tolerance(settings.accuracy)
         if bound is not None and bound.proved and outside:  # a point outside may well lie below the optimum
             bound = replace(bound, proved=False, reason=f"no proof: the point violates {point.residuals.worst!r}")
         if bound is not None and bound.proved and status is Status.LOCAL:
