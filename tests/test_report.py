@@ -1,10 +1,10 @@
 import json
 import re
 import warnings
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from html_page import Page
 from matplotlib.figure import Figure
 from sample_fits import example_fit, feedback_fit, linear_fit, mimo_fit, two_by_two
 
@@ -12,39 +12,6 @@ import optid
 from optid import report
 from optid.show.sections import extremes
 from optid.show.svg import inline
-
-
-class Page(HTMLParser):
-    """Elements, attributes and visible text of a page; refuses tags that are not closed in order."""
-
-    VOID = {"meta", "link", "br", "img", "hr", "input"}
-
-    def __init__(self, source: str) -> None:
-        super().__init__()
-        source = re.sub(r"<script>.*?</script>", "", source, flags=re.DOTALL)
-        self.open: list[str] = []
-        self.attributes: list[tuple[str, str, str]] = []
-        self.text = ""
-        self.feed(source)
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if not self.open or self.open[-1] not in ("style", "title", "script"):
-            self.text += data
-
-    def values(self, name: str) -> list[str]:
-        return [value for _, attribute, value in self.attributes if attribute == name]
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,11 @@
 import json
 import re
 import time
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 from browser import CHROMIUM, NO_BROWSER, Browser
+from html_page import Page
 from study_rows import rows as synthetic
 
 from optid.errors import DataError
@@ -22,34 +22,6 @@ from optid.studies.verdicts.verdict import conclude
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 HOSTILE = '</script><script>window.hacked = 1</script><img src=x onerror="window.hacked = 2">"\'&amp;\u2028{{ 7 * 7 }}'
 RUNS = 1500
-
-
-class Page(HTMLParser):
-    """Elements and attributes of a page; refuses tags that are not closed in order."""
-
-    VOID = {"meta", "link", "br", "img", "hr", "input"}
-
-    def __init__(self, source):
-        super().__init__()
-        self.open, self.attributes, self.tags, self.text = [], [], [], ""
-        self.feed(source)
-        assert self.open == []
-
-    def handle_starttag(self, tag, attrs):
-        self.attributes += [(tag, name, value or "") for name, value in attrs]
-        self.tags.append(tag)
-        if tag not in self.VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if not {"script", "style"} & set(self.open):
-            self.text += data
-
-    def values(self, name):
-        return [value for _, attribute, value in self.attributes if attribute == name]
 
 
 @pytest.fixture(scope="module")
