@@ -9,7 +9,7 @@ from optid.arrays import Array, as_list
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.monitor.arl import COMMON, Calibration
-from optid.faults.nuisance import ModelUncertainty, sensitivities
+from optid.faults.nuisance import CONFIDENCE, ModelUncertainty, sensitivities
 from optid.faults.ranges import outside, unsure_since
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
@@ -130,15 +130,17 @@ def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dict
 
 
 def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
-    """Return thresholds that a healthy record does not exceed: those of `base` times a factor of at least one.
+    """Return thresholds with no more alarms on a healthy record than are due: those of `base` times a factor.
 
-    A record is rarely long enough for its false-alarm rate to be measured. The factor is the larger of two: the ratio
-    of the energies that a tenth of its windows exceed to those of the simulation, and 1.05 times its largest energy
-    over the threshold.
+    A record is rarely long enough for its false-alarm rate to be measured. The factor is one, unless more than a tenth
+    of the windows reach the energies that a tenth of the simulated ones reach, or there are more alarms than in 95 % of
+    records of this length; then it is the ratio of these energies, or the one that leaves so many alarms.
 
     Raises:
         DataError: a record of fewer than 20 windows.
     """
+    from scipy.special import bdtrik, pdtrik
+
     window, records = monitor.window, in_units_of(monitor.dictionary.model, healthy).experiments
     watched = [monitor.watched(part.u, part.y)[: len(part.y) // window * window] for part in records]
     blocks = np.vstack([one.reshape(-1, window, len(base.q)).max(axis=1) for one in watched])
@@ -146,6 +148,9 @@ def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calib
     if len(largest) < FEWEST:
         raise DataError(
             f"The healthy record has {len(largest)} stretches of {window} samples: {FEWEST} are needed for thresholds.")
-    ratio = float(np.quantile(largest, 1 - COMMON)) / base.common
-    factor = max(1.0, ratio, 1.05 * float(largest.max()))
+    due = sum(len(part.y) for part in records) / base.arl0
+    allowed = min(int(np.ceil(pdtrik(CONFIDENCE, due))), len(largest) - 1)
+    factor = max(1.0, float(np.sort(largest)[-1 - allowed]))
+    if np.sum(largest > base.common) > bdtrik(CONFIDENCE, len(largest), COMMON):
+        factor = max(factor, float(np.quantile(largest, 1 - COMMON)) / base.common)
     return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.y) for part in records))
