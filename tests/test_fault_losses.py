@@ -1,5 +1,7 @@
 """Losses and stuck actuators between bounds: equal to a quadratic programme, right about what is left."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from fault_plants import levels, refused, standard
@@ -9,8 +11,10 @@ from test_fault_injection import small
 from test_fault_scan import record
 
 from optid import Data
+from optid.bases import Triangular
 from optid.errors import StructureError
 from optid.faults import Fault, bounded, dictionary, inject, scan, severity, whiten
+from optid.models import Nonlinearity
 
 
 def broken(model, fault, seed=0, count=160):
@@ -18,6 +22,17 @@ def broken(model, fault, seed=0, count=160):
     data = Data(u, inject(model, u, fault, seed=seed), dt=model.dt, outputs=model.outputs)
     found = dictionary(model, kinds=["loss", "stuck"], state_jump=False)
     return scan(found, whiten(model, data, x0="zero"), u)
+
+
+def test_a_nonlinearity_that_is_constant_over_the_reach_has_one_stop():
+    saturated = Nonlinearity(Triangular(8, (-2.0, 2.0)), np.clip(np.linspace(-3, 3, 8), -1, 1))
+    model = small()
+    model = replace(model, nonlinearities=(saturated, *model.nonlinearities[1:]))
+    result = broken(model, Fault.stuck("actuator:u1", 80, 1.8))
+    one = bounded(result, "actuator:u1 stuck", reach=(1.6, 2.0))
+    assert one.low[-1] == one.high[-1] == 1.0
+    tested = ~np.isnan(one.statistic)
+    assert tested.any() and np.all(one.sizes[tested, -1] == 1.0)
 
 
 def test_bounds_at_every_onset_are_a_quadratic_programme(real_data):

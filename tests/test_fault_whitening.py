@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fault_plants import levels, refused, standard
+from fault_plants import levels, noisy, refused, standard
 from state_systems import with_feedback
 from test_fault_injection import small
 
@@ -198,6 +198,18 @@ def test_parameters_that_vary_with_the_operating_point_enlarge_the_covariance():
         inject(replace(model, B=gain * model.B), u, seed=0)[100 * k : 100 * k + 100] for k, gain in enumerate(gains)])
     found = model_uncertainty(model, Data(u, varying))
     assert found.inflation > 5
+
+
+def test_missing_readings_are_no_variation_of_the_parameters():
+    """After a gap the innovations of the steady predictor are larger, which says nothing of the parameters."""
+    A, C = np.array([[1.5, -0.7], [1.0, 0.0]]), np.array([[1.0, 0.5]])
+    model = noisy(A, np.array([[1.0], [0.0]]), C, 0.09 * np.eye(2), np.array([[0.01]]))
+    for seed in range(6):
+        u = levels(800, seed, 1)
+        y = inject(model, u, seed=seed)
+        y[np.arange(800) % 120 < 20] = np.nan
+        found = model_uncertainty(model, Data(u, y))
+        assert found.inflation == 1.0 and found.deviation == 0.0
 
 
 def test_the_variation_between_sections_is_estimated():

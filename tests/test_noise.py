@@ -292,3 +292,11 @@ def test_a_start_whose_innovations_leave_the_range_of_numbers_is_left_out():
     rest = [np.random.default_rng(0).normal(size=(3000, 1))]
     starts = _starts(Likelihood(np.array([[1.5]]), np.array([[1.0]]), rest))
     assert starts and all(abs(1.5 - float(found.gain[0, 0])) < 1 for found in starts)
+
+
+def test_a_model_without_states_has_the_noise_of_its_outputs():
+    rng = np.random.default_rng(0)
+    u, e = rng.standard_normal((2, 300, 1))
+    model = HammersteinSS(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[2.0]]))
+    found = with_noise(model, Data(u, 2 * u + 0.1 * e)).noise
+    np.testing.assert_allclose(found.R, 0.01 * np.mean(e**2), rtol=1e-9)

@@ -56,6 +56,16 @@ def test_a_claim_is_judged_at_its_point(claim, x, dual, status, words):
     assert found.has_point == (x is not None and len(x) == 2 and bool(np.all(np.abs(x) < 1e100)))
 
 
+@pytest.mark.parametrize("limit", [None, 5.0])
+@pytest.mark.parametrize("error", [TimeoutError("no licence"), ChildProcessError("no licence")])
+def test_an_error_of_the_solver_itself_is_no_limit_of_ours(error, limit):
+    def broken(program, settings):
+        raise error
+
+    found = solve(projection(), broken, time_limit=limit)
+    assert found.status is Status.FAILED and f"{type(error).__name__}: no licence" in found.claimed + found.reason
+
+
 def test_nothing_claimed_is_not_false():
     assert not Solution(Status.FAILED, "", "").false_claim
 

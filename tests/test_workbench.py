@@ -26,6 +26,7 @@ from formulations.constraints.responses import step_band
 from formulations.constraints.shape import value_range
 from optid.errors import DataError, StructureError
 from optid.examples import example
+from optid.models import HammersteinSS
 from optid.workbench import views
 from optid.workbench.bench import Bench, Source
 from optid.workbench.request import Constraint, Request, suggested
@@ -245,6 +246,19 @@ def test_a_band_is_exact_without_past_outputs():
     f = fit.model.nonlinearities[0]
     step = fit.model.step_response(12).ravel() * np.diff(f(np.array(f.basis.interval)))
     assert step.max() <= 3.0 + 1e-6 and fit.prices[0].binding
+
+
+def test_a_model_without_an_equilibrium_has_no_static_characteristic(monkeypatch):
+    def nowhere(model, c, points):
+        raise StructureError("No equilibrium was found.")
+
+    chosen = example("thruster")
+    state = {**suggested(chosen.data, {}), "formulation": "hammerstein_ss.asivid",
+             "arguments": {"nx": 2, "basis": "triangular:5"}}
+    for tools in ({"static", "step"}, {"step"}):
+        found = Bench(Source(chosen.data, "record", state)).answer("fit", {"state": state})
+        assert {chart["tool"] for chart in found["charts"]} & {"static", "step"} == tools
+        monkeypatch.setattr(HammersteinSS, "static_curve", nowhere)
 
 
 def test_faults_may_be_taken_out():

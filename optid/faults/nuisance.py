@@ -226,6 +226,9 @@ def model_uncertainty(
         readings += int(present.sum()) - basis.shape[1] - steady.silent * int(present.all(axis=1).sum())
         left = white - basis @ (basis.T @ white)
         energy += float(np.sum(left**2))
+        # after a missing reading innovations are larger until the predictor has settled
+        unsettled = np.convolve(~present.all(axis=1), np.ones(steady.settling + 1))[: len(present)] > 0.5
+        rest[np.repeat(unsettled, present.shape[1])] = 0.0
         edges = np.linspace(0, len(rest), max(round(len(part.y) / length), 1) + 1).astype(int)
         sections += [(rest[a:b].T @ rest[a:b], rest[a:b].T @ left[a:b]) for a, b in zip(edges, edges[1:])]
     sizes = np.sqrt(np.diag(information))
@@ -244,13 +247,14 @@ def model_uncertainty(
     grams = [unit.T @ gram @ unit for gram, _ in sections]
     scores = [unit.T @ along / scale for _, along in sections]
     score = np.sum(scores, axis=0)
-    deviation = float(np.linalg.norm(score))
+    moved = np.linalg.pinv(np.sum(grams, axis=0), rcond=KNOWN, hermitian=True) @ score
+    deviation = float(np.sqrt(max(score @ moved, 0.0)))
     if deviation**2 <= len(score) + REJECTED * np.sqrt(2 * len(score)):
-        deviation, score = 0.0, 0 * score
+        deviation, moved = 0.0, 0 * moved
     factor = 1.0
     if healthy is None:
-        factor = overdispersion(grams, [one - gram @ score for one, gram in zip(scores, grams)])
-    both = np.column_stack([np.sqrt(factor) * root, root @ score]) if deviation else np.sqrt(factor) * root
+        factor = overdispersion(grams, [one - gram @ moved for one, gram in zip(scores, grams)])
+    both = np.column_stack([np.sqrt(factor) * root, root @ moved]) if deviation else np.sqrt(factor) * root
     found = ModelUncertainty(gained, steady, both, readings, factor, levels, deviation)
     return found if healthy is None else _inflated(found, healthy)
 

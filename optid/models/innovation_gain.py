@@ -270,5 +270,10 @@ def _solved(matrix: Array, right: Array) -> Array:
     """Solve a symmetric system; directions without information stay at zero."""
     from scipy.linalg.lapack import dgelss  # pyright: ignore[reportAttributeAccessIssue]
 
+    if not matrix.size:
+        return np.zeros(right.shape)
     scale = np.sqrt(np.maximum(matrix.diagonal(), TINY))
-    return (dgelss(matrix / np.outer(scale, scale), (right.T / scale).T, cond=1e-12)[1].T / scale).T
+    _, found, *_, info = dgelss(matrix / np.outer(scale, scale), (right.T / scale).T, cond=1e-12)
+    if info or not np.all(np.isfinite(found)):
+        raise np.linalg.LinAlgError("the singular values did not converge")
+    return (found.T / scale).T

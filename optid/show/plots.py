@@ -207,7 +207,10 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
                 _closeup(ax, axes[2 * o + 1, k], charts.time_charts(record, k, runs, part=liveliest(e.y[:, [o]]))[o])
     for ax in axes.flat:
         ax.set_title("")
-        ax.label_outer()
+        if not closeup:
+            ax.label_outer()
+        elif not ax.get_subplotspec().is_last_row():
+            ax.set_xlabel("")
     several = f", experiments 1-{len(shown)} of {record.n_experiments}" if record.n_experiments > 1 else ""
     axes[0, 0].set_title(f"Fit over time: {title}{several}")
     # outside the layout, where it would widen its column

@@ -142,7 +142,7 @@ class Document:
 
 def extremes(values: Array, bins: int) -> NDArray[np.intp]:
     """Return the places of the smallest and the largest of each of so many stretches of values (N,), and of gaps."""
-    width = -(-values.size // bins)
+    values, width = np.asarray(values, dtype=float), -(-values.size // bins)
     stretches = np.pad(values, (0, -values.size % width), constant_values=np.nan).reshape(-1, width)
     missing, first = ~np.isfinite(stretches), np.arange(0, values.size, width)
     places = np.concatenate([first + np.argmin(np.where(missing, np.inf, stretches), axis=1),

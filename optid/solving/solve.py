@@ -108,16 +108,22 @@ def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: 
     program.clear_duals()
     if settings.warm and program.start:
         program.assign(program.start)
+    if not separate or not hasattr(os, "fork"):
+        return _run(back_end, program, settings)
     clock = time.monotonic()
     try:
-        if not separate or not hasattr(os, "fork"):
-            return back_end.run(program, settings)
         limit = None if settings.time_limit is None else settings.time_limit + GRACE
-        return run_forked(back_end.run, program, settings, seconds=limit)
+        return run_forked(_run, back_end, program, settings, seconds=limit)
     except TimeoutError:
         return Answer(Status.LIMIT, f"stopped after {time.monotonic() - clock:.1f} s: it did not keep its time limit")
     except ChildProcessError as death:
         return Answer(Status.FAILED, f"the solver's process died: {death}")
+
+
+def _run(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
+    """Run a back end; an exception of its own is an answer, too, also in a child."""
+    try:
+        return back_end.run(program, settings)
     except StructureError as refusal:  # its message has the remedy for the user
         raise SolverRefused(str(refusal)) from refusal
     except Exception as error:  # a solver that crashes is an outcome, not a traceback

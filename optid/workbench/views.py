@@ -70,7 +70,10 @@ def characteristics(fit: Any, record: Data, output: str | None = None) -> list[d
         def shown(model: Any, c: int = c, points: Array = points, span: Array = span) -> Array:
             f = model.nonlinearities[c]
             step = model.step_response(count).reshape(count, model.l, -1)[:, o, c] * np.diff(f(span))
-            return np.concatenate([model.static_curve(c, points)[:, o], step])
+            rest = np.full(points.size, np.nan)
+            with suppress(OptidError):  # a plant that integrates, or one without an equilibrium at some input
+                rest = model.static_curve(c, points)[:, o]
+            return np.concatenate([rest, step])
 
         value = shown(model)
         band = None if known is None else known.of(shown)
@@ -79,6 +82,8 @@ def characteristics(fit: Any, record: Data, output: str | None = None) -> list[d
                 ("static", points, charts.channel_axis(channel, record.input_units[c]), [bars]),
                 ("step", model.dt * np.arange(count), Axis("time"), [])):
             part = slice(0, points.size) if what == "static" else slice(points.size, None)
+            if np.isnan(value[part]).all():
+                continue
             series = [] if band is None else [Series("95 % band", at, band.upper[part], "area", lows=band.lower[part])]
             title = f"Static characteristic of {f'{name} against ' if several else ''}{channel}"
             if what == "step":

@@ -107,8 +107,11 @@ def bounded(scan: Scan, candidate: Candidate | str, *, reach: ArrayLike | None =
     roots, correlations = scan.sweep.roots_of(c), scan.correlations[:, scan.sweep.columns(c)]
     sizes = np.einsum("kqi,kqj,kj->ki", roots, roots, correlations)  # without bounds
     designs = np.swapaxes(np.linalg.pinv(roots), 1, 2)
+    free = high > low  # f may be constant over the reach
     for k in np.flatnonzero(tested & np.any((sizes < low) | (sizes > high), axis=1)):
-        sizes[k] = lsq_linear(designs[k], roots[k] @ correlations[k], (low, high), "bvls", tol=1e-14).x
+        sizes[k, ~free] = low[~free]
+        left = roots[k] @ correlations[k] - designs[k][:, ~free] @ low[~free]
+        sizes[k, free] = lsq_linear(designs[k][:, free], left, (low[free], high[free]), "bvls", tol=1e-14).x
     multipliers = correlations - np.einsum("kqi,kqj,kj->ki", designs, designs, sizes)
     values = np.sum(sizes * (correlations + multipliers), axis=1)
     values[~tested], sizes[~tested] = np.nan, np.nan
