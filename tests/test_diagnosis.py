@@ -10,7 +10,7 @@ from test_fault_injection import small
 
 from optid import Data
 from optid.errors import DataError, DataWarning, StructureError
-from optid.faults import Fault, diagnose, dictionary, inject, load_diagnosis, model_uncertainty, thresholds
+from optid.faults import Fault, diagnose, dictionary, inject, load_diagnosis, model_uncertainty, nuisance, thresholds
 
 COUNT = 120
 
@@ -382,7 +382,7 @@ def test_the_uncertainty_of_an_identified_model_counts_or_is_refused(found, limi
     np.testing.assert_allclose(used.size_interval, unsure.size_interval, rtol=1e-9)
 
 
-def test_where_outputs_leave_the_identified_range_the_model_is_less_certain(found):
+def test_where_outputs_leave_the_identified_range_the_model_is_less_certain(found, monkeypatch):
     long = inputs(300, 7)
     known = model_uncertainty(small(), Data(long, inject(small(), long, seed=8)))
     low, high = known.levels
@@ -402,6 +402,9 @@ def test_where_outputs_leave_the_identified_range_the_model_is_less_certain(foun
     np.testing.assert_allclose(known.distance(y), expected)
     assert [note.partition(" in ")[2] for note in known.extrapolated(y)] == [
         "3 samples, first in sample 21: the model is less certain there."]
+    monkeypatch.setattr(nuisance, "BEYOND", np.inf)  # the same likelihoods, at their full power
+    full = diagnose(small(), faulty, found, model_uncertainty=known)
+    assert rough.certificate.runner_up_margin == pytest.approx(full.certificate.runner_up_margin / 2)
 
 
 # -- bad input -------------------------------------------------------------------------------------------------------

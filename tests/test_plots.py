@@ -55,6 +55,14 @@ def test_the_measured_line_is_the_record_and_the_one_step_line_obeys_the_differe
     assert np.allclose(drawn[2:], 0.5 * y[1:-1] - 0.2 * y[:-2] + 2 * u[1:-1] - 3, atol=1e-6)
 
 
+def test_a_close_up_and_the_record_above_it_have_their_own_times():
+    u, e = np.random.default_rng(0).standard_normal((2, 3000))
+    y = np.convolve(u, 0.8 ** np.arange(40))[:3000] + 0.1 * e
+    whole, part = plots.fit_over_time(optid.fit(optid.Data(u, y), "arx", na=1, nb=1)).axes[:2]
+    assert np.ptp(part.get_xlim()) < np.ptp(whole.get_xlim()) / 2
+    assert all(any(tick.label1.get_visible() for tick in ax.xaxis.get_major_ticks()) for ax in (whole, part))
+
+
 def test_a_test_record_is_drawn_instead_of_the_estimation_record():
     first, second = linear_fit().data.split(0.5)
     ax = plots.fit_over_time(linear_fit(), second).axes[0]

@@ -116,6 +116,11 @@ def test_a_state_space_model_shows_singular_values_noise_and_feedback(pages):
     assert "Singular values" in text
 
 
+def test_extremes_of_whole_numbers_are_those_of_numbers():
+    values = np.random.default_rng(0).integers(-9, 9, 5003)
+    np.testing.assert_array_equal(extremes(values, 100), extremes(values.astype(float), 100))
+
+
 def test_long_curves_keep_their_peaks():
     values = np.sin(np.arange(1e5) / 500)
     values[[12_345, 54_321]] = 7.0, -9.0

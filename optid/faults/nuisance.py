@@ -146,7 +146,8 @@ class ModelUncertainty:
         if self.levels is None:
             return np.ones(y.shape)
         low, high = self.levels
-        return minimum_filter1d(np.fmax(np.abs(2 * y - low - high) / (high - low), 1.0), 3, axis=0, mode="nearest")
+        span = np.where(high > low, high - low, np.inf)  # one reading only is no range
+        return minimum_filter1d(np.fmax(np.abs(2 * y - low - high) / span, 1.0), 3, axis=0, mode="nearest")
 
     def extrapolated(self, y: Array) -> list[str]:
         """State the outputs whose readings (N, l) leave the range they were identified over, and since when."""
@@ -214,8 +215,7 @@ def model_uncertainty(
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
     sections: list[tuple[Array, Array]] = []
-    readings_of = np.vstack([part.y for part in in_units_of(gained, data).experiments])
-    levels = np.array([np.nanmin(readings_of, axis=0), np.nanmax(readings_of, axis=0)])
+    levels = np.full((2, model.l), np.nan)
     length = max(count // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(gained, steady, data):
         by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
@@ -226,9 +226,11 @@ def model_uncertainty(
         readings += int(present.sum()) - basis.shape[1] - steady.silent * int(present.all(axis=1).sum())
         left = white - basis @ (basis.T @ white)
         energy += float(np.sum(left**2))
+        levels = np.array([np.fmin(levels[0], np.fmin.reduce(part.y)), np.fmax(levels[1], np.fmax.reduce(part.y))])
         # after a missing reading innovations are larger until the predictor has settled
-        unsettled = np.convolve(~present.all(axis=1), np.ones(steady.settling + 1))[: len(present)] > 0.5
-        rest[np.repeat(unsettled, present.shape[1])] = 0.0
+        sample = np.arange(len(present))
+        gap = np.maximum.accumulate(np.where(present.all(axis=1), -steady.settling - 1, sample))
+        rest[np.repeat(sample - gap <= steady.settling, present.shape[1])] = 0.0
         edges = np.linspace(0, len(rest), max(round(len(part.y) / length), 1) + 1).astype(int)
         sections += [(rest[a:b].T @ rest[a:b], rest[a:b].T @ left[a:b]) for a, b in zip(edges, edges[1:])]
     sizes = np.sqrt(np.diag(information))

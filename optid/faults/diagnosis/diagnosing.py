@@ -116,7 +116,7 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     stuck = frozen(lines, found, 2 * model.nx)
     first = search_record(record, part, found, asked, noise)
     notes = [remark, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
-             *noise["uncertainty"].extrapolated(part.y)]
+             *first.extrapolated]
     seen, ranking, alarm = find(first)
     notes.append(ranking.note)
     fits = ranking.fits if not found.unknown or ranking.explains else ()

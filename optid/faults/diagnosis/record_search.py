@@ -107,9 +107,9 @@ class RecordSearch:
         return [c for c, gains in zip(self.dictionary.candidates, self.gains) if not np.isnan(gains).all()]
 
     @cached_property
-    def extrapolated(self) -> bool:
-        """Whether outputs leave the range over which an uncertain model was identified."""
-        return bool(self.noise["uncertainty"].extrapolated(self.part.y))
+    def extrapolated(self) -> list[str]:
+        """The outputs that leave the range over which an uncertain model was identified, in words."""
+        return self.noise["uncertainty"].extrapolated(self.part.y)
 
     @cached_property
     def p_value(self) -> float:
