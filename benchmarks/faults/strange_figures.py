@@ -9,7 +9,8 @@ Figures:
 * inside: false alarms of the monitor in 30,000 healthy samples, white and AR(0.8) sensor noise, against the budget;
 * outside: false alarms where the inputs leave the identified range by a fifth, and of `diagnose`;
 * monitor: the parts that the monitor names;
-* gains: named sensors with half their gain, and the coverage of the interval of the share lost;
+* gains: named sensors with half their gain, before and behind their noise, and the coverage of the interval of the
+  share lost;
 * losses: kind named for a partial loss of an actuator;
 * leaks: what a leak of unstated direction is called;
 * sets: coverage of the set of answers over all faults, and healthy records that alarm;
@@ -24,6 +25,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
+import numpy as np
 from strange_plants import FAILURES, Failure, identify, record, simulate
 
 from optid.errors import DataError
@@ -108,20 +110,21 @@ def monitored(plant: str, runs: range) -> None:
 
 
 def gains(plant: str, runs: range) -> None:
-    failure = Failure(f"sensor:{HALF[plant]}", "gain", 0, 0.5)
-    named, covered, said = 0, 0, Counter()
-    for run in runs:
-        answer = asked(plant, run, failure)
-        label = answer.best.label if answer.best else answer.verdict
-        said[label] += 1
-        for a in answer.candidates:
-            for one in a.faults:
-                if one.name == failure.part and one.kind == "loss":
-                    named += 1
-                    low, high = one.size_interval[0]
-                    covered += low <= 0.5 <= high
-                    print(f"  {plant} {run}: {low:.4f} .. {high:.4f} p {a.posterior:.2f}", flush=True)
-    print(f"gains {plant}: named {named} of {len(runs)}, covered {covered}; {dict(said)}", flush=True)
+    for kind in ("gain", "early gain"):
+        failure = Failure(f"sensor:{HALF[plant]}", kind, 0, 0.5)
+        errors, said = [], Counter()
+        for run in runs:
+            answer = asked(plant, run, failure)
+            said[answer.best.label if answer.best else answer.verdict] += 1
+            for a in answer.candidates:
+                for one in a.faults:
+                    if one.name == failure.part and one.kind == "loss":
+                        low, high = one.size_interval[0]
+                        errors.append(((low + high) / 2 - 0.5) / ((high - low) / 3.92))
+                        print(f"  {plant} {run}: {low:.4f} .. {high:.4f} p {a.posterior:.2f}", flush=True)
+        z = np.array(errors)
+        print(f"gains {plant}, {kind}: named {z.size} of {len(runs)}, covered {np.sum(np.abs(z) <= 1.96)}, error "
+              f"{np.sqrt(np.mean(z**2)):.2f} standard errors; {dict(said)}", flush=True)
 
 
 def losses(plant: str, runs: range) -> None:

@@ -27,7 +27,8 @@ class Failure(NamedTuple):
 
     Attributes:
         part: "actuator:NAME", "sensor:NAME" or "process:leak".
-        kind: loss, stuck or bias of an actuator; bias, drift, frozen, dead, gain or noise of a sensor; leak.
+        kind: loss, stuck or bias of an actuator; bias, drift, frozen, dead, gain (of reading and noise), early gain (of
+            the reading before its noise) or noise of a sensor; leak.
         onset: first sample with it.
         size: share lost, level stuck at, offset, slope per sample, gain, factor of the noise, strength of the leak.
     """
@@ -218,6 +219,8 @@ def _sensor(reading: np.ndarray, noise: np.ndarray, last: np.ndarray, p: Plant, 
         reading[o] = np.nan
     elif failure.kind == "gain":
         reading[o] *= failure.size
+    elif failure.kind == "early gain":
+        reading[o] = failure.size * (reading[o] - noise[o]) + noise[o]
     elif failure.kind == "noise":
         reading[o] += (failure.size - 1) * noise[o]
     return reading

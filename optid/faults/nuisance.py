@@ -93,6 +93,11 @@ class Nuisance:
     s: Array
     unknown: int = 0
 
+    @property
+    def log_scale(self) -> float:
+        """Logarithm of the determinant of (I + M M')^(1/2)."""
+        return 0.5 * float(np.sum(np.log1p(self.s**2)))
+
     def __call__(self, r: Array) -> Array:
         """Whiten (N, l) or (N, l, d)."""
         flat = r.reshape(len(self.U), -1)
@@ -160,7 +165,8 @@ class ModelUncertainty:
                              f"samples, first in sample {samples[0]}: the model is less certain there.")
         return notes
 
-    def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True) -> Nuisance:
+    def nuisance(self, part: Experiment, x0: Array, present: Array, *, free_start: bool = True,
+                 seen: Callable[[Array], Array] | None = None) -> Nuisance:
         """Return the effect of the uncertainty on the whitened innovations of a record.
 
         Args:
@@ -168,20 +174,25 @@ class ModelUncertainty:
             x0: (n,) its initial state.
             present: (N, l) whether there is a reading.
             free_start: whether the initial state is unknown, because it was estimated from this record.
+            seen: what whitens changes (N, l, d) of the innovations; the predictor by default.
         """
+        def plain(changes: Array) -> Array:
+            return self.predictor.whitened(changes, present)
+
+        def diffuse(changes: Array) -> Array:
+            sizes = np.linalg.norm(plain(changes).reshape(present.size, -1), axis=0)
+            return DIFFUSE * changes[:, :, sizes > 0] / sizes[sizes > 0]
+
         by_parameter, by_start = sensitivities(self.model, self.predictor, part, x0, present, self.root)
-        columns = [self.distance(part.y).reshape(-1, 1) ** 2 * by_parameter]
+        columns: list[Any] = [self.distance(part.y)[:, :, None] ** 2 * by_parameter]
         if free_start:
-            sizes = np.linalg.norm(by_start, axis=0)
-            columns.append(DIFFUSE * by_start / np.where(sizes > 0, sizes, 1.0))
+            columns.append(diffuse(by_start))
         unknown = 0
         if outside(self.model, part.u):
-            free = self.predictor.respond(*unknown_effects(self.model, part.u), present)
-            flat = self.predictor.whitened(free, present).reshape(present.size, -1)
-            sizes = np.linalg.norm(flat, axis=0)
-            columns.append(DIFFUSE * flat[:, sizes > 0] / sizes[sizes > 0])
-            unknown = int(np.linalg.matrix_rank(columns[-1])) if sizes.any() else 0
-        U, s, _ = np.linalg.svd(np.hstack(columns), full_matrices=False)
+            columns.append(diffuse(self.predictor.respond(*unknown_effects(self.model, part.u), present)))
+            unknown = int(np.linalg.matrix_rank(columns[-1].reshape(present.size, -1)))
+        flat = (seen or plain)(np.concatenate(columns, axis=2)).reshape(present.size, -1)
+        U, s, _ = np.linalg.svd(flat, full_matrices=False)
         return Nuisance(U, s, unknown)
 
 
@@ -218,7 +229,8 @@ def model_uncertainty(
     levels = np.full((2, model.l), np.nan)
     length = max(count // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(gained, steady, data):
-        by_parameter, by_start = sensitivities(gained, steady, part, x0, present, np.eye(size))
+        by_parameter, by_start = (steady.whitened(effect, present).reshape(present.size, -1) for effect in
+                                  sensitivities(gained, steady, part, x0, present, np.eye(size)))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]
         rest = by_parameter - basis @ (basis.T @ by_parameter)
@@ -364,13 +376,12 @@ def moved_models(
 def sensitivities(
     model: "HammersteinSS", steady: Predictor, part: Experiment, x0: Array, present: Array, root: Array
 ) -> tuple[Array, Array]:
-    """Derivatives (N l, q) and (N l, n) of the whitened innovations along the columns of root and by the start."""
-    columns = np.empty((present.size, root.shape[1]))
+    """Derivatives (N, l, q) and (N, l, n) of the innovations along the columns of root and by the start."""
+    columns = np.empty((*present.shape, root.shape[1]))
     for j, (plus, minus, factor) in enumerate(moved_models(model, root)):
         first, second = (
             simulation.run(simulation.prepared(moved, "predict", part.u, part.y, None, ""), x0)
             for moved in (plus, minus)
         )
-        change = np.where(present, (second - first) * factor, 0.0)  # of the innovations
-        columns[:, j] = steady.whitened(change, present).ravel()
-    return columns, steady.whitened(steady.jumps(0, present), present).reshape(present.size, model.nx)
+        columns[:, :, j] = np.where(present, (second - first) * factor, 0.0)
+    return columns, steady.jumps(0, present)

@@ -64,6 +64,8 @@ def propagated(matrix: Array, drive: Array) -> Array:
     They solve a banded triangular system.
     """
     count, n, d = drive.shape
+    if not drive.size:  # LAPACK crashes without a right-hand side
+        return drive.copy()
     band = np.zeros((2 * n, count * n))
     band[0] = 1.0
     for i, j in np.ndindex(n, n):

@@ -140,7 +140,7 @@ class RecordSearch:
     @cached_property
     def gains_of_sensors(self) -> list[Explanation]:
         """Explanations by sensors that lost a share of their reading."""
-        return sensor_gains(self.dictionary, self.whitened, self.part)
+        return sensor_gains(self.dictionary, self.whitened, self.part, self.noise.get("uncertainty"))
 
     def widened(self) -> "RecordSearch":
         """Return the search with the outliers of all sensors among the candidates."""

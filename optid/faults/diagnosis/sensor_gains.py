@@ -1,12 +1,16 @@
-"""A sensor that lost a share of its reading, (1.11): y = (1 - gamma) times the true output, with the same noise.
+"""A sensor that lost a share of its reading, (1.11): y = (1 - gamma) times the true output.
 
 The loss is another row of C (of D and of the offset) from the onset on, so that the exact likelihood is that of a
-Kalman filter with this row, started from the state of the healthy one at the onset. It is computed for many shares and
-onsets at once, over a grid that is refined about the most probable onset and, once this is known to the sample, about
-the share. A dead sensor, gamma = 1, reads its noise and is the end of the range.
+Kalman filter with this row, started from the state of the healthy one at the onset. The noise of the sensor stays as it
+is where the gain is lost before it, and is multiplied by 1 - gamma, too, where it is lost behind it: both are tried.
+
+The likelihood is computed for many shares and onsets at once, over a grid that is refined about the most probable onset
+and, once this is known to the sample, about the share. What the parameters of an identified model do not know is that
+of the plant as it is, not of a healthy one with these readings: its effect on the innovations is computed for the
+outputs that the filter estimates. A dead sensor, gamma = 1, reads its noise and is the end of the range.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +18,8 @@ from optid.arrays import Array
 from optid.data.record import Experiment
 from optid.errors import StructureError
 from optid.faults.diagnosis.posterior import Explained, Explanation
-from optid.faults.signatures import Candidate, Dictionary
+from optid.faults.nuisance import ModelUncertainty, Nuisance
+from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Predictor, Whitened, predictor
 
 SHARES, ONSETS = 17, 15
@@ -32,118 +37,249 @@ FINE = 0.6
 LEAST = 5
 """Samples that must follow the onset."""
 
+LOWEST, MOST = 1e-6, 0.98
+"""Smallest share, and the largest lost together with the noise: beyond it nothing is read."""
 
-def sensor_gains(found: Dictionary, white: Whitened, part: Experiment) -> list[Explanation]:
+REPEATED = 3
+"""Largest number of searches, each with the effect of uncertain parameters at the best point of the one before."""
+
+AROUND = 12.0
+"""Standard deviations of the share that are searched with the effect of uncertain parameters."""
+
+
+def sensor_gains(
+    found: Dictionary, white: Whitened, part: Experiment, uncertainty: ModelUncertainty | None
+) -> list[Explanation]:
     """Return the explanations of a window by sensors of a dictionary that lost a share of their reading."""
     if white.states is None or found.model.feedback or np.any(found.model.L):
         return []
-    candidates = [c for c in found.candidates if c.kind == "loss" and not c.columns]
-    judged = [_judged(found, candidate, white, part) for candidate in candidates]
-    return [explanation for explanation in judged if explanation is not None]
-
-
-def _judged(found: Dictionary, candidate: Candidate, white: Whitened, part: Experiment) -> Explanation | None:
-    o = int(np.flatnonzero(candidate.into_output[:, 0])[0])
-    there = np.flatnonzero(white.present[:, o])
-    last = int(there[-LEAST]) if len(there) >= 2 * LEAST else 0
-    if last < 1:
-        return None
-    onsets: np.ndarray = np.unique(np.linspace(0, last, ONSETS).astype(int))
-    shares = np.linspace(0.0, 1.0, SHARES + 1)[1:]
-    wide, high = float(last), 1.0
-    for _ in range(ROUNDS):
-        tried, gammas = onsets, shares
+    explanations = []
+    for candidate in found.candidates:
+        if candidate.kind != "loss" or candidate.columns:
+            continue
+        o = int(np.flatnonzero(candidate.into_output[:, 0])[0])
+        there = np.flatnonzero(white.present[:, o])
+        if len(there) < 2 * LEAST or there[-LEAST] < 1:
+            continue
         try:
-            logs = likelihoods(found, o, white, part, tried, gammas)
+            laws = [SensorGain(found, o, white, part).searched(int(there[-LEAST]))]
+            if uncertainty is not None:
+                laws = _with_parameters(laws[0], uncertainty)
         except StructureError:  # without this sensor some mode is not observable
-            return None
-        k, g = np.unravel_index(int(np.argmax(logs)), logs.shape)
-        weights = np.exp(logs[k] - logs[k, g])
-        weights /= weights.sum()
-        std = float(np.sqrt(max(weights @ shares**2 - (weights @ shares) ** 2, 0.0)))
-        if np.max(np.diff(onsets), initial=1) > 1:  # at a wrong onset another share is the best one
-            wide *= CLOSER
-            reach = max(int(wide / 2), ONSETS // 2)
-            near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, last), ONSETS)
-            onsets = np.unique(near.astype(int))
-        elif shares[1] - shares[0] < FINE * std:
+            continue
+        which = np.repeat(np.arange(len(laws)), [law.onsets.size for law in laws])
+        onsets, logs, most, mean, variance = (np.concatenate([getattr(law, name) for law in laws])
+                                              for name in ("onsets", "logs", "most", "mean", "variance"))
+        logs = logs - np.log(len(laws))
+        best = int(np.argmax(logs))
+
+        def rest(onset: int, gain: "SensorGain" = laws[which[best]].gain, share: float = mean[best]) -> Explained:
+            left = gain.rests(np.array([onset]), np.array([share]))[0][0]
+            return Explained(white.r - left, left, 1)
+
+        explanations.append(Explanation((candidate,), onsets[:, None], logs, mean[:, None], variance[:, None, None],
+                                        2 * most, course=rest).likely())
+    return explanations
+
+
+def _with_parameters(law: "Law", uncertainty: ModelUncertainty) -> "list[Law]":
+    """Return the laws of both noises with the effect of uncertain parameters, which depends on the fault."""
+    for _ in range(REPEATED):
+        before, law = law, law.gain.at(law, uncertainty).searched(law.last)
+        if abs(law.onset - before.onset) <= 1:
             break
-        else:
-            high *= CLOSER
-            middle = float(np.clip(shares[g], high / 2, 1 - high / 2))
-            shares = np.linspace(max(middle - high / 2, 1e-6), middle + high / 2, SHARES)
-    most = logs.max(axis=1)
-    weights = np.exp(logs - most[:, None])
-    total = weights.sum(axis=1)
-    mean = weights @ gammas / total
-    variance = np.maximum(weights @ gammas**2 / total - mean**2, 1e-12)
-    evidence = most + np.log(total * (gammas[1] - gammas[0])) - np.log(len(white.r))  # uniform over shares and onsets
-
-    def rest(onset: int) -> Explained:
-        left = _rests(found, o, white, part, np.array([onset]), mean[tried == onset])[0][0]
-        return Explained(white.r - left, left, 1)
-
-    return Explanation(
-        (candidate,), tried[:, None], evidence, mean[:, None], variance[:, None, None], 2 * most, course=rest
-    ).likely()
+    return [replace(law.gain, scaled=scaled).at(law, uncertainty).around(law) for scaled in (False, True)]
 
 
-def likelihoods(
-    found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
-) -> Array:
-    """Return the log-likelihood ratios (K, G) to the healthy plant of onsets (K,) and shares (G,) of output `o`."""
-    rests, sizes = _rests(found, o, white, part, np.repeat(onsets, len(shares)), np.tile(shares, len(onsets)))
-    logs = 0.5 * float(np.sum(white.r**2)) - 0.5 * np.einsum("jno,jno->j", rests, rests) - sizes
-    return logs.reshape(len(onsets), len(shares))
+@dataclass(frozen=True, eq=False)
+class Law:
+    """Likelihood and share at every onset of a grid.
+
+    Attributes:
+        gain: the fault.
+        last: the last onset possible.
+        onsets: (K,).
+        logs: (K,) marginal likelihoods, uniform over shares and onsets.
+        most: (K,) the largest likelihoods.
+        mean: (K,) of the share.
+        variance: (K,) of the share.
+    """
+
+    gain: "SensorGain"
+    last: int
+    onsets: np.ndarray
+    logs: Array
+    most: Array
+    mean: Array
+    variance: Array
+
+    @property
+    def best(self) -> int:
+        """The row of the most probable onset."""
+        return int(np.argmax(self.logs))
+
+    @property
+    def onset(self) -> int:
+        """The most probable onset."""
+        return int(self.onsets[self.best])
 
 
-def _rests(found: Dictionary, o: int, white: Whitened, part: Experiment, onsets: np.ndarray, shares: Array
-           ) -> tuple[Array, Array]:
-    """Whitened innovations (J, N, l) with a share lost from an onset on, and the logarithms (J,) of their scale."""
-    model, steady, present = found.model, white.predictor, white.present
-    different, which = np.unique(shares, return_inverse=True)
-    scale = float(np.trace(steady.covariance) / np.trace(predictor(model).covariance))
-    filters = [_filter(found, o, float(share), scale) for share in different]
-    gain = np.stack([f.K for f in filters])[which]
-    rows, root = np.stack([f.C for f in filters])[which], np.stack([f.root for f in filters])[which]
-    left = np.ones((len(shares), model.l))
-    left[:, o] = 1 - shares
-    driven = model.expanded(part.u)
-    direct = driven @ model.D.T + model.offset_y
-    into = driven @ model.B.T + model.offset_x
-    assert white.states is not None
-    x, innovations = np.zeros((len(shares), model.nx)), np.empty((len(shares), *part.y.shape))
-    healthy = np.where(present, white.innovations, 0.0)
-    for k in range(len(part.y)):
-        begins = onsets == k
-        if begins.any():
-            x[begins] = white.states[k]
-        e = np.where(present[k], np.nan_to_num(part.y[k]) - left * direct[k] - np.einsum("jli,ji->jl", rows, x), 0.0)
-        innovations[:, k] = e
-        x = x @ model.A.T + into[k] + np.einsum("jil,jl->ji", gain, e)
-    result = np.empty_like(innovations)
-    before = steady.whitened(healthy, present)
-    costs = np.zeros(len(shares))
-    log_healthy = _scales(steady, present)
-    tails = [np.concatenate([np.cumsum((_scales(f, present) - log_healthy)[::-1])[::-1], [0.0]]) for f in filters]
-    for j, onset in enumerate(onsets):
-        result[j, :onset] = before[:onset]
-        own = replace(steady, covariance=filters[which[j]].covariance, root=root[j])
-        result[j, onset:] = own.whitened(innovations[j, onset:], present[onset:])
-        costs[j] = tails[which[j]][onset]
-    if white.nuisance is not None:
-        result = np.moveaxis(white.nuisance(np.moveaxis(result, 0, 2)), 2, 0)
-    return result, costs
+@dataclass(frozen=True, eq=False)
+class SensorGain:
+    """A share of the reading of output `o` lost in a window.
 
+    Attributes:
+        found: the dictionary.
+        o: the output.
+        white: the healthy innovations of the window.
+        part: the window.
+        scaled: whether the noise is multiplied by what is left of the reading.
+        nuisance: the effect of uncertain parameters; that on the healthy innovations by default.
+    """
 
-def _filter(found: Dictionary, o: int, share: float, scale: float) -> Predictor:
-    model = found.model
-    factors = np.ones(model.l)
-    factors[o] = 1 - share
-    damaged = replace(model, C=factors[:, None] * model.C, D=factors[:, None] * model.D,
-                      offset_y=factors * model.offset_y)
-    steady = predictor(damaged)
-    return replace(steady, covariance=scale * steady.covariance, root=steady.root / np.sqrt(scale))
+    found: Dictionary
+    o: int
+    white: Whitened
+    part: Experiment
+    scaled: bool = False
+    nuisance: Nuisance | None = None
+
+    def searched(self, last: int) -> Law:
+        """Search all onsets to the last one and all shares."""
+        sudden = np.argsort(-np.abs(np.nan_to_num(self.white.innovations[: last + 1, self.o])))[:ONSETS]
+        onsets: np.ndarray = np.unique(np.append(np.linspace(0, last, ONSETS).astype(int), sudden))
+        return self._refined(last, onsets, float(last), self._shares(0.5, 1.0))
+
+    def at(self, law: Law, uncertainty: ModelUncertainty) -> "SensorGain":
+        """Return the same with the effect of uncertain parameters at the best point of a law."""
+        return replace(self, nuisance=self._nuisance(uncertainty, law.onset, float(law.mean[law.best])))
+
+    def around(self, law: Law) -> Law:
+        """Search around the best point of another law."""
+        k = law.onset
+        onsets = np.unique(np.linspace(max(k - ONSETS, 0), min(k + ONSETS, law.last), ONSETS).astype(int))
+        width = AROUND * float(np.sqrt(law.variance[law.best]))
+        return self._refined(law.last, onsets, 2.0 * ONSETS, self._shares(float(law.mean[law.best]), width))
+
+    def _shares(self, middle: float, width: float) -> Array:
+        """Equally spaced shares about a middle, as far as it is possible."""
+        top = MOST if self.scaled else 1.0
+        width = min(width, top - LOWEST)
+        middle = float(np.clip(middle, LOWEST + width / 2, top - width / 2))
+        return middle + width * np.linspace(-0.5, 0.5, SHARES)
+
+    def _refined(self, last: int, onsets: np.ndarray, wide: float, shares: Array) -> Law:
+        for _ in range(ROUNDS):
+            tried, gammas = onsets, shares
+            logs = self.likelihoods(tried, gammas)
+            k, g = np.unravel_index(int(np.argmax(logs)), logs.shape)
+            weights = np.exp(logs[k] - logs[k, g])
+            weights /= weights.sum()
+            std = float(np.sqrt(max(weights @ shares**2 - (weights @ shares) ** 2, 0.0)))
+            if np.max(np.diff(onsets), initial=1) > 1:  # at a wrong onset another share is the best one
+                wide *= CLOSER
+                reach = max(int(wide / 2), ONSETS // 2)
+                near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, last), ONSETS)
+                onsets = np.unique(np.append(near.astype(int), onsets[k]))
+            elif shares[1] - shares[0] < FINE * std:
+                break
+            else:
+                shares = self._shares(float(shares[g]), CLOSER * float(np.ptp(shares)))
+        most = logs.max(axis=1)
+        weights = np.exp(logs - most[:, None])
+        total = weights.sum(axis=1)
+        mean = weights @ gammas / total
+        variance = np.maximum(weights @ gammas**2 / total - mean**2, 1e-12)
+        evidence = most + np.log(total * (gammas[1] - gammas[0])) - np.log(len(self.white.r))
+        return Law(self, last, tried, evidence, most, mean, variance)
+
+    def likelihoods(self, onsets: np.ndarray, shares: Array) -> Array:
+        """Return the log-likelihood ratios (K, G) to the healthy plant of onsets (K,) and shares (G,)."""
+        rests, sizes = self.rests(np.repeat(onsets, len(shares)), np.tile(shares, len(onsets)))
+        logs = 0.5 * float(np.sum(self.white.r**2)) - 0.5 * np.einsum("jno,jno->j", rests, rests) - sizes
+        if self.nuisance is not None and self.white.nuisance is not None:
+            logs += self.white.nuisance.log_scale - self.nuisance.log_scale
+        return np.asarray(logs.reshape(len(onsets), len(shares)))
+
+    def rests(self, onsets: np.ndarray, shares: Array) -> tuple[Array, Array]:
+        """Whitened innovations (J, N, l) with a share lost from an onset on, and the logarithms (J,) of their scale."""
+        steady, present = self.white.predictor, self.white.present
+        different, which = np.unique(shares, return_inverse=True)
+        filters = [self._filter(float(share)) for share in different]
+        innovations = self._innovations(onsets, [filters[i] for i in which], shares)
+        result = np.empty_like(innovations)
+        before = steady.whitened(np.where(present, self.white.innovations, 0.0), present)
+        costs = np.zeros(len(shares))
+        log_healthy = _scales(steady, present)
+        tails = [np.concatenate([np.cumsum((_scales(f, present) - log_healthy)[::-1])[::-1], [0.0]]) for f in filters]
+        for j, onset in enumerate(onsets):
+            result[j, :onset] = before[:onset]
+            result[j, onset:] = filters[which[j]].whitened(innovations[j, onset:], present[onset:])
+            costs[j] = tails[which[j]][onset]
+        nuisance = self.nuisance or self.white.nuisance
+        if nuisance is not None:
+            result = np.moveaxis(nuisance(np.moveaxis(result, 0, 2)), 2, 0)
+        return result, costs
+
+    def _innovations(self, onsets: np.ndarray, filters: list[Predictor], shares: Array) -> Array:
+        """Innovations (J, N, l) of the filters from their onsets on, of healthy ones (where the state is zero) before.
+
+        Only those from the onset on are meant to be used.
+        """
+        model, present = self.found.model, self.white.present
+        gain, rows = np.stack([f.K for f in filters]), np.stack([f.C for f in filters])
+        left = np.ones((len(shares), model.l))
+        left[:, self.o] = 1 - shares
+        driven = model.expanded(self.part.u)
+        direct, into = driven @ model.D.T + model.offset_y, driven @ model.B.T + model.offset_x
+        assert self.white.states is not None
+        x, innovations = np.zeros((len(shares), model.nx)), np.empty((len(shares), *self.part.y.shape))
+        for k in range(len(self.part.y)):
+            begins = onsets == k
+            if begins.any():
+                x[begins] = self.white.states[k]
+            e = np.nan_to_num(self.part.y[k]) - left * direct[k] - np.einsum("jli,ji->jl", rows, x)
+            innovations[:, k] = np.where(present[k], e, 0.0)
+            x = x @ model.A.T + into[k] + np.einsum("jil,jl->ji", gain, innovations[:, k])
+        return innovations
+
+    def _filter(self, share: float) -> Predictor:
+        model, steady = self.found.model, self.white.predictor
+        factors = np.ones(model.l)
+        factors[self.o] = 1 - share
+        noise = model.noise
+        assert noise is not None
+        damaged = predictor(replace(model, C=factors[:, None] * model.C, noise=noise.mapped(
+            np.eye(model.nx), np.diag(factors)) if self.scaled else noise))
+        scale = float(np.trace(steady.covariance) / np.trace(predictor(model).covariance))
+        return replace(damaged, covariance=scale * damaged.covariance, root=damaged.root / np.sqrt(scale))
+
+    def _nuisance(self, uncertainty: ModelUncertainty, onset: int, share: float) -> Nuisance:
+        """Return the effect of uncertain parameters with a share lost from an onset on.
+
+        A change e of the healthy innovations of the true outputs is one of a filter with another gain, which sees e as
+        an addition to the outputs and K e as one to the next state.
+        """
+        steady, present, after = self.white.predictor, self.white.present, slice(onset, None)
+        share = min(share, 1 - LOWEST)
+        own = self._filter(share)
+        left = np.ones(len(own.C))
+        left[self.o] = 1 - share
+        rest = self._innovations(np.array([onset]), [own], np.array([share]))[0, after, self.o]
+        y = np.array(self.part.y)
+        y[after, self.o] = (y[after, self.o] - rest) / left[self.o]
+
+        def seen(changes: Array) -> Array:
+            e = changes[after]
+            drive = np.zeros((len(e), model.nx, e.shape[2]))
+            drive[1:] = steady.K @ e[:-1]
+            filtered = replace(own, C=model.C, K=own.K * left).respond(drive, e, present[after])
+            return np.concatenate([steady.whitened(changes[:onset], present[:onset]),
+                                   own.whitened(left[:, None] * filtered, present[after])])
+
+        model = self.found.model
+        assert self.white.states is not None
+        return uncertainty.nuisance(replace(self.part, y=y), self.white.states[0], present, seen=seen)
 
 
 def _scales(steady: Predictor, present: np.ndarray) -> Array:

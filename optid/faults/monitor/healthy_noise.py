@@ -45,7 +45,8 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     for part, x0 in zip(raw.experiments, as_list(given)):
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
-        by_parameter, by_start = sensitivities(known.model, known.predictor, here, x0, there, known.root)
+        by_parameter, by_start = (known.predictor.whitened(effect, there).reshape(there.size, -1) for effect in
+                                  sensitivities(known.model, known.predictor, here, x0, there, known.root))
         by_parameter -= by_start @ np.linalg.lstsq(by_start, by_parameter, rcond=None)[0]
         raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
         effect, taps = raw_effect.copy(), steady.C[:, known.model.nx :]  # the last states are past innovations

@@ -159,11 +159,13 @@ class StateErrors(Criterion):
     def _placed(self, x: Array) -> tuple[StatePoint, HammersteinSS]:
         """Return the point and the model at x; the last ones are kept, since every step asks twice."""
         key = x.tobytes()
-        if key not in self._last:
-            self._last.clear()
+        kept = self._last.get(key)
+        if kept is None:
             point = self.unknowns.unpack(x)
-            self._last[key] = point, self.at(point)
-        return self._last[key]
+            kept = point, self.at(point)
+            self._last.clear()
+            self._last[key] = kept
+        return kept
 
     @cached_property
     def _last(self) -> dict[bytes, tuple[StatePoint, HammersteinSS]]:
