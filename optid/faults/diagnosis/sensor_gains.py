@@ -10,7 +10,9 @@ of the plant as it is, not of a healthy one with these readings: its effect on t
 outputs that the filter estimates. A dead sensor, gamma = 1, reads its noise and is the end of the range.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -222,10 +224,7 @@ class SensorGain:
         return result, costs
 
     def _innovations(self, onsets: np.ndarray, filters: list[Predictor], shares: Array) -> Array:
-        """Innovations (J, N, l) of the filters from their onsets on, of healthy ones (where the state is zero) before.
-
-        Only those from the onset on are meant to be used.
-        """
+        """Innovations (J, N, l) of the filters; those before the onset of each are not meant to be used."""
         model, present = self.found.model, self.white.present
         gain, rows = np.stack([f.K for f in filters]), np.stack([f.C for f in filters])
         left = np.ones((len(shares), model.l))
@@ -233,8 +232,8 @@ class SensorGain:
         driven = model.expanded(self.part.u)
         direct, into = driven @ model.D.T + model.offset_y, driven @ model.B.T + model.offset_x
         assert self.white.states is not None
-        x, innovations = np.zeros((len(shares), model.nx)), np.empty((len(shares), *self.part.y.shape))
-        for k in range(len(self.part.y)):
+        x, innovations = np.zeros((len(shares), model.nx)), np.zeros((len(shares), *self.part.y.shape))
+        for k in range(int(onsets.min()), len(self.part.y)):
             begins = onsets == k
             if begins.any():
                 x[begins] = self.white.states[k]
@@ -243,16 +242,22 @@ class SensorGain:
             x = x @ model.A.T + into[k] + np.einsum("jil,jl->ji", gain, innovations[:, k])
         return innovations
 
-    def _filter(self, share: float) -> Predictor:
-        model, steady = self.found.model, self.white.predictor
-        factors = np.ones(model.l)
-        factors[self.o] = 1 - share
-        noise = model.noise
+    @cached_property
+    def _filter(self) -> Callable[[float], Predictor]:
+        """The predictor of a share lost."""
+        model, noise = self.found.model, self.found.model.noise
         assert noise is not None
-        damaged = predictor(replace(model, C=factors[:, None] * model.C, noise=noise.mapped(
-            np.eye(model.nx), np.diag(factors)) if self.scaled else noise))
-        scale = float(np.trace(steady.covariance) / np.trace(predictor(model).covariance))
-        return replace(damaged, covariance=scale * damaged.covariance, root=damaged.root / np.sqrt(scale))
+        scale = float(np.trace(self.white.predictor.covariance) / np.trace(predictor(model).covariance))
+
+        @cache
+        def damaged(share: float) -> Predictor:
+            factors = np.ones(model.l)
+            factors[self.o] = 1 - share
+            own = noise.mapped(np.eye(model.nx), np.diag(factors)) if self.scaled else noise
+            steady = predictor(replace(model, C=factors[:, None] * model.C, noise=own))
+            return replace(steady, covariance=scale * steady.covariance, root=steady.root / np.sqrt(scale))
+
+        return damaged
 
     def _nuisance(self, uncertainty: ModelUncertainty, onset: int, share: float) -> Nuisance:
         """Return the effect of uncertain parameters with a share lost from an onset on.
