@@ -76,6 +76,54 @@ def test_the_likelihood_of_a_sensor_gain_is_that_of_a_kalman_filter_with_another
     assert logs_of[0, 1] == pytest.approx(logs[1] - logs[0], rel=1e-6)
 
 
+def test_the_noise_of_a_sensor_may_be_lost_with_its_reading():
+    model, u = small(), levels(COUNT, 0)
+    clean, noise = inject(model, u, noise="none"), inject(model, u, seed=2)
+    after = np.arange(COUNT) >= 80
+    y = np.where(after[:, None] & [True, False], 0.5 * noise, noise)
+    assert np.any(y != clean)
+    record = record_of(model, (u, y))
+    found, part = dictionary(model, kinds=["loss"]), record.experiments[0]
+    white = whiten(model, record)
+    same, scaled = (SensorGain(found, 0, white, part, scaled).searched(COUNT - 6) for scaled in (False, True))
+    assert scaled.onset == 80 and scaled.logs.max() > same.logs.max() + 3
+    # behind the gain the reading is one of the healthy plant, but for its unit
+    record = record_of(model, (u, noise))
+    again = whiten(model, record, x0=white.states[0])
+    left = SensorGain(found, 0, white, part, True).rests(np.array([80]), np.array([0.5]))[0][0]
+    np.testing.assert_allclose(left, again.r, atol=1e-6)
+
+
+def test_the_effect_of_parameters_beside_a_lost_gain_is_that_of_the_filter_with_another_row():
+    """Against differences of the innovations of moved models, healthy to the onset and damaged afterwards."""
+    model, u, onset, share = small(), levels(COUNT, 0), 60, 0.5
+    known = model_uncertainty(model, Data(levels(2000, 1), inject(model, levels(2000, 1), seed=9)))
+    found = replace(dictionary(model, kinds=["loss"]), predictor=known.predictor)
+    part = record_of(model, (u, inject(model, u, Fault.loss("sensor:y1", onset, share), seed=3))).experiments[0]
+    white = whiten(model, Data(part.u, part.y), uncertainty=known)
+    gain = SensorGain(found, 0, white, part)
+    steady, own, left = known.predictor, gain._filter(share), np.array([1 - share, 1.0])
+
+    def innovations(moved):
+        x, rows = white.states[0], []
+        drive = moved.expanded(u)
+        for k in range(COUNT):
+            of, K = (left, own.K + (moved.K - known.model.K) * left) if k >= onset else (np.ones(2), moved.K)
+            e = part.y[k] - of * (moved.C @ x + moved.D @ drive[k] + moved.offset_y)
+            x = moved.A @ x + moved.B @ drive[k] + moved.offset_x + K @ e
+            rows.append((own if k >= onset else steady).root @ e)
+        return np.concatenate(rows)
+
+    moves = np.stack([(innovations(plus) - innovations(minus)) * factor for plus, minus, factor in known.moves], axis=1)
+    nuisance = gain.at(replace(gain.searched(COUNT - 6), onsets=np.array([onset]), logs=np.zeros(1),
+                               mean=np.array([share])), known).nuisance
+    free = nuisance.U[:, nuisance.s > 1e4]  # of the initial state
+    moves -= free @ (free.T @ moves)
+    others = nuisance.U[:, nuisance.s <= 1e4] * nuisance.s[nuisance.s <= 1e4]
+    expected, seen = moves @ moves.T, others @ others.T
+    assert np.linalg.norm(seen - expected) < 0.15 * np.linalg.norm(expected)  # the gain's is that of a run
+
+
 @pytest.mark.slow
 @pytest.mark.sampled(1)
 def test_the_interval_of_a_sensor_gain_covers():
