@@ -128,6 +128,19 @@ def test_fitted_state_minimises(model, simulator):
     assert run[simulator](data, x0="fit") == pytest.approx(run[simulator](data, x0=x0), abs=1e-12)
 
 
+@pytest.mark.parametrize("simulator", ["predict", "measured_feedback"])
+def test_the_state_of_a_linear_model_is_the_same_without_the_kernel(simulator, monkeypatch):
+    from optid.models import state_simulation
+
+    monkeypatch.setattr(state_simulation, "STRETCH", 200)  # in several parts
+    for model in (linear(), linear(n=1, m=1, outputs=1)):
+        data = record(model, count=150, noise=0.2)
+        found = model.initial_state(data, simulator)
+        with monkeypatch.context() as patch:
+            patch.setattr(state_simulation, "SHORT", 0)
+            assert found == pytest.approx(model.initial_state(data, simulator), abs=1e-12)
+
+
 def test_state_of_every_experiment_is_found_without_noise():
     model = with_feedback()
     data = record(model, noise=0.0, experiments=2)

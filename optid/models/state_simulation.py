@@ -11,6 +11,7 @@ import numpy as np
 from optid.arrays import Array, compact
 from optid.errors import DataError
 from optid.models.experiments import check_inputs, scaled_least_squares, signal_units
+from optid.models.recursions import SHORT, propagated
 from optid.models.state_signals import Direct, Parts, Signals, Stretch
 from optid.models.state_space import StateSpace
 
@@ -131,8 +132,6 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
 
     Where the error of the whole record is not needed, the run ends when the initial state has no effect any more.
     """
-    from optid.models.state_kernels import sensitivities
-
     n, outputs = x0.size, job.model.l
     root, cost, largest, informs = np.zeros((0, n + 1)), 0.0, 0.0, True
     x, turn, length = np.array(x0, dtype=float), np.eye(n), max(64, STRETCH // (n * outputs + 1))
@@ -146,8 +145,7 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
         with np.errstate(over="ignore"):
             cost += float(np.sum(error[present] ** 2))
         if informs:
-            jacobian = np.empty((len(states), outputs, n))
-            sensitivities(job.model.parts, NOTHING, signals(job, stretch, states, simulated), turn, jacobian)
+            jacobian, turn = _by_start(job, first, stretch, states, simulated, turn)
             rows = np.column_stack([(jacobian / unit[:, None])[present], error[present]])
             if not (np.all(np.isfinite(rows)) and np.isfinite(cost)):
                 raise DataError(
@@ -157,6 +155,24 @@ def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) 
             largest = max(largest, float(np.abs(turn).max()))
             informs = float(np.abs(turn).max()) > FORGOTTEN * largest
     return root, cost
+
+
+def _by_start(job: Run, first: int, stretch: Stretch, states: Array, simulated: Array, turn: Array
+              ) -> tuple[Array, Array]:
+    """Return the derivatives (T, l, n) of the outputs of a stretch, and that (n, n) of the state after it."""
+    model, known = job.model, None if job.known is None else job.known[first : first + len(states)]
+    linear = known is not None and not (model.latent or model.feedback or np.isnan(known).any())
+    if linear and len(states) <= SHORT:  # nothing to be compiled
+        F, drive = model.A - job.gain @ model.C, np.zeros((len(states), *turn.shape))
+        drive[0] = turn
+        with np.errstate(all="ignore"):
+            moved = propagated(F, drive)
+            return model.C @ moved, F @ moved[-1]
+    from optid.models.state_kernels import sensitivities
+
+    jacobian, turn = np.empty((*simulated.shape, len(turn))), turn.copy()
+    sensitivities(model.parts, NOTHING, signals(job, stretch, states, simulated), turn, jacobian)
+    return jacobian, turn
 
 
 def allowed_range(data: Any, times: float = FAR) -> Any:
