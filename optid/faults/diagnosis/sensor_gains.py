@@ -245,17 +245,18 @@ class SensorGain:
     @cached_property
     def _filter(self) -> Callable[[float], Predictor]:
         """The predictor of a share lost."""
-        model, noise = self.found.model, self.found.model.noise
-        assert noise is not None
-        scale = float(np.trace(self.white.predictor.covariance) / np.trace(predictor(model).covariance))
+        model, healthy = self.found.model, predictor(self.found.model)
+        scale = float(np.trace(self.white.predictor.covariance) / np.trace(healthy.covariance))
 
         @cache
         def damaged(share: float) -> Predictor:
             factors = np.ones(model.l)
             factors[self.o] = 1 - share
-            own = noise.mapped(np.eye(model.nx), np.diag(factors)) if self.scaled else noise
-            steady = predictor(replace(model, C=factors[:, None] * model.C, noise=own))
-            return replace(steady, covariance=scale * steady.covariance, root=steady.root / np.sqrt(scale))
+            C = factors[:, None] * model.C
+            own = replace(
+                healthy, C=C, K=healthy.K / factors, covariance=np.outer(factors, factors) * healthy.covariance,
+                root=healthy.root / factors) if self.scaled else predictor(replace(model, C=C))
+            return replace(own, covariance=scale * own.covariance, root=own.root / np.sqrt(scale))
 
         return damaged
 
