@@ -183,7 +183,7 @@ def test_parameters_that_are_not_the_most_likely_ones_deviate_by_what_their_reco
     part, present = data.experiments[0], np.ones((1000, model.l), dtype=bool)
     displacement = np.column_stack([20 * right.root[:, -1], found.root[:, -1]])
     moves, _ = sensitivities(right.model, right.predictor, part, np.zeros(model.nx), present, displacement)
-    seen = right.predictor.whitened(moves).reshape(present.size, 2)
+    seen = right.predictor.flattened(moves, present)
     # the true parameters are not the most likely ones either: sqrt(q) standard deviations off
     assert np.linalg.norm(seen[:, 0] - seen[:, 1]) < 2 * np.sqrt(right.root.shape[1])
     assert np.linalg.norm(seen[:, 0]) > 19

@@ -176,11 +176,9 @@ class ModelUncertainty:
             free_start: whether the initial state is unknown, because it was estimated from this record.
             seen: what whitens changes (N, l, d) of the innovations; the predictor by default.
         """
-        def plain(changes: Array) -> Array:
-            return self.predictor.whitened(changes, present)
 
         def diffuse(changes: Array) -> Array:
-            sizes = np.linalg.norm(plain(changes).reshape(present.size, -1), axis=0)
+            sizes = np.linalg.norm(self.predictor.flattened(changes, present), axis=0)
             return DIFFUSE * changes[:, :, sizes > 0] / sizes[sizes > 0]
 
         by_parameter, by_start = sensitivities(self.model, self.predictor, part, x0, present, self.root)
@@ -190,8 +188,9 @@ class ModelUncertainty:
         unknown = 0
         if outside(self.model, part.u):
             columns.append(diffuse(self.predictor.respond(*unknown_effects(self.model, part.u), present)))
-            unknown = int(np.linalg.matrix_rank(columns[-1].reshape(present.size, -1)))
-        flat = (seen or plain)(np.concatenate(columns, axis=2)).reshape(present.size, -1)
+            unknown = int(np.linalg.matrix_rank(self.predictor.flattened(columns[-1], present)))
+        changes = np.concatenate(columns, axis=2)
+        flat = self.predictor.flattened(changes, present) if seen is None else seen(changes).reshape(present.size, -1)
         U, s, _ = np.linalg.svd(flat, full_matrices=False)
         return Nuisance(U, s, unknown)
 
@@ -229,7 +228,7 @@ def model_uncertainty(
     levels = np.full((2, model.l), np.nan)
     length = max(count // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(gained, steady, data):
-        by_parameter, by_start = (steady.whitened(effect, present).reshape(present.size, -1) for effect in
+        by_parameter, by_start = (steady.flattened(effect, present) for effect in
                                   sensitivities(gained, steady, part, x0, present, np.eye(size)))
         basis, sizes, _ = np.linalg.svd(by_start, full_matrices=False)
         basis = basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)]

@@ -115,6 +115,10 @@ class Predictor:
                 result[np.ix_(rows, there)] = np.einsum("ij,nj...->ni...", block, innovations[np.ix_(rows, there)])
         return result
 
+    def flattened(self, changes: Array, present: Array) -> Array:
+        """Return changes (N, l, d) of the innovations, whitened, as columns (N l, d)."""
+        return self.whitened(changes, present).reshape(present.size, -1)
+
 
 def predictor(model: "HammersteinSS") -> Predictor:
     """Return the steady Kalman predictor of a model with noise covariances.

@@ -5,9 +5,9 @@ Kalman filter with this row, started from the state of the healthy one at the on
 is where the gain is lost before it, and is multiplied by 1 - gamma, too, where it is lost behind it: both are tried.
 
 The likelihood is computed for many shares and onsets at once, over a grid that is refined about the most probable onset
-and, once this is known to the sample, about the share. What the parameters of an identified model do not know is that
-of the plant as it is, not of a healthy one with these readings: its effect on the innovations is computed for the
-outputs that the filter estimates. A dead sensor, gamma = 1, reads its noise and is the end of the range.
+and, once this is known to the sample, about the share. The uncertainty of an identified model is that about the damaged
+plant, not about a healthy one with these readings: its effect on the innovations is computed for the outputs that the
+filter estimates. A dead sensor, gamma = 1, reads its noise and is the end of the range.
 """
 
 from collections.abc import Callable
@@ -59,12 +59,11 @@ def sensor_gains(
     for candidate in found.candidates:
         if candidate.kind != "loss" or candidate.columns:
             continue
-        o = int(np.flatnonzero(candidate.into_output[:, 0])[0])
-        there = np.flatnonzero(white.present[:, o])
-        if len(there) < 2 * LEAST or there[-LEAST] < 1:
+        gain = SensorGain(found, int(np.flatnonzero(candidate.into_output[:, 0])[0]), white, part)
+        if gain.last < 1:
             continue
         try:
-            laws = [SensorGain(found, o, white, part).searched(int(there[-LEAST]))]
+            laws = [gain.searched()]
             if uncertainty is not None:
                 laws = _with_parameters(laws[0], uncertainty)
         except StructureError:  # without this sensor some mode is not observable
@@ -87,7 +86,7 @@ def sensor_gains(
 def _with_parameters(law: "Law", uncertainty: ModelUncertainty) -> "list[Law]":
     """Return the laws of both noises with the effect of uncertain parameters, which depends on the fault."""
     for _ in range(REPEATED):
-        before, law = law, law.gain.at(law, uncertainty).searched(law.last)
+        before, law = law, law.gain.at(law, uncertainty).searched()
         if abs(law.onset - before.onset) <= 1:
             break
     return [replace(law.gain, scaled=scaled).at(law, uncertainty).around(law) for scaled in (False, True)]
@@ -99,7 +98,6 @@ class Law:
 
     Attributes:
         gain: the fault.
-        last: the last onset possible.
         onsets: (K,).
         logs: (K,) marginal likelihoods, uniform over shares and onsets.
         most: (K,) the largest likelihoods.
@@ -108,7 +106,6 @@ class Law:
     """
 
     gain: "SensorGain"
-    last: int
     onsets: np.ndarray
     logs: Array
     most: Array
@@ -146,11 +143,17 @@ class SensorGain:
     scaled: bool = False
     nuisance: Nuisance | None = None
 
-    def searched(self, last: int) -> Law:
-        """Search all onsets to the last one and all shares."""
-        sudden = np.argsort(-np.abs(np.nan_to_num(self.white.innovations[: last + 1, self.o])))[:ONSETS]
-        onsets: np.ndarray = np.unique(np.append(np.linspace(0, last, ONSETS).astype(int), sudden))
-        return self._refined(last, onsets, float(last), self._shares(0.5, 1.0))
+    @cached_property
+    def last(self) -> int:
+        """The last onset possible; 0 where the sensor has too few readings."""
+        there = np.flatnonzero(self.white.present[:, self.o])
+        return int(there[-LEAST]) if len(there) >= 2 * LEAST else 0
+
+    def searched(self) -> Law:
+        """Search all onsets and shares."""
+        sudden = np.argsort(-np.abs(np.nan_to_num(self.white.innovations[: self.last + 1, self.o])))[:ONSETS]
+        onsets: np.ndarray = np.unique(np.append(np.linspace(0, self.last, ONSETS).astype(int), sudden))
+        return self._refined(onsets, float(self.last), self._shares(0.5, 1.0))
 
     def at(self, law: Law, uncertainty: ModelUncertainty) -> "SensorGain":
         """Return the same with the effect of uncertain parameters at the best point of a law."""
@@ -159,9 +162,9 @@ class SensorGain:
     def around(self, law: Law) -> Law:
         """Search around the best point of another law."""
         k = law.onset
-        onsets = np.unique(np.linspace(max(k - ONSETS, 0), min(k + ONSETS, law.last), ONSETS).astype(int))
+        onsets = np.unique(np.linspace(max(k - ONSETS, 0), min(k + ONSETS, self.last), ONSETS).astype(int))
         width = AROUND * float(np.sqrt(law.variance[law.best]))
-        return self._refined(law.last, onsets, 2.0 * ONSETS, self._shares(float(law.mean[law.best]), width))
+        return self._refined(onsets, 2.0 * ONSETS, self._shares(float(law.mean[law.best]), width))
 
     def _shares(self, middle: float, width: float) -> Array:
         """Equally spaced shares about a middle, as far as it is possible."""
@@ -170,7 +173,7 @@ class SensorGain:
         middle = float(np.clip(middle, LOWEST + width / 2, top - width / 2))
         return middle + width * np.linspace(-0.5, 0.5, SHARES)
 
-    def _refined(self, last: int, onsets: np.ndarray, wide: float, shares: Array) -> Law:
+    def _refined(self, onsets: np.ndarray, wide: float, shares: Array) -> Law:
         for _ in range(ROUNDS):
             tried, gammas = onsets, shares
             logs = self.likelihoods(tried, gammas)
@@ -181,7 +184,7 @@ class SensorGain:
             if np.max(np.diff(onsets), initial=1) > 1:  # at a wrong onset another share is the best one
                 wide *= CLOSER
                 reach = max(int(wide / 2), ONSETS // 2)
-                near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, last), ONSETS)
+                near = np.linspace(max(onsets[k] - reach, 0), min(onsets[k] + reach, self.last), ONSETS)
                 onsets = np.unique(np.append(near.astype(int), onsets[k]))
             elif shares[1] - shares[0] < FINE * std:
                 break
@@ -193,7 +196,7 @@ class SensorGain:
         mean = weights @ gammas / total
         variance = np.maximum(weights @ gammas**2 / total - mean**2, 1e-12)
         evidence = most + np.log(total * (gammas[1] - gammas[0])) - np.log(len(self.white.r))
-        return Law(self, last, tried, evidence, most, mean, variance)
+        return Law(self, tried, evidence, most, mean, variance)
 
     def likelihoods(self, onsets: np.ndarray, shares: Array) -> Array:
         """Return the log-likelihood ratios (K, G) to the healthy plant of onsets (K,) and shares (G,)."""

@@ -45,7 +45,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     for part, x0 in zip(raw.experiments, as_list(given)):
         here = replace(part, u=part.u[:LONGEST], y=part.y[:LONGEST])
         there = ~np.isnan(here.y)
-        by_parameter, by_start = (known.predictor.whitened(effect, there).reshape(there.size, -1) for effect in
+        by_parameter, by_start = (known.predictor.flattened(effect, there) for effect in
                                   sensitivities(known.model, known.predictor, here, x0, there, known.root))
         by_parameter -= by_start @ np.linalg.lstsq(by_start, by_parameter, rcond=None)[0]
         raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
