@@ -12,7 +12,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "data.record": ["Data"],
-    "data.readers": ["read", "open_stream"],
+    "data.readers": ["Format", "read", "open_stream"],
     "data.streams": ["Stream"],
     "data.channels": ["Transform"],
     "bases": ["Triangular", "Trigonometric", "Polynomial", "BSpline", "PiecewiseConstant", "Linear", "UserFunctions"],

@@ -11,6 +11,7 @@ import optid.models.hammerstein_ss
 from typing import Any, Literal, overload
 
 from optid.data.record import Data as Data
+from optid.data.readers import Format as Format
 from optid.data.readers import read as read
 from optid.data.readers import open_stream as open_stream
 from optid.data.streams import Stream as Stream

@@ -51,7 +51,7 @@ def test_one_record_may_be_a_plain_list_or_masked():
 
 
 def test_repr_says_what_a_person_wants_to_know(record):
-    assert repr(record) == "Data('tank': 200 samples every 0.1, valve, pump -> level)"
+    assert repr(record) == "Data('tank': 200 samples every 0.1 s, valve, pump -> level)"
     assert "'tank': 2 experiments, 200 samples" in repr(Data.join(*record.split(0.5)))
     text = str(record)
     assert text.startswith("tank: 200 samples every 0.1") and text == str(record.describe())
@@ -309,9 +309,9 @@ def test_pandas_frames_go_out_and_come_back():
 def test_a_description_has_every_figure():
     u = np.tile([1.0, 2.0, np.nan, 4.0], 3)
     shown = Data(u=u, y=np.arange(12.0), dt=0.5, name="rig", input_units="%", start=2.0).describe()
-    assert shown.channels[0].levels == 3 and shown.lengths == (12,) and shown.starts == (2.0,)
+    assert shown.channels[0].levels == 3 and shown.lengths == (12,) and shown.ends == ((2.0, 7.5),)
     assert [line.split() for line in str(shown).splitlines()] == [
-        "rig: 12 samples every 0.5".split(), "from 2 to 7.5".split(),
+        "rig: 12 samples every 0.5 s".split(), "from 2 to 7.5".split(),
         "channel role unit low high mean std levels missing".split(),
         "u input % 1 4 2.333 1.247 3 25.00%".split(), "y output 0 11 5.5 3.452 12 none".split()]
     assert "experiment 2: 10 samples from 100 to 104.5" in str(two_runs().describe())

@@ -221,7 +221,7 @@ def test_what_is_no_record_in_parts_is_refused(record, folders, tmp_path):
         layout = optid.fit(record, **STRUCTURE).program.compressed.statistics.layout
         collect(optid.open_stream(folders), layout, weights=[np.ones(4000), np.ones(2500)])
     text = dd.from_pandas(frame.assign(u="x"), npartitions=2, sort=False)
-    refuses(DataError, "partition .: column 'u' is of type", optid.open_stream(text).ranges)
+    refuses(DataError, "partition ., column 'u', row 1 holds 'x'", optid.open_stream(text).ranges)
     frame.iloc[:3].to_parquet(tmp_path / "short.parquet")
     with pytest.raises(RankError, match="experiment 2: 3 samples, but the lags reach back 4"):
         optid.fit(optid.open_stream([folders[0], tmp_path / "short.parquet"]), na=4, nb=1, basis="triangular:4")

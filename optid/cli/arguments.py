@@ -33,9 +33,9 @@ def reading(how: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of a record as arguments of `optid.read`."""
     return {
         **how,
-        **{key: listed(how[key]) for key in ("inputs", "outputs", "columns")},
+        **{key: listed(how[key]) for key in ("inputs", "outputs", "columns", "input_units", "output_units", "quality")},
+        "missing": tuple(listed(how["missing"]) or ()),
         "time": False if how["time"] == "none" else how["time"],
-        "delimiter": how["delimiter"].replace("\\t", "\t"),
     }
 
 

@@ -113,7 +113,7 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
 def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
             what: str = "fit") -> None:
     """Validate on the held-out record and save the model; a record that was used whole is named in its file."""
-    from optid.cli.arguments import listed
+    from optid.cli import arguments as words
 
     if held_out is not None:
         from optid.identify.validation.checks import validate as check
@@ -123,8 +123,8 @@ def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Pat
     if saved is not None:
         record = None
         if data and held_out is None:
-            named = {key: listed(how[key]) for key in ("inputs", "outputs", "columns")}
-            record = {**how, **named, "files": [str(Path(name).resolve()) for name in data]}
+            named = {key: words.listed(value) if isinstance(value, list) else value for key, value in how.items()}
+            record = {**named, "files": [str(Path(name).resolve()) for name in data]}
         found.model.save(saved, record)
 
 

@@ -19,9 +19,8 @@ ARL0 = 10_000
 KEPT = 10_000  # samples after which the state is saved, events or not
 
 
-def monitor(model: Path, follow: File = None, until_end: bool = False, inputs: Words = None, outputs: Words = None,
-            dt: float | None = None, time: str | None = None, columns: Words = None, delimiter: str = ",",
-            decimal: str = ".", fill_gaps: int | None = None, strict: bool = False, kinds: Words = None,
+def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: dict[str, Any],
+            fill_gaps: int | None = None, strict: bool = False, kinds: Words = None,
             load: Words = None, state_jump: bool = True, arl0: float | None = None, window: int = 100,
             identified: Paths = None, healthy: Paths = None, thresholds: File = None, extrapolate: bool = False,
             seed: int = 0, state: File = None, lines: bool = False) -> None:
@@ -52,17 +51,21 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, inputs: W
         lines (--json): Print one JSON object per line.
     """
     from optid.cli import arguments as words
+    from optid.data.reading.format import Format
     from optid.data.reading.rows import RowReader
+    from optid.errors import DataError
 
     check_folders(state, thresholds)
     with hearing() as heard, Waiting() as waiting:
         waiting.step("reading")
         plant = words.state_space_model(model)
-        given = (inputs, outputs, dt, time, None, columns, delimiter, decimal)
-        how = words.as_modelled(dict(zip(READING, given)), plant)
+        how = words.as_modelled(how, plant)
         reading = words.reading(how)
-        del reading["experiment"]
-        reader = RowReader(**reading, fill=fill_gaps or 0, label="standard input" if follow is None else follow.name)
+        channels = {key: reading.pop(key) for key in ("inputs", "outputs", "dt", "time")}
+        if reading.pop("experiment") is not None:
+            raise DataError("a stream of rows is one experiment; leave --experiment out")
+        reader = RowReader(**channels, how=Format(**reading), fill=fill_gaps or 0,
+                           label="standard input" if follow is None else follow.name)
         if state is not None and state.exists():
             watcher = _resumed(state, plant, model)
         else:

@@ -33,13 +33,30 @@ The record:
     inputs (-u NAME...): Columns of the inputs. [dim]u, u1, u2, ...[/]
     outputs (-y NAME...): Columns of the outputs. [dim]y, y1, y2, ...[/]
     dt: Sampling time. [dim]from the time stamps[/]
-    time (NAME): Column of time stamps; 'none' ignores them. [dim]t, time[/]
+    time (NAME): Column of time stamps; 'none' ignores them. [dim]one named as a clock, or of dates[/]
     experiment (NAME): Column that names the experiment of each row.
     columns (NAME...): Names of the columns of a file without a header.
-    delimiter: Delimiter of a CSV file.
-    decimal: Decimal mark of a CSV file.
+    input_units (UNIT...): One unit per input.
+    output_units (UNIT...): One unit per output.
     test (FILE...): Validate on these files.
     seed: Seed of the noise of the example.
+How the files are written:
+    delimiter: Character between the cells of a text file. [dim]found[/]
+    decimal: Decimal mark.
+    thousands: Mark between groups of three digits.
+    encoding (NAME): Encoding of a text file. [dim]UTF-8, or by its byte order mark[/]
+    comment (TEXT): Skip lines that begin with this text.
+    skip_rows (N): Lines to skip before the header.
+    units_row (N): Row after the header that holds the units, 0 for none. [dim]found[/]
+    missing (WORD...): Words and numbers that mark missing samples, such as BAD,-9999.
+    date_format (FORMAT): Format of the time stamps, such as '%d.%m.%Y %H:%M:%S'. [dim]ISO 8601[/]
+    time_zone (ZONE): Zone of local time stamps, such as Europe/Berlin.
+    time_tolerance (SHARE): Largest deviation of a time step, relative to the median step.
+    gaps (WORD): Lost rows become 'missing' samples, or 'experiments' begin after them. [dim]refused[/]
+    resample (DURATION): Bring the record onto this sampling time, such as 1s or 5min.
+    quality (COLUMN:VALUE...): Columns of quality and their value for a good sample, such as PV.Q:192.
+    from_ (--from TIME): Leave out the samples before this date or second.
+    to (TIME): Leave out the samples after this date or second.
 The model:
     formulation (-f NAME): Formulation of the model; optid formulations lists them.
     feedback_basis (NAME:SIZE...): Basis of the nonlinear output feedback, one for all outputs or one per output.
@@ -65,8 +82,24 @@ READING: dict[str, tuple[Any, Any]] = {
     "time": (str | None, None),
     "experiment": (str | None, None),
     "columns": (Words, None),
-    "delimiter": (str, ","),
+    "input_units": (Words, None),
+    "output_units": (Words, None),
+    "delimiter": (str | None, None),
     "decimal": (str, "."),
+    "thousands": (str | None, None),
+    "encoding": (str | None, None),
+    "comment": (str | None, None),
+    "skip_rows": (int, 0),
+    "units_row": (int | None, None),
+    "missing": (Words, None),
+    "date_format": (str | None, None),
+    "time_zone": (str | None, None),
+    "time_tolerance": (float, 0.01),
+    "gaps": (str | None, None),
+    "resample": (str | None, None),
+    "quality": (Words, None),
+    "from_": (str | None, None),
+    "to": (str | None, None),
 }
 """How the files of a record are read: the type of each option and its default, in place of a parameter ``how``."""
 
@@ -118,7 +151,7 @@ def described(text: str) -> tuple[str, dict[str, tuple[str, str, str]]]:
 
 def option_of(argument: str) -> str:
     """Return the option word of an argument."""
-    return "--" + argument.replace("_", "-")
+    return "--" + argument.strip("_").replace("_", "-")
 
 
 def descriptions() -> Iterator[tuple[str, Description]]:
@@ -130,7 +163,7 @@ def descriptions() -> Iterator[tuple[str, Description]]:
 
 def in_options(text: str) -> str:
     """Write a message about arguments of Python with the options of the command."""
-    known = {"solver", "accuracy", "time_limit"}.union(*(found.options for _, found in descriptions()))
+    known = {"solver", "accuracy", "time_limit", *READING}.union(*(found.options for _, found in descriptions()))
     word = "|".join(sorted(known, key=len, reverse=True))
 
     def several(match: re.Match[str]) -> str:
@@ -138,7 +171,10 @@ def in_options(text: str) -> str:
 
     text = re.sub(rf"(takes no )argument '({word})'(?=\.)", lambda m: m[1] + option_of(m[2]), text)
     text = re.sub(rf"( needs |Known: )((?:{word})(?:, (?:{word}))*)(?=$|\.)", several, text)
-    text = re.sub(rf"(?<![\w.-])({word})=(?=['\w\[(.-])", lambda m: option_of(m[1]) + " ", text)
+    text = text.replace("pass time=False and dt=", "pass --time none and --dt").replace("time=False", "--time none")
+    text = re.sub(rf"(?<=['\w\]]), (?=(?:{word})=)", " ", text)
+    text = re.sub(rf"(?<![\w.-])({word})=(?=['\"\w\[(.-])", lambda m: option_of(m[1]) + " ", text)
+    text = re.sub(rf"(?<![\w.-])({word})=(?=[ .,:])", lambda m: option_of(m[1]), text)
     return re.sub(rf"^({word})(?=,| must| is | has | of input| \()", lambda m: option_of(m[1]), text)
 
 

@@ -20,7 +20,7 @@ from optid.errors import DataWarning, InfeasibleError, OptidError, SolverFailed,
 PATIENCE = 2.0  # seconds of silence before progress is shown
 FILES = "FILE..."  # metavar of options whose values are files
 
-_FILE = re.compile(r".+\.(csv|tsv|txt|parquet|mat|npz|npy|json)", re.IGNORECASE)
+_FILE = re.compile(r".+\.(csv|tsv|txt|dat|asc|lvm|parquet|mat|npz|npy|xlsx|tdms|mf4|json)", re.IGNORECASE)
 _NUMBER = re.compile(r"-[0-9.].*")
 
 

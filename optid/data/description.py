@@ -1,6 +1,9 @@
 """A record at a glance: its experiments, its sampling, and each channel's range, levels and missing samples."""
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from optid.data.channels import MOST_LEVELS, Channel
 
@@ -13,25 +16,29 @@ class Description:
 
     Attributes:
         name: name of the data set.
-        dt: sampling time.
+        interval: sampling time with its unit.
         lengths: samples of each experiment.
-        starts: time of the first sample of each experiment.
+        ends: time of the first and of the last sample of each experiment.
         channels: figures of each channel over all experiments, inputs first.
+        findings: what reading the record derived, assumed or repaired.
     """
 
     name: str
-    dt: float
+    interval: str
     lengths: tuple[int, ...]
-    starts: tuple[float, ...]
+    ends: tuple[tuple[Any, Any], ...]
     channels: tuple[Channel, ...]
+    findings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        lines = [f"{self.name or 'Record'}: {sum(self.lengths)} samples every {self.dt:g}"]
+        lines = [f"{self.name or 'Record'}: {sum(self.lengths)} samples every {self.interval}"]
+        found = [f"  {finding}" for finding in self.findings]
         if len(self.lengths) > MOST_EXPERIMENTS:
             lines.append(f"  {len(self.lengths)} experiments of {min(self.lengths)} to {max(self.lengths)} samples")
-        for k, (samples, start) in enumerate(zip(self.lengths, self.starts) if len(lines) < 2 else ()):
+        for k, (samples, ends) in enumerate(zip(self.lengths, self.ends) if len(lines) < 2 else ()):
             label = f"experiment {k + 1}: {samples} samples " if len(self.lengths) > 1 else ""
-            lines.append(f"  {label}from {start:.10g} to {start + (samples - 1) * self.dt:.10g}")
+            lines.append(f"  {label}from {instant(ends[0])} to {instant(ends[1])}")
+        lines[1:1] = found
         table = [("channel", "role", "unit", "low", "high", "mean", "std", "levels", "missing")]
         for c in self.channels:
             levels = str(c.levels) if c.levels <= MOST_LEVELS else f"over {MOST_LEVELS}"
@@ -44,3 +51,11 @@ class Description:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def instant(time: Any) -> str:
+    """Return a time as text: a date without trailing zeros, or a number."""
+    if not isinstance(time, np.datetime64):
+        return f"{time:.10g}"
+    day, _, clock = str(time.astype("M8[us]")).partition("T")
+    return f"{day} {clock.rstrip('0').rstrip('.') if '.' in clock else clock}"

@@ -1,125 +1,209 @@
 """From files, frames and dictionaries to `Data`."""
 
 from collections import Counter
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading import columns as known
-from optid.data.reading.columns import TIME_TOLERANCE, Wanted, as_stamps, choose, seconds
-from optid.data.reading.sources import Table, open_table
+from optid.data.reading import long_tables
+from optid.data.reading.clock import Clock, clock_columns, seconds
+from optid.data.reading.columns import Wanted, choose
+from optid.data.reading.format import Format
+from optid.data.reading.rival_clocks import settle
+from optid.data.reading.sources import Table, open_tables
+from optid.data.reading.uniform import agreed_step, regular
 from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError
 
-__all__ = ["Stream", "open_stream", "read"]
+__all__ = ["Format", "Stream", "open_stream", "read"]
 
 
 def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None,
-         time: str | int | bool | None = None, experiment: str | int | None = None, *,
-         columns: Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
-         output_units: str | Sequence[str] | None = None, name: str | None = None, delimiter: str = ",",
-         decimal: str = ".", time_tolerance: float = TIME_TOLERANCE) -> Data:
+         time: str | int | bool | Sequence[str] | None = None, experiment: str | int | None = None,
+         name: str | None = None, *, format: Format | None = None, **words: Any) -> Data:
     """Read a record; blank, NaN and NA cells are missing samples.
 
+    What was derived, assumed or repaired is told by `Data.findings`.
+
     Args:
-        source: path of a .csv, .txt, .tsv, .parquet, .mat (5 to 7.3), .npz or .npy file; a pandas, polars or arrow
-            table; an xarray data set; a mapping {name: (N,) or (N, channels) array}; an (N, channels) array; or a list
-            of these, one per experiment. The fields of a MATLAB structure are named "structure.field".
+        source: path of a .csv, .txt, .tsv, .dat, .lvm, .parquet, .mat (5 to 7.3), .npz or .npy file, with the extra
+            ``plant`` also of an .xlsx, .tdms or .mf4 file; a pandas, polars or arrow table; an xarray data set; a
+            mapping {name: (N,) or (N, channels) array}; an (N, channels) array; or a list of these, one per experiment.
+            A source whose clock continues that of the one before continues its experiment. The fields of a MATLAB
+            structure are named "structure.field".
         inputs: columns of the inputs by name or position, or {channel name: column}; u, or u1, u2, ..., when not given.
         outputs: columns of the outputs likewise; y, or y1, y2, ..., when not given.
-        dt: sampling time; from the time stamps when not given, 1 without stamps.
-        time: column of time stamps (numbers, dates, ISO text; dates count in seconds); when not given a column t or
-            time, a time index of a frame, or the only column of dates of a frame or Parquet file; False ignores it.
+        dt: sampling time in seconds; from the time stamps when not given, 1 sample without stamps.
+        time: column of time stamps, or two with date and time of day; when not given the one that is named as a clock
+            (t, time, Timestamp, Zeit, "Time (ms)", ...), a time index of a frame, or the only column of dates; False
+            ignores it. Stamps are dates, times of day, seconds, another unit that the name tells, seconds or
+            milliseconds since 1970, or the days of Excel or MATLAB.
         experiment: column whose value names the experiment; a new experiment starts where it changes.
-        columns: names of the columns of a source that has none.
-        input_units: one unit per input.
-        output_units: one unit per output.
         name: name of the data set; the file's when not given.
-        delimiter: character between the cells of a CSV file.
-        decimal: decimal mark of a CSV file, "." or ",".
-        time_tolerance: largest deviation of a time step from the median step, relative to it.
+        format: how the table is written, and what to repair.
+        words: the fields of `Format` as keywords, such as ``delimiter=";", decimal=","``.
 
     Raises:
         DataError: missing file or column (with the nearest name), empty table, cell that is not a number (with column
             and row), time stamps that are not uniform (with sample, step and median), infinite sample, or a missing
-            extra (with its pip line).
+            extra (with its pip line); the message says what to type.
 
     Warns:
         DataWarning: integer samples that look saturated or wrapped around.
     """
+    how = Format.of(format, words)
     dt = None if dt is None else sampling_time(dt)
     sources = list(source) if isinstance(source, list | tuple) else [source]
     if not sources:
         raise DataError("the list of sources is empty; give at least one.")
     runs: list[_Run] = []
     for item in sources:
-        runs += _runs(open_table(item, columns, delimiter, decimal), inputs, outputs, time, experiment)
-    step = dt
+        runs += _runs_of(open_tables(item, how), inputs, outputs, time, experiment)
     for run in runs:
         if run.names != runs[0].names:
             raise DataError(f"{run.label} has channels {run.names}, {runs[0].label} has {runs[0].names}.")
-        if run.stamps is not None:
-            found = known.uniform_step(run.stamps, time_tolerance, run.label)
-            step = known.agreed_step(found, step, time_tolerance, run.label)
+    runs, joined = _continued(runs, how) if experiment is None else (runs, [])
+    runs = _between(runs, how, dt)
+    experiments, step, findings = _sampled(runs, how, dt)
+    dated = all(run.is_dated for run in runs)
+    notes = [*(note for run in runs for note in run.findings), *joined, *findings]
+    if step is None:
+        clockless = "no time column" if all(run.stamps is None for run in runs) else "a single time stamp"
+        notes.insert(0, f"{clockless}: 1 sample = 1; pass dt= (seconds)")
     first = sources[0]
-    starts = [0.0 if run.stamps is None else float(seconds(run.stamps[:1])[0]) for run in runs]
+    units = runs[0].units
     return Data.of_experiments(
-        [Experiment(run.u, run.y, start) for run, start in zip(runs, starts)],
-        1.0 if step is None else step, *runs[0].names, input_units, output_units,
+        experiments, 1.0 if step is None else step, *runs[0].names,
+        how.input_units or [units.get(one, "") for one in runs[0].names[0]],
+        how.output_units or [units.get(one, "") for one in runs[0].names[1]],
         name if name is not None else Path(first).stem if isinstance(first, str | Path) else "",
+        time_unit="" if step is None else "s", dated=dated, findings=tuple(dict.fromkeys(notes)),
     )
 
 
-class _Run(NamedTuple):
-    """One experiment of one source; names of inputs and outputs, stamps (N,) or None."""
+@dataclass(frozen=True)
+class _Run:
+    """One experiment of one source."""
 
     label: str
-    names: tuple[tuple[str, ...], tuple[str, ...]]
+    names: tuple[tuple[str, ...], tuple[str, ...]]  # of inputs and outputs
     u: np.ndarray
     y: np.ndarray
-    stamps: np.ndarray | None
+    stamps: np.ndarray | None  # (N,)
+    clock: Clock | None
+    units: Mapping[str, str]
+    step: float | None  # sampling time that the source states
+    findings: tuple[str, ...]
+
+    @property
+    def is_dated(self) -> bool:
+        return self.stamps is not None and self.stamps.dtype.kind == "M"
+
+    def part(self, rows: Any) -> "_Run":
+        return replace(self, u=self.u[rows], y=self.y[rows], stamps=None if self.stamps is None else self.stamps[rows])
 
 
-def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: str | int | bool | None, experiment: str | int | None
-          ) -> list[_Run]:
-    label = table.label
-    ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
-    signals = [*ins.values(), *outs.values()]
-    clock = known.time_column(table.names, time, signals, label, table.index)
+def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any, experiment: Any) -> list[_Run]:
+    """Return the experiments of a source; of several tables those that have all channels."""
+    if len(tables) == 1:
+        return _runs(tables[0], inputs, outputs, time, experiment)
+    whole, refusals = [], []
+    for table in tables:
+        try:
+            for wanted, letter in ((inputs, "u"), (outputs, "y")):
+                choose(table.names, wanted, letter, table.label)
+            whole.append(table)
+        except DataError as error:
+            refusals.append(error)
+    if not whole:
+        raise refusals[0]
+    return [run for table in whole for run in _runs(table, inputs, outputs, time, experiment)]
+
+
+def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: str | int | None) -> list[_Run]:
+    label, how = table.label, table.how
+    try:
+        ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
+    except DataError as error:
+        raise long_tables.explained(error, table, inputs, outputs) from None
+    signals = list(dict.fromkeys([*ins.values(), *outs.values()]))
+    clocks = clock_columns(table.names, time, signals, label, table.index, table.dates)
     group = None if experiment is None else known.column_name(table.names, experiment, label)
-    loaded = table.load(list(dict.fromkeys([*signals, *(name for name in (clock, group) if name is not None)])),
-                        clock, group)
-    stamps = None if clock is None else as_stamps(np.ravel(loaded[clock]), f"{label}, column {clock!r}")
+    goods = dict(how.quality or {})
+    quality = known.guarded(goods, table.names, signals, label)
+    others = [name for name in (*clocks, *([group] if group is not None else []), *quality) if name not in signals]
+    unused = [name for name in known.quality_columns(table.names, signals) if name not in (*quality, *others)]
+    wanted = list(dict.fromkeys([*signals, *others, *unused]))
+    loaded = table.load(wanted, {*others, *unused} | ({group} if group is not None else set()))
+    findings = [*table.findings]
+    clock, stamps, said = _clock(table, loaded, clocks, time)
+    findings += said
     groups = None if group is None else np.ravel(loaded[group])
-    loaded = {name: loaded[name] for name in signals}
-    y_names, y = _stacked(outs, loaded, label, kept=set(ins.values()))
-    u_names, u = _stacked(ins, loaded, label)
+    good = {name: known.is_good(loaded[name], goods[name], f"{label}, column {name!r}") for name in quality}
+    findings += [known.unused_quality(unused, loaded)] if unused else []
+    loaded = {name: _numeric(loaded[name], name, table) for name in signals}
+    y_names, y = _stacked(outs, loaded, table, quality, good, kept=set(ins.values()))
+    u_names, u = _stacked(ins, loaded, table, quality, good)
     if len(u) != len(y):
         raise DataError(f"{label}: u has {len(u)} samples and y has {len(y)}. Cut both to the common part.")
     if stamps is not None and len(stamps) != len(u):
-        raise DataError(f"{label}: {clock!r} has {len(stamps)} stamps for {len(u)} samples; time=False ignores it.")
+        raise DataError(f"{label}: {clocks[0]!r} has {len(stamps)} stamps for {len(u)} samples; time=False ignores it.")
+    units = {name: table.units.get(column, "") for name, column in (ins | outs).items()}
+    whole = _Run(label, (u_names, y_names), u, y, stamps, clock, units, table.step, tuple(findings))
     runs = []
     for value, rows in _groups(groups, len(u), label):
-        part = label if value is None else f"{label}, experiment {value!r}"
-        check_shape(u[rows], f"{part}, inputs")
-        check_shape(y[rows], f"{part}, outputs")
-        runs.append(_Run(part, (u_names, y_names), u[rows], y[rows], None if stamps is None else stamps[rows]))
+        part = replace(whole.part(rows), label=label if value is None else f"{label}, experiment {value!r}")
+        check_shape(part.u, f"{part.label}, inputs")
+        check_shape(part.y, f"{part.label}, outputs")
+        runs.append(part)
     return runs
 
 
-def _stacked(pairs: dict[str, str], loaded: dict[str, Any], label: str, kept: Set[str] = frozenset()
-             ) -> tuple[tuple[str, ...], np.ndarray]:
+def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time: Any
+           ) -> tuple[Clock | None, np.ndarray | None, list[str]]:
+    """Return the clock of a table, its stamps and what is to be said of it."""
+    if not clocks:
+        return None, None, []
+    try:
+        clock, stamps, said = settle(loaded, clocks, table, asked=time is not None and time is not True)
+    except DataError as error:
+        if table.advice and "pass " not in str(error).lower():
+            raise DataError(f"{error} Pass {table.advice}.") from None
+        if table.advice and "date_format=" in str(error) and "date_format=" in table.advice:
+            raise DataError(f"{str(error).partition(' Pass ')[0]} Pass {table.advice}.") from None
+        raise
+    return clock, stamps, said
+
+
+def _numeric(values: Any, column: str, table: Table) -> Any:
+    """Return the samples of a column, texts converted to numbers and marks of missing samples to NaN."""
+    array = np.asarray(values) if not isinstance(values, np.ma.MaskedArray) else values
+    if array.dtype.kind in "UO" and array.ndim == 1 and all(isinstance(cell, str) for cell in array.tolist()):
+        cells = array.tolist()
+        array, row = known.to_numbers(cells, table.how)
+        if row is not None:
+            raise known.cell_error(f"{table.label}: column {column!r}, row {row + 1}", cells[row], table.how, [cells],
+                                   table.advice)
+    return known.without_marks(array, table.how) if array.dtype.kind in "iuf" else values
+
+
+def _stacked(pairs: dict[str, str], loaded: dict[str, Any], table: Table, quality: Mapping[str, str],
+             good: Mapping[str, np.ndarray], kept: Set[str] = frozenset()) -> tuple[tuple[str, ...], np.ndarray]:
     """Return names and samples (N, channels), read-only; all columns but those kept make room for their copies."""
     names: list[str] = []
-    parts = []
+    parts, label = [], table.label
     uses = Counter(pairs.values())
     for name, column in pairs.items():
         part = as_samples(loaded[column], f"{label}, column {column!r}")
+        for guard in (guard for guard, signal in quality.items() if signal == column):
+            part = np.where(good[guard][:, None], part, np.nan)
         parts.append(part)
         names += [name] if part.shape[1] == 1 else [f"{name}{c + 1}" for c in range(part.shape[1])]
         uses[column] -= 1
@@ -147,3 +231,97 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
             raise DataError(f"{label}: experiment {value!r} starts again at row {starts[k] + 1}. Sort the rows by "
                             "experiment, or give the second run a value of its own.")
     return [(value, slice(a, b)) for value, a, b in zip(labels, starts, [*starts[1:], rows])]
+
+
+# -- from runs to experiments
+
+
+def _continued(runs: list[_Run], how: Format) -> tuple[list[_Run], list[str]]:
+    """Join runs whose clock continues that of the run before; with `gaps` or `resample` also those behind a gap."""
+    found, findings = [runs[0]], []
+    for run in runs[1:]:
+        last = found[-1]
+        if _follows(last, run, how):
+            findings.append(f"{run.label} continues {last.label.rpartition(' + ')[2]}")
+            assert last.stamps is not None and run.stamps is not None
+            found[-1] = replace(last, label=f"{last.label} + {run.label}", u=np.vstack([last.u, run.u]),
+                                y=np.vstack([last.y, run.y]), stamps=np.concatenate([last.stamps, run.stamps]),
+                                findings=tuple(dict.fromkeys([*last.findings, *run.findings])))
+        else:
+            found.append(run)
+    if len(findings) > 3:
+        findings = [f"{len(findings)} files continue the one before"]
+    return found, findings
+
+
+def _follows(last: _Run, run: _Run, how: Format) -> bool:
+    if last.stamps is None or run.stamps is None or last.stamps.dtype != run.stamps.dtype or last.stamps.size < 2:
+        return False
+    border = float(seconds(run.stamps[:1] - last.stamps[-1:])[0])
+    median = float(np.median(seconds(np.diff(last.stamps))))
+    if how.gaps is not None or how.resample is not None:
+        return border > 0
+    return median > 0 and abs(border - median) <= how.time_tolerance * median
+
+
+def _between(runs: list[_Run], how: Format, dt: float | None) -> list[_Run]:
+    """Return the samples from the instant `from_` to the instant `to`."""
+    if how.from_ is None and how.to is None:
+        return runs
+    kept = []
+    for run in runs:
+        stamps = run.stamps if run.stamps is not None else (dt or 1.0) * np.arange(len(run.u))
+        inside = np.ones(len(run.u), dtype=bool)
+        for name, value in (("from_", how.from_), ("to", how.to)):
+            if value is not None:
+                instant = _instant(value, name, stamps, run.clock)
+                inside &= stamps >= instant if name == "from_" else stamps <= instant
+        if inside.any():
+            kept.append(run.part(inside))
+    if not kept:
+        stamps = runs[0].stamps
+        span = "" if stamps is None else f"; {runs[0].label} has {stamps[0]} to {stamps[-1]}"
+        raise DataError(f"from_={how.from_!r}, to={how.to!r}: no sample lies between{span}.")
+    return kept
+
+
+def _instant(value: Any, name: str, stamps: np.ndarray, clock: Clock | None) -> Any:
+    """Return an instant in the type of some stamps."""
+    try:
+        if stamps.dtype.kind == "M":
+            date = np.datetime64(value).astype("M8[ns]")
+            if clock is not None and clock.how.time_zone is not None:
+                from optid.data.reading.dates import to_utc
+
+                date = to_utc(np.array([date]), clock.how.time_zone, name)[0]
+            return date
+        number = float(value)
+        return np.timedelta64(round(number * 1e9), "ns") if stamps.dtype.kind == "m" else number
+    except (ValueError, TypeError, OverflowError):
+        kind = "a date such as '2024-05-01T12:00'" if stamps.dtype.kind == "M" else "a number of seconds"
+        raise DataError(f"{name}={value!r}: must be {kind}, as the clock has.") from None
+
+
+def _sampled(runs: Sequence[_Run], how: Format, dt: float | None
+             ) -> tuple[list[Experiment], float | None, list[str]]:
+    """Return the experiments of some runs, their sampling time and what was repaired."""
+    experiments: list[Experiment] = []
+    findings: list[str] = []
+    step = dt
+    for run in runs:
+        if run.stamps is None:
+            if run.step is not None:
+                step = agreed_step(run.step, step, how.time_tolerance, run.label)
+            if how.resample is not None or how.gaps is not None:
+                word = "resample" if how.resample is not None else "gaps"
+                raise DataError(f"{run.label} has no time column, which {word}= needs. Name it: time=.")
+            experiments.append(Experiment(run.u, run.y, 0.0))
+            continue
+        pieces, found, said = regular(run.stamps, run.u, run.y, dt, how, run.label)
+        findings += said
+        step = agreed_step(found, step, how.time_tolerance, run.label)
+        for piece in pieces:
+            for part in (piece.u, piece.y):
+                part.flags.writeable = False
+            experiments.append(Experiment(piece.u, piece.y, float(seconds(np.atleast_1d(piece.stamp))[0])))
+    return experiments, step, findings

@@ -47,6 +47,9 @@ class Data(Ports):
     Attributes:
         experiments: the records, each with read-only arrays u (N, m) and y (N, l).
         dt, inputs, outputs, input_units, output_units, name: as given, a name and a unit ("" where unknown) for each.
+        time_unit: unit of dt: "s" where it is known, "" where dt counts samples.
+        dated: whether the times of the samples are dates; then the starts of experiments are seconds since 1970 (UTC).
+        findings: what reading the record derived, assumed or repaired, one sentence each.
         transform: how to return to raw units; identity unless `detrend` or `scale` was used.
     """
 
@@ -57,24 +60,27 @@ class Data(Ports):
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     name: str
+    time_unit: str
+    dated: bool
+    findings: tuple[str, ...] = field(repr=False)
     transform: Transform = field(repr=False)
 
-    def __init__(self, u: Any, y: Any, dt: float = 1.0, inputs: str | Sequence[str] | None = None,
+    def __init__(self, u: Any, y: Any, dt: float | None = None, inputs: str | Sequence[str] | None = None,
                  outputs: str | Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
-                 output_units: str | Sequence[str] | None = None, name: str = "", start: float | Sequence[float] = 0.0
-                 ) -> None:
+                 output_units: str | Sequence[str] | None = None, name: str = "", start: Any = 0.0) -> None:
         """Copy and check the record.
 
         Args:
             u: (N,) or (N, m), or a list of such arrays, one per experiment; NaN = missing.
             y: (N,) or (N, l), or a list of as many arrays; NaN = missing.
-            dt: sampling time, positive, in the user's unit of time (seconds where units matter).
+            dt: sampling time in seconds, positive; when not given 1, and time counts samples.
             inputs: names of the inputs; u, or u1, u2, ... when not given.
             outputs: names of the outputs; y, or y1, y2, ... when not given.
             input_units: one unit per input.
             output_units: one unit per output.
             name: name of the data set, for reports.
-            start: time of the first sample, one for all experiments or one for each.
+            start: time of the first sample, one for all experiments or one for each: seconds, or dates (datetime64,
+                ISO text).
 
         Raises:
             DataError: wrong shape or type, infinite sample, different lengths, wrong number of names; the message
@@ -87,31 +93,34 @@ class Data(Ports):
         ys = as_records(y, "y", listed(outputs))
         if len(us) != len(ys):
             raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
-        starts = np.atleast_1d(np.asarray(start, dtype=float))
-        if starts.shape not in ((1,), (len(us),)) or not np.isfinite(starts).all():
-            raise DataError(f"start = {start!r}: one finite time, or one for each of the {len(us)} experiments.")
+        starts, dated = _starts(start, len(us))
         experiments = []
         for k, (ue, ye, s) in enumerate(zip(us, ys, np.broadcast_to(starts, len(us)))):
             try:
                 experiments.append(Experiment(ue, ye, float(s)))
             except DataError as error:
                 raise DataError(f"experiment {k + 1}: {error}" if len(us) > 1 else str(error)) from None
-        self._complete(experiments, dt, inputs, outputs, input_units, output_units, name)
+        self._complete(experiments, dt, inputs, outputs, input_units, output_units, name=str(name), dated=dated)
 
     @classmethod
-    def of_experiments(cls, experiments: Sequence[Experiment], dt: float, inputs: Sequence[str], outputs: Sequence[str],
-                       input_units: Any = None, output_units: Any = None, name: str = "") -> "Data":
-        """Return data of experiments with checked samples, without a copy; arguments as of the class."""
+    def of_experiments(cls, experiments: Sequence[Experiment], dt: float | None, inputs: Sequence[str],
+                       outputs: Sequence[str], input_units: Any = None, output_units: Any = None, name: str = "",
+                       **more: Any) -> "Data":
+        """Return data of experiments with checked samples, without a copy.
+
+        Arguments as of the class; `more` are the attributes time_unit, dated and findings.
+        """
         data = object.__new__(cls)
-        data._complete(experiments, dt, inputs, outputs, input_units, output_units, name)
+        data._complete(experiments, dt, inputs, outputs, input_units, output_units, name=name, **more)
         return data
 
-    def _complete(self, experiments: Sequence[Experiment], dt: float, inputs: Any, outputs: Any, input_units: Any,
-                  output_units: Any, name: str) -> None:
+    def _complete(self, experiments: Sequence[Experiment], dt: float | None, inputs: Any, outputs: Any,
+                  input_units: Any, output_units: Any, **more: Any) -> None:
         m, l = experiments[0].u.shape[1], experiments[0].y.shape[1]  # noqa: E741
         names = channel_fields(m, l, inputs, outputs, input_units, output_units)
-        _filled(self, experiments=tuple(experiments), dt=sampling_time(dt), name=str(name),
-                transform=Transform.identity(m, l), **names)
+        more = {"time_unit": "" if dt is None else "s", "dated": False, "findings": ()} | more
+        _filled(self, experiments=tuple(experiments), dt=sampling_time(1.0 if dt is None else dt),
+                transform=Transform.identity(m, l), **names, **more)
         for channel, share in self.missing.items():
             if share == 1.0:
                 raise DataError(f"channel {channel!r}: every sample is missing. Check the column, or leave it out.")
@@ -144,9 +153,20 @@ class Data(Ports):
         return one_or_all([e.y for e in self.experiments])
 
     @property
+    def start(self) -> Any:
+        """Time of the first sample, a date (datetime64) where the record is dated; a tuple for several experiments."""
+        return one_or_all([self._instants(e, np.zeros(1))[0] for e in self.experiments])
+
+    @property
     def time(self) -> Any:
-        """Sampling instants (N,), or a tuple of such arrays when there are several experiments."""
-        return one_or_all([e.start + self.dt * np.arange(e.n_samples) for e in self.experiments])
+        """Sampling instants (N,), dates where the record is dated; a tuple of such arrays for several experiments."""
+        return one_or_all([self._instants(e, np.arange(e.n_samples)) for e in self.experiments])
+
+    def _instants(self, e: Experiment, samples: np.ndarray) -> np.ndarray:
+        if not self.dated:
+            return e.start + self.dt * samples
+        start = np.datetime64(round(e.start * 1e6), "us").astype("M8[ns]")  # seconds since 1970 hold microseconds
+        return start + np.round(self.dt * samples * 1e9).astype("m8[ns]")
 
     # -- what the data look like ---------------------------------------------------------------------------------
 
@@ -183,7 +203,12 @@ class Data(Ports):
     def __repr__(self) -> str:
         runs = f"{self.n_experiments} experiments, " if self.n_experiments > 1 else ""
         channels = f"{', '.join(self.inputs)} -> {', '.join(self.outputs)}"
-        return f"Data({self.name!r}: {runs}{self.n_samples} samples every {self.dt:g}, {channels})"
+        return f"Data({self.name!r}: {runs}{self.n_samples} samples every {self.interval}, {channels})"
+
+    @property
+    def interval(self) -> str:
+        """The sampling time with its unit, as text."""
+        return f"{self.dt:g} {self.time_unit}".rstrip()
 
     def __str__(self) -> str:
         units = "" if self.transform.is_identity else "\n  detrended or scaled; reports are in raw units"
@@ -191,8 +216,9 @@ class Data(Ports):
 
     def describe(self) -> Description:
         """Return range, mean, distinct levels and missing samples of each channel, and how it is sampled."""
-        return Description(self.name, self.dt, tuple(e.n_samples for e in self.experiments),
-                           tuple(e.start for e in self.experiments), self.channels)
+        ends = [self._instants(e, np.array([0, e.n_samples - 1])) for e in self.experiments]
+        return Description(self.name, self.interval, tuple(e.n_samples for e in self.experiments),
+                           tuple((a, b) for a, b in ends), self.channels, self.findings)
 
     def plot(self) -> Any:
         """Return a matplotlib figure of every channel over time."""
@@ -208,7 +234,7 @@ class Data(Ports):
             import pandas as pd
         except ImportError:
             raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
-        times = [pd.Index(e.start + self.dt * np.arange(e.n_samples), name="time") for e in self.experiments]
+        times = [pd.Index(self._instants(e, np.arange(e.n_samples)), name="time") for e in self.experiments]
         frames = [pd.DataFrame(record, index, [*self.inputs, *self.outputs])
                   for record, index in zip(self.records, times)]
         return frames[0] if len(frames) == 1 else pd.concat(
@@ -257,7 +283,7 @@ class Data(Ports):
     __iter__ = None  # neither samples nor experiments are meant more than the other
 
     def __getitem__(self, part: slice) -> "Data":
-        """Return data[first:last] by samples (integers, as of a list) or by time (floats), of every experiment.
+        """Return data[first:last] by samples (integers, as of a list) or by time (floats, dates), of every experiment.
 
         Raises:
             DataError: not a slice, a step, samples mixed with times, or a part without samples.
@@ -266,6 +292,9 @@ class Data(Ports):
             raise DataError("data[first:last] takes samples (data[100:200]) or times (data[1.0:2.0]), and no step; "
                             "use decimate for every k-th sample, .u and .y for arrays.")
         ends = [end for end in (part.start, part.stop) if end is not None]
+        if self.dated:
+            ends = [_seconds_of(end) for end in ends]
+            part = slice(*(None if end is None else _seconds_of(end) for end in (part.start, part.stop)))
         whole = all(isinstance(end, int | np.integer) and not isinstance(end, bool) for end in ends)
         if not whole and not all(isinstance(end, float | np.floating) and end == end for end in ends):
             raise DataError(f"data[{part.start!r}:{part.stop!r}]: two integers are samples, two floats are times.")
@@ -365,6 +394,29 @@ def _filled(data: Data, **values: Any) -> Data:
     for name, value in values.items():
         object.__setattr__(data, name, value)
     return data
+
+
+def _starts(start: Any, count: int) -> tuple[np.ndarray, bool]:
+    """Return the start of every experiment in seconds, and whether they are dates."""
+    try:
+        starts = np.atleast_1d(np.asarray(start))
+        dated = starts.dtype.kind in "MUO"
+        if dated:
+            starts = starts.astype("M8[us]").astype(np.int64) / 1e6
+        starts = starts.astype(float)
+    except (ValueError, TypeError):
+        starts, dated = np.array([np.nan]), False
+    if starts.shape not in ((1,), (count,)) or not (np.isfinite(starts) & (np.abs(starts) < 1e15)).all():
+        raise DataError(f"start = {start!r}: one finite time or date, or one for each of the {count} experiments.")
+    return starts, dated
+
+
+def _seconds_of(end: Any) -> Any:
+    """Return a date as seconds since 1970; other ends of a slice as they are."""
+    try:
+        return float(np.asarray(end).astype("M8[us]").astype(np.int64)) / 1e6 if not np.isreal(end) else end
+    except (ValueError, TypeError):
+        return end
 
 
 def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what: str) -> list[int]:

@@ -11,9 +11,12 @@ import numpy as np
 from optid.arrays import check_integer
 from optid.data.channels import Ports, Transform, channel_fields, sampling_time
 from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surveyed
-from optid.data.reading.columns import TIME_TOLERANCE, Wanted, agreed_step, as_stamps, choose, time_column, uniform_step
+from optid.data.reading.clock import Clock, clock_columns, recognise
+from optid.data.reading.columns import Wanted, choose
+from optid.data.reading.format import Format
 from optid.data.reading.parts import Part
 from optid.data.reading.sources import Source, open_source
+from optid.data.reading.uniform import agreed_step, uniform_step
 from optid.data.reduction import available_cores, fetched, reduced
 from optid.errors import DataError
 
@@ -30,7 +33,7 @@ class Stream(Ports):
     `DataError` that names the channel and the sample when its chunk is reached.
 
     Attributes:
-        dt, inputs, outputs, input_units, output_units, name: as of `Data`.
+        dt, inputs, outputs, input_units, output_units, name, time_unit, findings: as of `Data`.
         n_samples: number of samples, None if only a pass gives it (CSV, Dask data frames).
         parts: parts that can be read independently, in order; empty if the record is read from its beginning to its
             end.
@@ -48,6 +51,8 @@ class Stream(Ports):
     _whole: Part | None = field(repr=False, compare=False)
     parts: tuple[Part, ...] = field(default=(), repr=False)
     scheduler: Any = field(default=None, repr=False)
+    time_unit: str = ""
+    findings: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         if self.n_experiments > 1:
@@ -149,10 +154,8 @@ class Stream(Ports):
 
 def open_stream(  # noqa: D417 - the others stand with `read`
     source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float | None = None, chunk: int = CHUNK, *,
-    time: str | int | bool | None = None, columns: Sequence[str] | None = None,
-    input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
-    name: str | None = None, delimiter: str = ",", decimal: str = ".", time_tolerance: float = TIME_TOLERANCE,
-    scheduler: Any = None,
+    time: str | int | bool | None = None, name: str | None = None, scheduler: Any = None,
+    format: Format | None = None, **words: Any,
 ) -> Stream:
     """Open a record that need not fit into memory; nothing but headers is read yet.
 
@@ -165,26 +168,31 @@ def open_stream(  # noqa: D417 - the others stand with `read`
             (N, channels) numbers; it is read, not mapped, because mapped pages count as resident memory.
         dt: sampling time; when not given from the first block or part with two time stamps, 1 without stamps.
         chunk: samples read at a time.
-        time: column of time stamps, checked on every pass; a column t or time when not given; False ignores it.
-        columns: names of the columns of an npy file, a Dask array, or a CSV file without a header.
-        time_tolerance: largest deviation of a time step from the first chunk's median step, relative to it.
+        time: column of time stamps, checked on every pass.
         scheduler: address of a Dask scheduler ("tcp://host:8786"), or an open `distributed.Client`, whose workers read
             the parts of the record: row groups of Parquet files, whole files of another kind, partitions of Dask
             collections. They must see files under the same path, and run the same versions. The result of a fit is the
             same to the last digit on any number of workers, and on this machine when it reads the same parts. A fit
             makes two passes: `persist` a Dask collection that is costly to compute.
+        words: fields of `Format`; those that repair (gaps, resample, quality, from_, to) need the record in memory.
 
     Raises:
         DataError: as `read`, here or when the chunk is reached.
         ClusterError: the cluster cannot be used.
     """
     chunk = check_integer(chunk, "chunk", error=DataError)
+    how = Format.of(format, words)
+    if repairs := [one for one in ("gaps", "resample", "quality", "from_", "to") if getattr(how, one) is not None]:
+        raise DataError(f"a stream is not repaired: {repairs[0]}= needs the record in memory; use read.")
     several = list(source) if isinstance(source, list | tuple) else [source]
     if not several:
         raise DataError("the list of sources is empty; give at least one.")
-    opened = [open_source(one, chunk, columns, delimiter, decimal) for one in several]
-    ins, outs, clock = _chosen(opened, inputs, outputs, time)
-    names = channel_fields(len(ins), len(outs), list(ins), list(outs), input_units, output_units)
+    opened = [open_source(one, chunk, how) for one in several]
+    ins, outs, clocks = _chosen(opened, inputs, outputs, time)
+    how, units = opened[0].how, opened[0].units
+    names = channel_fields(len(ins), len(outs), list(ins), list(outs),
+                           how.input_units or [units.get(column, "") for column in ins.values()],
+                           how.output_units or [units.get(column, "") for column in outs.values()])
     dt = None if dt is None else sampling_time(dt)
     if scheduler is not None:
         from optid.data.clusters import connected
@@ -192,49 +200,58 @@ def open_stream(  # noqa: D417 - the others stand with `read`
         with connected(scheduler):  # refused now, not at the first pass
             pass
     parts: list[Part] = []
-    read = [*ins.values(), *outs.values(), *([clock] if clock else [])]
+    read = [*ins.values(), *outs.values(), *clocks]
     if scheduler is not None or len(opened) > 1 or opened[0].whole is None:
         parts = [replace(part, experiment=i) for i, one in enumerate(opened) for part in one.parts(read)]
         if len({part.experiment for part in parts}) < len(opened):
             raise DataError("a source of the list has no rows.")
-    if clock is not None:
+    clock, step = None, dt
+    if clocks:
         sources = (fetched(part, scheduler) for part in parts) if parts else (one.whole for one in opened)
-        found, where = _step(sources, clock, time_tolerance)
-        dt = agreed_step(found, dt, time_tolerance, where)
-    step = 1.0 if dt is None else dt
+        clock, step = _clock_and_step(sources, clocks, how, units.get(clocks[0], ""), dt)
+    findings = [note for one in opened for note in one.findings]
+    findings += [clock.finding] if clock is not None and clock.finding else []
+    if step is None:
+        findings.insert(0, "no time column: 1 sample = 1; pass dt= (seconds)")
     lengths = [one.n_samples for one in opened]
     label = Path(several[0]).stem if isinstance(several[0], str | Path) else ""
     return Stream(
-        **names, dt=step, name=label if name is None else name,
+        **names, dt=1.0 if step is None else step, name=label if name is None else name,
         n_samples=None if None in lengths else sum(n for n in lengths if n is not None),
-        _channels=Channels(ins, outs, clock, step, time_tolerance), _whole=opened[0].whole, parts=tuple(parts),
-        scheduler=scheduler,
+        _channels=Channels(ins, outs, clock, 1.0 if step is None else step, how), _whole=opened[0].whole,
+        parts=tuple(parts), scheduler=scheduler, time_unit="" if step is None else "s",
+        findings=tuple(dict.fromkeys(findings)),
     )
 
 
 def _chosen(opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
-            ) -> tuple[dict[str, str], dict[str, str], str | None]:
-    """Return {channel: column} of inputs and outputs and the clock, equal for all sources."""
+            ) -> tuple[dict[str, str], dict[str, str], list[str]]:
+    """Return {channel: column} of inputs and outputs and the columns of the clock, equal for all sources."""
     found = []
     for one in opened:
         ins, outs = (choose(one.names, wanted, c, one.label) for wanted, c in ((inputs, "u"), (outputs, "y")))
-        found.append((ins, outs, time_column(one.names, time, [*ins.values(), *outs.values()], one.label)))
+        clocks = clock_columns(one.names, time, [*ins.values(), *outs.values()], one.label, dated=one.dates)
+        found.append((ins, outs, clocks[:1]))
         if found[-1] != found[0]:
             raise DataError(f"{one.label} has channels {found[-1][:2]} and clock {found[-1][2]!r}, {opened[0].label} "
                             f"has {found[0][:2]} and {found[0][2]!r}: name the columns, or pass time=False.")
     return found[0]
 
 
-def _step(sources: Iterable[Any], clock: str, tolerance: float) -> tuple[float | None, str]:
-    """Return the first time step and its source; None if no source has two stamps."""
+def _clock_and_step(sources: Iterable[Any], columns: Sequence[str], how: Format, unit: str, dt: float | None
+                    ) -> tuple[Clock | None, float | None]:
+    """Return the clock and the sampling time that the first source with two stamps shows; dt if given."""
+    clock = None
     for one in sources:
         stamps = np.empty(0)
-        for block in one.blocks([clock], clock):
-            more = as_stamps(block[clock], f"{one.label}, column {clock!r}")
+        for block in one.blocks(columns, set(columns)):
+            clock = clock or recognise(block, columns, how, one.label, unit)
+            more = clock.stamps(block, one.label)
             stamps = np.concatenate([stamps, more]) if stamps.size else more
             if stamps.size > 1:
-                return uniform_step(stamps, tolerance, one.label), one.label
-    return None, ""
+                found = uniform_step(stamps, how.time_tolerance, one.label)
+                return clock, agreed_step(found, dt, how.time_tolerance, one.label)
+    return clock, dt
 
 
 def _of_part(leaf: Callable[[Part, Iterable[Chunk]], Any], channels: Channels, part: Part) -> Any:

@@ -1,8 +1,10 @@
 """The Python that repeats a fit of the workbench: running it gives the same numbers."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
+from optid.data.readers import Format
 from optid.registry import CONSTRAINTS, entry_point
 from optid.workbench.request import BAND, PASSES, Constraint, Request
 
@@ -44,7 +46,7 @@ def script(request: Request, source: str, whole: bool = False) -> str:
 
 def reading(files: list[str], how: Mapping[str, Any]) -> str:
     """Write the call that reads files, without default options."""
-    usual = {"delimiter": ",", "decimal": "."}
+    usual = {field.name: field.default for field in fields(Format)} | {"missing": ()}
     given = {key: value for key, value in how.items() if value is not None and value != usual.get(key)}
     options = "".join(f", {key}={value!r}" for key, value in given.items())
     return f"optid.read({files if len(files) > 1 else files[0]!r}{options})"

@@ -9,7 +9,10 @@ import numpy as np
 
 from optid.arrays import check_finite, check_integers
 from optid.data.channels import Transform
-from optid.data.reading.columns import as_stamps, seconds, uniform_step
+from optid.data.reading.clock import Clock, seconds
+from optid.data.reading.columns import cell_error, to_numbers, without_marks
+from optid.data.reading.format import Format
+from optid.data.reading.uniform import uniform_step
 from optid.errors import DataError
 
 Block = Mapping[str, np.ndarray]
@@ -33,9 +36,9 @@ class Channels:
 
     inputs: Mapping[str, str]  # {channel: column}
     outputs: Mapping[str, str]  # {channel: column}
-    clock: str | None  # column of time stamps, or None
+    clock: Clock | None  # how the time stamps are read, or None
     step: float  # sampling time that the stamps are compared with
-    tolerance: float  # largest deviation of a time step, relative to the sampling time
+    how: Format = Format()  # how the source is written
     # in which the samples are given, raw = value * scale + offset; None for those of the source
     units: Transform | None = None
 
@@ -45,18 +48,22 @@ class Channels:
         `DataError` for an infinite sample, integers beyond the digits of float64, or a non-uniform clock.
         """
         done, last = 0, None
-        columns = [*self.inputs.values(), *self.outputs.values(), *([self.clock] if self.clock else [])]
-        for block in part.blocks(columns, self.clock):
-            u, y = (_gathered(block, pairs, part.label, done) for pairs in (self.inputs, self.outputs))
+        texts = set(self.clock.columns) if self.clock else set()
+        columns = [*self.inputs.values(), *self.outputs.values(), *sorted(texts)]
+        for block in part.blocks(columns, texts):
+            u, y = (_gathered(block, pairs, part.label, done, self.how) for pairs in (self.inputs, self.outputs))
             done += len(u)
             if self.units is not None:
                 u, y = self.units.apply_u(u), self.units.apply_y(y)
             if self.clock is None:
                 yield u, y, None
                 continue
-            stamps = as_stamps(block[self.clock], f"{part.label}, column {self.clock!r}")
+            stamps = self.clock.stamps(block, part.label)
+            if last is not None and self.clock.kind == "times of day":
+                day = np.timedelta64(86400 * 10**9, "ns")
+                stamps = stamps + day * np.round(seconds(last - stamps[:1])[0] / 86400 + 0.49)
             since = stamps if last is None else np.concatenate([last, stamps])
-            uniform_step(since, self.tolerance, part.label, self.step, done - since.size)
+            uniform_step(since, self.how.time_tolerance, part.label, self.step, done - since.size)
             last = stamps[-1:] if stamps.size else last
             yield u, y, stamps
 
@@ -68,7 +75,7 @@ class Channels:
             raise DataError(f"{last.label} and {first.label} have time stamps of different types: {last.stamp.dtype}, "
                             f"{first.stamp.dtype}.")
         step = float(seconds(first.stamp - last.stamp)[0])
-        if not abs(step - self.step) <= self.tolerance * self.step:
+        if not abs(step - self.step) <= self.how.time_tolerance * self.step:
             raise DataError(
                 f"{first.label} begins {step:.6g} after the last sample of {last.label}, the sampling time is "
                 f"{self.step:.6g}. Parts must follow one another: sort them by time (files are taken in the order of "
@@ -76,14 +83,18 @@ class Channels:
                 "time=False and dt=.")
 
 
-def _gathered(block: Block, pairs: Mapping[str, str], label: str, done: int) -> np.ndarray:
+def _gathered(block: Block, pairs: Mapping[str, str], label: str, done: int, how: Format) -> np.ndarray:
     columns = [block[column] for column in pairs.values()]
     samples = np.empty((columns[0].shape[0], len(columns)))
     labels = [f"{label}, column {column!r}" for column in pairs.values()]
     for c, column in enumerate(columns):
+        if column.dtype.kind == "O":
+            column, row = to_numbers(column.tolist(), how)
+            if row is not None:
+                raise cell_error(f"{labels[c]}, row {done + row + 1}", block[list(pairs.values())[c]][row], how)
         if column.dtype.kind in "iu" and column.dtype.itemsize == 8:
             check_integers(column[:, None], labels[c : c + 1], done, limits=False)
-        samples[:, c] = column
+        samples[:, c] = without_marks(column, how)
     check_finite(samples, labels, done)
     return samples
 

@@ -1,24 +1,22 @@
-"""The columns of inputs, outputs and time, and the check of time stamps."""
+"""The columns of inputs, outputs and quality, and the one conversion of cells to numbers."""
 
 import re
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from optid.data.channels import numbered_names
-from optid.data.reading.csvfile import MISSING
+from optid.data.reading.format import Format, call, is_number
 from optid.errors import DataError, nearest
 
 Wanted = str | int | Sequence[str | int] | Mapping[str, str | int] | None
 """Columns by name or position; a mapping {channel name: column} renames."""
 
-TIME_TOLERANCE = 0.01  # a time step may deviate from the median step by this share of it
-
-TIME_NAMES = ("t", "time")
-
 MOST_LISTED = 40  # columns that a message lists
+
+_QUALITY = re.compile(r"[ ._:/-]*\(?(q|qual|qua|quality|status|state|sts|stat|qc|good|valid|flag)\)?", re.IGNORECASE)
+"""What the name of a column of quality adds to that of its channel."""
 
 
 def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dict[str, str]:
@@ -34,7 +32,9 @@ def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dic
         numbered = sorted((c for c in known if re.fullmatch(rf"{letter}[0-9]+", c)), key=lambda c: int(c[1:]))
         found = [letter] if letter in known else numbered
         if not found:
-            raise DataError(f"{label} has no column {letter!r} or '{letter}1': name the {what}. {_listing(known)}")
+            bare = " It has no header: name its columns, columns=[...], or give their positions." * (
+                list(known) == [str(place) for place in range(len(known))])
+            raise DataError(f"{label} has no column {letter!r} or '{letter}1': name the {what}.{bare} {listing(known)}")
         return {c: c for c in found}
     if isinstance(wanted, Mapping):
         pairs = {str(name): column_name(known, column, label) for name, column in wanted.items()}
@@ -46,7 +46,7 @@ def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dic
             raise DataError(f"{label}: a column is listed twice in {what} {several}.")
         pairs = _unnamed(pairs, known, letter)
     if not pairs:
-        raise DataError(f"{label}: {what} is empty; name at least one column. {_listing(known)}")
+        raise DataError(f"{label}: {what} is empty; name at least one column. {listing(known)}")
     return pairs
 
 
@@ -62,99 +62,6 @@ def column_name(known: Sequence[str], wanted: str | int, label: str) -> str:
     return wanted
 
 
-def time_column(known: Sequence[str], time: str | int | bool | None, taken: Sequence[str], label: str,
-                index: str | None = None) -> str | None:
-    """Return the column of time stamps: the one named, else t, time or the index, None if there is none.
-
-    Args:
-        known: columns of the source.
-        time: a column; None looks for t or time, True requires it, False ignores it.
-        taken: columns of inputs and outputs.
-        label: name of the source, for the message.
-        index: name of a time index, which need not be among the columns.
-
-    Raises:
-        DataError: no such column.
-    """
-    if time is False:
-        return None
-    if time is not None and time is not True:
-        return index if time == index else column_name(known, time, label)
-    named = [c for c in known if c.lower() in TIME_NAMES and c not in taken]
-    named += [index] if index is not None and index not in taken else []
-    if time and not named:
-        raise DataError(f"{label} has no column t or time. {_listing(known)}")
-    return named[0] if named else None
-
-
-def as_stamps(values: Any, label: str) -> np.ndarray:
-    """Return time stamps (N,) as float64, as dates or as durations (datetime64, timedelta64, in nanoseconds).
-
-    Numbers, numpy dates and durations, and ISO 8601 text are read, else `DataError`; blank text is a missing stamp.
-    """
-    array = np.asarray(values)
-    if array.dtype.kind in "UO":
-        array = _parsed(array.astype(str), label)
-    if array.dtype.kind in "Mm":
-        return array.astype(f"{array.dtype.kind}8[ns]")
-    if array.dtype.kind not in "iuf":
-        raise DataError(f"{label}: time stamps of type {array.dtype} cannot be read; convert them to seconds.")
-    return array.astype(np.float64)
-
-
-def seconds(stamps: np.ndarray) -> np.ndarray:
-    """Return stamps (N,) as float64: numbers as they are, durations in seconds, dates in seconds since 1970."""
-    return stamps.astype(np.int64) / 1e9 if stamps.dtype.kind in "Mm" else stamps
-
-
-def uniform_step(stamps: np.ndarray, tolerance: float, label: str, step: float | None = None, first: int = 0
-                 ) -> float | None:
-    """Check that time stamps are uniform and return their mean step, None for a single stamp.
-
-    Args:
-        stamps: (N,), from `as_stamps`.
-        tolerance: largest deviation of a step from the median step, relative to it.
-        label: name of the source, for the message.
-        step: what the steps are compared with; their median when not given.
-        first: index of the first stamp in the whole record.
-
-    Raises:
-        DataError: a stamp is missing, time does not increase, or a step deviates; the message has the sample, the
-            step found there and the median step.
-    """
-    here = np.isfinite(stamps)
-    if not here.all():
-        raise DataError(f"{label}: the time stamp of sample {first + int(np.argmin(here))} is missing.")
-    if stamps.size < 2:
-        return None
-    # Differences of dates are exact in nanoseconds; seconds since 1970 would lose the digits of fast sampling.
-    steps = seconds(np.diff(stamps))
-    median = float(np.median(steps)) if step is None else step
-    if median <= 0:
-        raise DataError(f"{label}: time does not increase (median step {median:g}); sort the rows by time.")
-    bad = np.abs(steps - median) > tolerance * median
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise DataError(f"{label}: time stamps are not uniform. Sample {first + k + 1} (t = {stamps[k + 1]}) comes "
-                        f"{steps[k]:.6g} after the one before, the median step is {median:.6g} ({int(bad.sum())} "
-                        f"step(s) deviate by more than {tolerance:.2%}). Insert rows with blank cells where samples "
-                        "were lost, interpolate onto a uniform grid, raise time_tolerance, or pass time=False and dt= "
-                        "if the stamps are wrong.")
-    return float(steps.mean())
-
-
-def agreed_step(found: float | None, dt: float | None, tolerance: float, label: str) -> float | None:
-    """Return dt if given, else the step found, rounded to 12 digits; `DataError` if they differ."""
-    if found is None:
-        return dt
-    if dt is None:
-        return float(f"{found:.12g}")
-    if abs(found - dt) > tolerance * dt:
-        raise DataError(f"{label}: dt = {dt:g}, but the time stamps step by {found:.6g}. Leave dt out to use the "
-                        "stamps (mind their unit), pass time=False to ignore them, or resample for the model.")
-    return dt
-
-
 def position_names(columns: Sequence[str] | None, width: int, label: str) -> list[str]:
     """Return the names of the columns of a plain array: those given (or a `DataError`), else their positions."""
     if columns is not None and len(columns) != width:
@@ -162,28 +69,131 @@ def position_names(columns: Sequence[str] | None, width: int, label: str) -> lis
     return [str(c) for c in (range(width) if columns is None else columns)]
 
 
-def _parsed(text: np.ndarray, label: str) -> np.ndarray:
-    missing = np.isin(np.char.lower(np.char.strip(text)), [*MISSING, "nat"])
-    try:
-        return np.where(missing, "nan", text).astype(np.float64)
-    except ValueError:
-        pass
-    try:
-        with warnings.catch_warnings():  # numpy warns that it converts a time zone to UTC, which is what is wanted
-            warnings.simplefilter("ignore", UserWarning)
-            return np.where(missing, "NaT", text).astype("datetime64[ns]")
-    except ValueError:
-        raise DataError(f"{label}: the stamps (first: {str(text[0])!r}) are neither numbers nor ISO dates such as "
-                        "2024-05-01T12:00:00. Convert them to seconds, or pass time=False and dt=.") from None
+def listing(known: Sequence[str]) -> str:
+    """Return a sentence that lists the columns."""
+    more = f", and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
+    return "Columns: " + ", ".join(known[:MOST_LISTED]) + more + "."
+
+
+# -- columns of quality
+
+
+def quality_columns(known: Sequence[str], signals: Iterable[str]) -> dict[str, str]:
+    """Return {column of quality: column of samples} by the names of the columns."""
+    found = {}
+    for signal in signals:
+        for name in known:
+            if name != signal and name.startswith(signal) and _QUALITY.fullmatch(name[len(signal) :]):
+                found[name] = signal
+    return found
+
+
+def guarded(quality: Mapping[str, str], known: Sequence[str], signals: Sequence[str], label: str) -> dict[str, str]:
+    """Return {column of quality: column of samples} for the columns of quality that the user names (`DataError`)."""
+    found, named = {}, quality_columns(known, signals)
+    for column in quality:
+        name = column_name(known, column, label)
+        likely = [signal for signal in signals if name.startswith(signal)] or list(signals) * (len(signals) == 1)
+        if name not in named and not likely:
+            raise DataError(f"{label}: the name of the column of quality {name!r} does not begin with that of an input "
+                            f"or output ({', '.join(signals)}): rename it, such as '{signals[0]}.Q'.")
+        found[name] = named.get(name) or max(likely, key=len)
+    return found
+
+
+def unused_quality(names: Sequence[str], loaded: Mapping[str, Any]) -> str:
+    """Return the finding about columns of quality that the user did not name."""
+    words, bad = [], 0
+    for name in names:
+        cells = np.ravel(loaded[name]).astype(str)
+        values, counts = np.unique(cells, return_counts=True)
+        usual = str(values[np.argmax(counts)]).removesuffix(".0")
+        words.append(f"{name}:{usual}")
+        bad += cells.size - int(counts.max())
+    return (f"columns of quality are not used: {', '.join(names)} ({bad} cells differ from the usual one). Pass "
+            f"quality={' '.join(words)!r} to count such samples as missing")
+
+
+def is_good(values: Any, good: str, where: str) -> np.ndarray:
+    """Return which samples (N,) a column of quality marks as good: those equal to a value, as a number or as text."""
+    array = np.asarray(values)
+    if array.dtype.kind in "iufb":
+        if not is_number(good):
+            raise DataError(f"{where} holds numbers, and {good!r} is none.")
+        return array == float(good)
+    text = np.char.strip(array.astype(str))
+    if is_number(good):
+        return np.array([is_number(cell) and float(cell) == float(good) for cell in text.tolist()], dtype=bool)
+    return np.char.lower(text) == good.lower()
+
+
+# -- cells
+
+
+def to_numbers(cells: Sequence[str], how: Format) -> tuple[np.ndarray, int | None]:
+    """Return the numbers of some cells (N,), NaN where missing, and the row of the first cell that is no number."""
+    if how.is_plain and "_" not in "".join(cells):  # float() reads 1_000 as a number, a table does not
+        try:
+            return np.array(list(map(float, cells)), dtype=np.float64), None
+        except ValueError:
+            pass
+    values = np.empty(len(cells))
+    for row, cell in enumerate(cells):
+        try:
+            values[row] = how.number(cell)
+        except ValueError:
+            return values, row
+    return values, None
+
+
+def without_marks(samples: np.ndarray, how: Format) -> np.ndarray:
+    """Return samples with NaN in place of the numbers that mark missing ones."""
+    marks = [mark for mark in how.numbers if np.isfinite(mark)]
+    if not marks:
+        return samples
+    lost = np.isin(samples, marks)
+    return np.where(lost, np.nan, samples) if lost.any() else samples
+
+
+def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str]] = (), advice: str = "") -> DataError:
+    """Return the error about a cell that is no number, with what to type.
+
+    Args:
+        where: source, column and row.
+        cell: its text.
+        how: the format by which it was read.
+        around: columns of cells of the same rows, which may hold further words of missing samples.
+        advice: what the layout of the file proposes.
+    """
+    text, words = cell.strip(), dict[str, Any]()
+    if not any(sign.isdigit() for sign in text):
+        marks = dict.fromkeys(one.strip() for column in around for one in column
+                              if not any(sign.isdigit() for sign in one) and not how.is_missing(one))
+        marks = [text] if not marks or len(marks) > 8 else list(marks)
+        words["missing"] = ",".join([*how.missing, *marks])
+        hint = "Leave the cell blank where a sample is missing, or name the words of missing samples"
+    elif how.decimal == "," and "." in text:
+        hint = "With a decimal comma a point is no decimal mark; it may separate thousands"
+        words["thousands"] = "."
+    elif how.thousands is None and re.fullmatch(r"[+-]?\d{1,3}([,.' \u00a0\u2019\u202f]\d{3})+([.,]\d*)?", text):
+        words["thousands"] = re.sub(r"[\d+-]", "", text)[0]
+        hint = "It seems to have a separator of thousands"
+        if words["thousands"] == how.decimal:
+            words = {"decimal": ",", "thousands": "."}
+    elif how.decimal == "." and re.fullmatch(r"[+-]?\d*,\d+([eE][+-]?\d+)?", text):
+        hint, words["decimal"] = "It seems to be a number with a decimal comma", ","
+    else:
+        hint = "Leave the cell blank where a sample is missing"
+    given = {word: value for word, value in words.items() if value != getattr(how, word) and f"{word}=" not in advice}
+    if "missing" in words and "missing=" in advice:
+        given.pop("missing", None)
+    typed = ", ".join(part for part in (call(given), advice) if part)
+    return DataError(f"{where} holds {cell!r}, not a number. {hint}{f': pass {typed}.' if typed else '.'}")
 
 
 def _unnamed(pairs: dict[str, str], known: Sequence[str], letter: str) -> dict[str, str]:
     """Name channels after their letter if the columns have only positions."""
-    if any(not column.isdigit() or known[int(column)] != column for column in pairs.values()):
+    positions = {str(place) for place, name in enumerate(known) if name == str(place)}
+    if not positions.issuperset(pairs.values()):
         return pairs
     return dict(zip(numbered_names(letter, len(pairs)), pairs.values()))
-
-
-def _listing(known: Sequence[str]) -> str:
-    more = f", and {len(known) - MOST_LISTED} more" if len(known) > MOST_LISTED else ""
-    return "Columns: " + ", ".join(known[:MOST_LISTED]) + more + "."

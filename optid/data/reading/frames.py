@@ -1,12 +1,13 @@
 """Columns of pandas, polars and arrow tables, through narwhals; a time index counts as a column."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence, Set
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import check_integers
-from optid.data.reading.columns import TIME_NAMES
+from optid.data.reading.clock import is_time_name
+from optid.data.reading.dates import is_date
 from optid.errors import DataError
 
 
@@ -46,21 +47,29 @@ def index_name(frame: Any, names: Sequence[str]) -> str | None:
     index = getattr(frame, "index", None)
     kind = getattr(getattr(index, "dtype", None), "kind", "")
     name = getattr(index, "name", None)
-    if kind not in ("M", "m") and not (str(name).lower() in TIME_NAMES and kind in ("i", "u", "f")):
+    if kind not in ("M", "m") and not (name is not None and is_time_name(str(name)) and kind in ("i", "u", "f", "O")):
         return None
     called = "index" if name is None else str(name)
     return called if called not in names else f"{called} (index)"
 
 
-def only_clock(schema: Mapping[str, Any]) -> str | None:
-    """Return the only column of dates or durations, None where there is none or more than one."""
-    clocks = [str(name) for name, kind in schema.items() if str(kind).partition("(")[0] in ("Datetime", "Duration")]
-    return clocks[0] if len(clocks) == 1 else None
+def dated_columns(frame: Any) -> tuple[str, ...]:
+    """Return the columns of a table that hold dates, durations, or texts that begin with a date."""
+    import narwhals as nw
+
+    table = nw.from_native(frame, eager_only=True)
+    found = []
+    for name, kind in table.schema.items():
+        if isinstance(kind, nw.Datetime | nw.Duration | nw.Date):
+            found.append(str(name))
+        elif isinstance(kind, nw.String | nw.Object):
+            first = next((cell for cell in table[name].head(50).to_list() if cell is not None and cell == cell), "")
+            found += [str(name)] * (not isinstance(first, str | int | float | bool) or is_date(str(first)))
+    return tuple(found)
 
 
-def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None, group: str | None
-               ) -> dict[str, np.ndarray]:
-    """Return columns as (N,) arrays of a real type; clock and group may be text or dates.
+def load_frame(label: str, frame: Any, wanted: Sequence[str], texts: Set[str]) -> dict[str, np.ndarray]:
+    """Return columns as (N,) arrays: numbers of a real type, texts as objects, and dates; only `texts` may be dates.
 
     Raises:
         DataError: a column that does not hold numbers, or integers beyond the digits of float64.
@@ -71,7 +80,12 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None,
     loaded = {}
     for name in wanted:
         column = table[name]
-        if name in (clock, group):
+        if isinstance(column.dtype, nw.Date):
+            column = column.cast(nw.Datetime("us"))
+        if isinstance(column.dtype, nw.String) or (isinstance(column.dtype, nw.Object) and _is_text(column)):
+            loaded[name] = np.array(["" if cell is None or cell != cell else str(cell) for cell in column.to_list()],
+                                    dtype=object)
+        elif name in texts:
             dates = isinstance(column.dtype, nw.Datetime) and column.null_count() == 0
             # Through integers, because a time zone would make objects of the dates.
             loaded[name] = column.dt.timestamp("ns").to_numpy().astype("M8[ns]") if dates else column.to_numpy()
@@ -87,14 +101,21 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], clock: str | None,
     return loaded
 
 
+def _is_text(column: Any) -> bool:
+    """Whether a column of objects holds texts, and perhaps numbers and missing samples."""
+    cells = column.to_list()
+    return any(isinstance(cell, str) for cell in cells) and all(
+        cell is None or (isinstance(cell, str | int | float) and not isinstance(cell, bool)) for cell in cells)
+
+
 def partition_blocks(label: str, names: Sequence[str], chunk: int, content: Any, wanted: Sequence[str],
-                     clock: str | None) -> Iterator[dict[str, np.ndarray]]:
+                     texts: Set[str]) -> Iterator[dict[str, np.ndarray]]:
     """Yield columns of a computed partition of a Dask collection, `chunk` rows at a time; errors as of `load_frame`."""
     if isinstance(content, np.ndarray):
         if content.dtype.kind not in "iuf":
             raise DataError(f"{label}: the samples are of type {content.dtype}; convert them to numbers first.")
         whole = {name: content[:, names.index(name)] for name in wanted}
     else:
-        whole = load_frame(label, content.set_axis(list(names), axis=1), wanted, clock, None)
+        whole = load_frame(label, content.set_axis(list(names), axis=1), wanted, texts)
     for start in range(0, len(whole[wanted[0]]), chunk):
         yield {name: column[start : start + chunk] for name, column in whole.items()}

@@ -1,6 +1,6 @@
-"""Parquet files: whole by polars; in blocks and parts by pyarrow, whose memory can be bounded."""
+"""Parquet files by pyarrow, which verifies checksums and bounds its memory; whole ones also by polars."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -14,40 +14,53 @@ from optid.errors import DataError
 SAMPLES = 1 << 20  # row groups are taken together up to this many samples: smaller tasks do not pay
 
 
-def parquet_schema(path: Path) -> dict[str, Any]:
-    """Return the names and types of the columns; `DataError` where the file is damaged."""
+def parquet_head(path: Path) -> Any:
+    """Return the first rows, and so the columns and their types; `DataError` where the file is damaged."""
     import polars as pl
 
     with _undamaged(path, pl.exceptions.PolarsError, pl.exceptions.PanicException):
-        return dict(pl.read_parquet_schema(path))
+        return pl.read_parquet(path, n_rows=50, use_statistics=False)
 
 
-def load_parquet(path: Path, wanted: Sequence[str], clock: str | None, group: str | None) -> dict[str, Any]:
-    """Return some columns whole; errors as of `load_frame`, and `DataError` where they are damaged."""
+def load_parquet(path: Path, wanted: Sequence[str], texts: Set[str]) -> dict[str, Any]:
+    """Return some columns whole; errors as of `load_frame`, and `DataError` where they are damaged.
+
+    Checksums of pages are verified where pyarrow is installed: polars ignores them.
+    """
     import polars as pl
 
+    columns = list(dict.fromkeys(wanted))
     with _undamaged(path, pl.exceptions.PolarsError, pl.exceptions.PanicException):
-        frame = pl.read_parquet(path, columns=list(dict.fromkeys(wanted)), use_statistics=False)
-    return load_frame(path.name, frame, wanted, clock, group)
+        try:
+            import pyarrow.parquet as parquet
+        except ImportError:
+            frame: Any = pl.read_parquet(path, columns=columns, use_statistics=False)
+        else:
+            frame = parquet.read_table(path, columns=columns, page_checksum_verification=True)
+    return load_frame(path.name, frame, wanted, texts)
 
 
-def parquet_footer(path: Path) -> tuple[list[str], int]:
-    """Return columns and number of rows; `DataError` if the file is damaged or pyarrow is missing."""
+def parquet_footer(path: Path) -> tuple[list[str], int, tuple[str, ...]]:
+    """Return columns, number of rows and columns of dates; `DataError` if the file is damaged or pyarrow is missing."""
     parquet = _pyarrow_parquet(path)
     with _undamaged(path):
-        return list(parquet.read_schema(path).names), parquet.read_metadata(path).num_rows
+        schema = parquet.read_schema(path)
+        dates = tuple(field.name for field in schema if str(field.type).startswith(("timestamp", "date", "duration")))
+        return list(schema.names), parquet.read_metadata(path).num_rows, dates
 
 
-def parquet_blocks(path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], clock: str | None
+def parquet_blocks(path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], texts: Set[str]
                    ) -> Iterator[Block]:
     """Yield columns of some row groups, or of all for None, `chunk` rows at a time; errors as of `load_parquet`."""
     parquet = _pyarrow_parquet(path)
     import pyarrow as pa
 
     # Both settings bound the memory: by default pyarrow fetches the whole file ahead, or a whole row group.
-    with _undamaged(path), parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False) as file:
+    with _undamaged(path), parquet.ParquetFile(
+        path, buffer_size=1 << 20, pre_buffer=False, page_checksum_verification=True
+    ) as file:
         for batch in file.iter_batches(chunk, row_groups=groups, columns=list(dict.fromkeys(wanted))):
-            yield load_frame(path.name, pa.Table.from_batches([batch]), wanted, clock, None)
+            yield load_frame(path.name, pa.Table.from_batches([batch]), wanted, texts)
 
 
 def parquet_parts(path: Path, chunk: int) -> list[Part]:

@@ -6,7 +6,7 @@ or computed there.
 
 import hashlib
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,7 @@ class Part:
     """Successive samples of one experiment, read on every pass."""
 
     label: str  # for messages
-    # yields blocks of (columns, the one of them that is the clock); of a Dask partition of (its content, columns,
-    # clock)
+    # yields blocks of (columns, those of them that may be text); of a Dask partition of (its content, columns, texts)
     read: Callable[..., Iterator[Block]] = field(repr=False)
     n_samples: int | None = None  # number of samples, or None
     # path, size and digest of the end of each file when the record was opened
@@ -33,11 +32,11 @@ class Part:
     # task of Dask, or its result: a frame, or an array (n, channels); None for files
     content: Any = field(default=None, repr=False)
 
-    def blocks(self, wanted: Sequence[str], clock: str | None) -> Iterator[Block]:
+    def blocks(self, wanted: Sequence[str], texts: Set[str]) -> Iterator[Block]:
         """Start a pass over some columns; `DataError` if a file is missing on this machine or has other content."""
         for path, size, digest in self.files:
             _check_same(path, (size, digest))
-        return self.read(wanted, clock) if self.content is None else self.read(self.content, wanted, clock)
+        return self.read(wanted, texts) if self.content is None else self.read(self.content, wanted, texts)
 
 
 def file_parts(parts: Sequence[Part], *paths: Path) -> list[Part]:

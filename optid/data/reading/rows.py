@@ -2,13 +2,16 @@
 
 import csv
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.data.reading.columns import TIME_TOLERANCE, as_stamps, choose, seconds, time_column
-from optid.data.reading.csvfile import check_marks, is_missing, is_number
+from optid.data.reading import dates
+from optid.data.reading.clock import Clock, clock_columns, recognise, seconds
+from optid.data.reading.columns import choose, to_numbers
+from optid.data.reading.format import Format, is_number
 from optid.errors import DataError
 
 LARGEST = 1e100  # larger numbers are not samples: they would overflow in later computations
@@ -49,35 +52,34 @@ class RowReader:
     """
 
     def __init__(self, inputs: Sequence[str], outputs: Sequence[str], *, dt: float, time: str | bool | None = None,
-                 columns: Sequence[str] | None = None, delimiter: str = ",", decimal: str = ".", fill: int = 0,
-                 label: str = "stream", tolerance: float = TIME_TOLERANCE) -> None:
+                 how: Format | None = None, fill: int = 0, label: str = "stream") -> None:
         """Prepare for the columns of inputs and outputs with time stamps at the sampling time dt.
 
         Args:
             inputs: columns of the inputs.
             outputs: columns of the outputs.
             dt: sampling time of the time stamps.
-            time: column of time stamps; by default t or time; False ignores it.
-            columns: names of the columns of a table without a header.
-            delimiter: between the cells.
-            decimal: decimal mark.
+            time: column of time stamps; by default one that is named as a clock; False ignores it.
+            how: how the table is written.
             fill: largest number of missing samples inserted into a gap of whole sampling times; 0 refuses gaps.
             label: name of the table in messages.
-            tolerance: largest deviation of a time step from dt, relative to it.
 
         Raises:
-            DataError: an invalid delimiter or decimal mark.
+            DataError: a word of the format that needs the whole record.
         """
-        check_marks(delimiter, decimal)
-        self._wanted, self._dt, self._fill, self._label, self._tolerance = (
-            (list(inputs), list(outputs)), dt, fill, label, tolerance
-        )
-        self._time, self._delimiter, self._decimal = time, delimiter, decimal
+        how = Format() if how is None else how
+        for word, instead in (("gaps", "fill_gaps"), ("resample", ""), ("quality", ""), ("from_", ""), ("to", "")):
+            if getattr(how, word) is not None:
+                raise DataError(f"{word}= needs the whole record, not a stream of rows"
+                                + (f"; use --{instead.replace('_', '-')}." if instead else "."))
+        self._wanted, self._dt, self._fill, self._label, self._how = (list(inputs), list(outputs)), dt, fill, label, how
+        self._time, self._delimiter = time, how.delimiter or ","
         self._names: list[str] | None = None
-        self._headed = columns is None
+        self._headed = how.columns is None
+        self._reads: Clock | None = None
         self.begin_file()
-        if columns is not None:
-            self._known([str(name) for name in columns])
+        if how.columns is not None:
+            self._known([str(name) for name in how.columns])
 
     def _known(self, names: list[str]) -> None:
         for name in names:
@@ -85,9 +87,9 @@ class RowReader:
                 raise DataError(f"{self._label} has two columns named {name!r}: rename one.")
         ins, outs = (choose(names, wanted, letter, self._label) for wanted, letter in zip(self._wanted, "uy"))
         signals = [*ins.values(), *outs.values()]
-        clock = time_column(names, self._time, signals, self._label)
+        clocks = clock_columns(names, self._time, signals, self._label)
         self._names, self._places = names, [names.index(name) for name in signals]
-        self._clock = None if clock is None else names.index(clock)
+        self._clock = [names.index(name) for name in clocks[:2]]
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -103,13 +105,15 @@ class RowReader:
         if memory["names"] is not None:
             self._known(list(memory["names"]))
         if memory["last"] is not None:
-            self._last = as_stamps([memory["last"]], self._label)
+            text = str(memory["last"])
+            self._last = np.array([float(text)]) if is_number(text) else np.array([text], dtype="M8[ns]")
 
     def begin_file(self) -> None:
         """Expect the header of another file; its time stamps may start again."""
         if self._headed:
             self._names = None
         self.line, self._since = 0, 0  # lines read, and rows since the last stamp
+        self._texts = 0  # rows of units that may follow
         self._blank: list[int] = []
         self._last: np.ndarray | None = None
 
@@ -117,20 +121,24 @@ class RowReader:
         """Read complete lines, without their ends; `DataError` for a header without the required columns."""
         lines = list(lines)
         if self._names is None:
-            while lines and not lines[0].strip():
+            while lines and (not lines[0].strip() or self.line < self._how.skip_rows or self._is_comment(lines[0])):
                 del lines[0]
                 self.line += 1
             if not lines:
                 return Rows(np.empty((0, sum(map(len, self._wanted)))), len(self._wanted[0]), np.empty(0, int), [], [])
-            first = self._cells(lines[0].removeprefix("\ufeff"))
+            head = lines[0].removeprefix("\ufeff")
+            if self._how.delimiter is None:
+                self._delimiter = max(",\t;", key=head.count)
+            first = self._cells(head)
             if all(map(is_number, first)):
                 raise DataError(f"{self._label} has no header row (it starts with {lines[0][:60]!r}): name the "
                                 "columns, --columns.")
             self._known([cell.strip() for cell in first])
             del lines[0]
             self.line += 1
+            self._texts = 3 if self._how.units_row is None else self._how.units_row
         rows = self._rows(lines)
-        if self._clock is not None and len(rows.lines):
+        if self._clock and len(rows.lines):
             rows = self._timed(rows)
         if rows.error:
             self.line = rows.stop - 1
@@ -141,16 +149,51 @@ class RowReader:
             return next(csv.reader([line], delimiter=self._delimiter), [])
         return line.split(self._delimiter)
 
+    def _is_comment(self, line: str) -> bool:
+        return self._how.comment is not None and line.lstrip().startswith(self._how.comment)
+
+    def _is_units(self, line: str) -> bool:
+        """Whether a line after the header holds units: texts, and nothing missing or numeric."""
+        cells = [cell.strip() for cell in self._cells(line) if cell.strip()]
+        units = bool(cells) and self._texts > 0 and not any(
+            any(sign.isdigit() for sign in cell[:1]) or is_number(cell) or self._how.is_missing(cell) for cell in cells)
+        self._texts = self._texts - 1 if units else 0
+        return units
+
+    def _stamp(self, cells: Sequence[str]) -> str:
+        """Return the text of the stamp of a row: one cell, or a date and a time of day."""
+        if not self._clock:
+            return ""
+        text = cells[self._clock[0]].strip()
+        if len(self._clock) > 1 and " " not in text and dates.is_date(text):
+            hour = cells[self._clock[1]].strip()
+            return f"{text} {hour}" if dates.is_time_of_day(hour) else text
+        return text
+
+    def _stamps(self, texts: Sequence[str]) -> np.ndarray:
+        """Return stamps of texts (N,), by the clock that the first ones show."""
+        block = {"time": np.array(texts, dtype=object)}
+        if self._reads is None:
+            assert self._names is not None
+            found = recognise({self._names[self._clock[0]]: block["time"]}, [self._names[self._clock[0]]], self._how,
+                              self._label)
+            self._reads = replace(found, columns=("time",))
+        return self._reads.stamps(block, self._label)
+
     def _rows(self, lines: list[str]) -> Rows:
         assert self._names is not None
+        while lines and self._texts and self._is_units(lines[0]):
+            del lines[0]
+            self.line += 1
         first, m = self.line + 1, len(self._wanted[0])
         self.line += len(lines)
         cells = [line.split(self._delimiter) for line in lines]
-        if not self._blank and all(lines) and self._decimal == "." and {len(self._names)} >= set(map(len, cells)):
+        if (not self._blank and all(lines) and self._how.is_plain and not self._how.missing and not self._how.comment
+                and {len(self._names)} >= set(map(len, cells))):
             try:  # all at once, where nothing is wrong
                 values = np.array([[float(row[place]) for place in self._places] for row in cells])
                 if not any('"' in line or "_" in line for line in lines) and not np.any(np.abs(values) > LARGEST):
-                    stamps = [] if self._clock is None else [row[self._clock].strip() for row in cells]
+                    stamps = [self._stamp(row) for row in cells] if self._clock else []
                     numbers = np.arange(first, first + len(lines))
                     return Rows(values.reshape(len(lines), len(self._places)), m, numbers, stamps, [])
             except ValueError:
@@ -159,6 +202,8 @@ class RowReader:
         for number, line in enumerate(lines, first):
             if not line.strip():
                 self._blank.append(number)
+                continue
+            if self._is_comment(line):
                 continue
             for blank in self._blank:  # blank lines at the end are none
                 rows.append([np.nan] * len(self._places))
@@ -172,7 +217,7 @@ class RowReader:
             stamps.append(stamp)
             bad += [(number, f"line {number}{what}") for what in wrong]
         values = np.array(rows, dtype=float).reshape(len(rows), len(self._places))
-        return Rows(values, m, np.array(numbers, dtype=int), [] if self._clock is None else stamps, bad)
+        return Rows(values, m, np.array(numbers, dtype=int), stamps if self._clock else [], bad)
 
     def _row(self, cells: list[str]) -> tuple[list[float], str, list[str]]:
         """Return the samples of a row, its stamp, and messages about bad cells."""
@@ -183,12 +228,14 @@ class RowReader:
         row, wrong = [], []
         for place in self._places:
             cell = cells[place].strip()
-            text = cell.replace(self._decimal, ".")
-            value = float(text) if is_number(text) and "_" not in text and abs(float(text)) <= LARGEST else np.nan
-            if value != value and not is_missing(cell):
+            (value,), row_of_bad = to_numbers([cell], self._how)
+            value = float(value) if row_of_bad is None and abs(value) <= LARGEST else np.nan
+            if value in self._how.numbers:
+                value = np.nan
+            elif value != value and not self._how.is_missing(cell):
                 wrong.append(f", column {self._names[place]!r} holds {cell!r}, not a number; it counts as missing.")
             row.append(value)
-        return row, "" if self._clock is None else cells[self._clock].strip(), wrong
+        return row, self._stamp(cells), wrong
 
     def _timed(self, rows: Rows) -> Rows:
         """Check the time stamps; cut before the first bad one, or fill the gap there."""
@@ -197,7 +244,7 @@ class RowReader:
             self._since += len(rows.lines)
             return rows
         try:
-            read = as_stamps([rows.stamps[k] for k in marks], f"{self._label}, time")
+            read = self._stamps([rows.stamps[k] for k in marks])
         except DataError:
             read = np.full(1, np.nan)
         if not np.isfinite(read).all() or (self._last is not None and read.dtype != self._last.dtype):
@@ -205,13 +252,13 @@ class RowReader:
         steps = seconds(np.diff(np.concatenate([read[:1] if self._last is None else self._last, read])))
         # samples since the stamp before; rows without a stamp count
         since = np.diff(np.concatenate([[marks[0] if self._last is None else -1 - self._since], marks]))
-        wrong = np.abs(steps - since * self._dt) > self._tolerance * self._dt
+        wrong = np.abs(steps - since * self._dt) > self._how.time_tolerance * self._dt
         if not wrong.any():
             self._last, self._since = read[-1:], len(rows.lines) - 1 - int(marks[-1])
             return rows
         at = int(np.argmax(wrong))
         row, extra = int(marks[at]), steps[at] / self._dt - since[at]
-        lost = int(round(extra)) if abs(extra - round(extra)) <= self._tolerance else 0
+        lost = int(round(extra)) if abs(extra - round(extra)) <= self._how.time_tolerance else 0
         if self._fill and lost >= 1:
             self._last, self._since = read[at : at + 1], 0
             count, rest = min(lost, self._fill), self._timed(rows.cut(row + 1))
@@ -233,7 +280,7 @@ class RowReader:
         kept, bad = list(rows.stamps), list(rows.bad)
         for row, stamp in enumerate(rows.stamps):
             try:
-                found = as_stamps([stamp or "nan"], self._label)
+                found = self._stamps([stamp]) if stamp else np.array([np.nan])
             except DataError:
                 found = np.array([np.nan])
             if np.isfinite(found).all() and found.dtype == (kind or found.dtype):

@@ -1,9 +1,9 @@
 """Sources of records: named columns, loaded whole, or read in blocks and parts."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,16 @@ import numpy as np
 
 from optid.data.reading.columns import position_names
 from optid.data.reading.csvfile import open_csv
-from optid.data.reading.frames import frame_names, index_name, load_frame, only_clock, partition_blocks
+from optid.data.reading.format import Format
+from optid.data.reading.frames import dated_columns, frame_names, index_name, load_frame, partition_blocks
 from optid.data.reading.npyfile import npz_arrays, open_npy, side_by_side
 from optid.data.reading.parts import Part, file_parts
 from optid.errors import DataError
 
-TEXT = (".csv", ".txt", ".tsv")
+TEXT = (".csv", ".txt", ".tsv", ".lvm", ".dat", ".asc")
+PLANT = (".xlsx", ".tdms", ".mf4")
+STEPS = ("ts", "dt", "sampletime", "samplingtime", "timestep", "samplinginterval", "deltat")
+RATES = ("fs", "samplerate", "samplingrate", "samplingfrequency", "samplefrequency")
 
 
 @dataclass(frozen=True)
@@ -26,11 +30,16 @@ class Table:
 
     label: str  # name of the source, for messages
     names: list[str]  # names of its columns or variables
-    # function of columns, the clock and the column of experiments among them, returning {name: array}; numeric columns
-    # are (N,) or (N, channels) of a real type, clock and experiments may be text or dates
-    load: Callable[[Sequence[str], str | None, str | None], dict[str, Any]]
-    # name of a time index besides the columns, or of the only column of dates; None without one
-    index: str | None = None
+    # function of columns, and of those among them that may be texts or dates, returning {name: array}: numeric columns
+    # are (N,) or (N, channels) of a real type, texts (N,) objects
+    load: Callable[[Sequence[str], Set[str]], dict[str, Any]]
+    how: Format = Format()  # how it is written: what the user said, completed by what the source says
+    index: str | None = None  # name of a time index besides the columns
+    dates: tuple[str, ...] = ()  # columns of dates
+    units: Mapping[str, str] = field(default_factory=dict)  # units by column, where the source has them
+    step: float | None = None  # sampling time that stands beside the samples
+    advice: str = ""  # what a refusal proposes to type
+    findings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,10 @@ class Source:
     # function of the columns to read, returning the independent parts in the order of time
     parts: Callable[[Sequence[str]], Iterable[Part]]
     label: str  # name of the source, for messages
+    how: Format = Format()  # how it is written
+    dates: tuple[str, ...] = ()  # columns of dates
+    units: Mapping[str, str] = field(default_factory=dict)  # units by column, where the source has them
+    findings: tuple[str, ...] = ()
 
 
 def existing(path: Path) -> Path:
@@ -61,69 +74,102 @@ def existing(path: Path) -> Path:
 # -- whole
 
 
-def open_table(source: Any, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
-    """Open a file, a frame, a dictionary of arrays or an array; arguments as of `optid.data.readers.read`.
+def open_tables(source: Any, how: Format) -> list[Table]:
+    """Open a file, a frame, a dictionary of arrays or an array: one table for each experiment that it holds.
 
     `DataError`: no such file, unknown format, an unreadable file, or a missing extra with its pip line.
     """
     if isinstance(source, str | Path):
         path = Path(source)
         kind = path.suffix.lower()
-        known = (*TEXT, ".parquet", ".mat", ".npz", ".npy")
+        known = (*TEXT, ".parquet", ".mat", ".npz", ".npy", *PLANT)
         if kind not in known:
             raise DataError(f"{path.name}: unknown kind of file {kind!r}. Known: {', '.join(known)}.")
         try:
-            return _file_table(existing(path), kind, columns, delimiter, decimal)
+            return _file_tables(existing(path), kind, how)
         except OSError as error:
             raise DataError(f"{path.name} cannot be read: {error.strerror}.") from error
     if hasattr(source, "data_vars") and hasattr(source, "coords"):  # an xarray data set
-        return _of_arrays("the data set", {name: variable.values for name, variable in source.variables.items()})
+        return [_of_arrays("the data set", {name: variable.values for name, variable in source.variables.items()}, how)]
     if isinstance(source, Mapping):
-        return _of_arrays("the dictionary", source)
+        return [_of_arrays("the dictionary", source, how)]
     if isinstance(source, np.ndarray):
-        return _of_array("the array", source, columns)
-    names, table = frame_names("the frame", source)
-    if len(table) == 0:
-        raise DataError("the frame has no rows.")
-    return Table("the frame", names, partial(load_frame, "the frame", table),
-                 index_name(source, names) or only_clock(table.schema))
+        return [_of_array("the array", source, how)]
+    return [_of_frame("the frame", source, how)]
 
 
-def _file_table(path: Path, kind: str, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Table:
+def _file_tables(path: Path, kind: str, how: Format) -> list[Table]:
     if kind in TEXT:
-        file = open_csv(path, columns, "\t" if kind == ".tsv" else delimiter, decimal)
-        return Table(path.name, file.names, file.columns)
+        file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
+        return [Table(path.name, file.names, file.columns, file.layout.how, None, file.layout.dates, file.layout.units,
+                      None, file.layout.advice, file.layout.findings)]
     if kind == ".parquet":
-        from optid.data.reading.parquet import load_parquet, parquet_schema
+        from optid.data.reading.parquet import load_parquet, parquet_head
 
-        schema = parquet_schema(path)
-        return Table(path.name, list(schema), partial(load_parquet, path), only_clock(schema))
+        head = parquet_head(path)
+        return [Table(path.name, list(head.columns), partial(load_parquet, path), how, None, dated_columns(head))]
     if kind == ".npz":
-        return Table(path.name, list(npz_arrays(path)), lambda wanted, *_: npz_arrays(path, wanted))
+        names = list(npz_arrays(path))
+        known = npz_arrays(path, [name for name in names if name.lower().replace("_", "") in (*STEPS, *RATES)])
+        step, rest = _stated_step(known, path.name)
+        names = [name for name in names if name not in known or name in rest]
+        return [Table(path.name, names, lambda wanted, _: npz_arrays(path, wanted), how, step=step)]
     if kind == ".npy":
-        opened = open_npy(path, columns)
-        return Table(path.name, list(opened.names), lambda wanted, *_: next(opened.blocks(opened.rows, wanted)))
+        opened = open_npy(path, how.columns)
+        return [Table(path.name, list(opened.names), lambda wanted, _: next(opened.blocks(opened.rows, wanted)), how)]
+    if kind in PLANT:
+        from optid.data.reading.plant_files import plant_tables
+
+        return [_of_frame(label, frame, how) if units is None else replace(_of_frame(label, frame, how), units=units)
+                for label, frame, units in plant_tables(path, kind)]
     from optid.data.reading.matlab import mat_variables
 
     names = list(mat_variables(path))
     if not names:
         raise DataError(f"{path.name} holds no arrays of numbers.")
-    return Table(path.name, names, lambda wanted, *_: mat_variables(path, wanted))
+    return [Table(path.name, names, lambda wanted, _: mat_variables(path, wanted), how)]
 
 
-def _of_arrays(label: str, variables: Mapping[Any, Any]) -> Table:
+def _of_frame(label: str, frame: Any, how: Format) -> Table:
+    names, table = frame_names(label, frame)
+    if len(table) == 0:
+        raise DataError(f"{label} has no rows.")
+    return Table(label, names, partial(load_frame, label, table), how, index_name(frame, names), dated_columns(table))
+
+
+def _of_arrays(label: str, variables: Mapping[Any, Any], how: Format) -> Table:
     if not variables:
         raise DataError(f"{label} holds no arrays.")
     named = {str(name): value for name, value in variables.items()}
-    return Table(label, list(named), lambda wanted, *_: {name: named[name] for name in wanted})
+    step, named = _stated_step(named, label)
+    dated = tuple(name for name, value in named.items() if getattr(getattr(value, "dtype", None), "kind", "") in "Mm"
+                  and getattr(value, "ndim", 0) == 1)
+    return Table(label, list(named), lambda wanted, _: {name: named[name] for name in wanted}, how, dates=dated,
+                 step=step)
 
 
-def _of_array(label: str, array: np.ndarray, columns: Sequence[str] | None) -> Table:
+def _stated_step(named: Mapping[str, Any], label: str) -> tuple[float | None, dict[str, Any]]:
+    """Return the sampling time that stands beside the samples as a single number, and the other variables."""
+    step, others = None, dict(named)
+    for name, value in named.items():
+        word = name.rpartition(".")[2].lower().replace("_", "")
+        if word in (*STEPS, *RATES) and np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf":
+            number = float(np.ravel(value)[0])
+            if not 0 < number < np.inf:
+                kind = "rate" if word in RATES else "time"
+                raise DataError(f"{label}: {name} = {number:g}: the sampling {kind} that stands beside the samples "
+                                "must be positive; leave it out and pass dt=.")
+            step = 1 / number if word in RATES else number
+            del others[name]
+    return step, others
+
+
+def _of_array(label: str, array: np.ndarray, how: Format) -> Table:
     if array.ndim not in (1, 2):
         raise DataError(f"{label} has shape {array.shape}; it must be (samples, channels).")
     table = array[:, None] if array.ndim == 1 else array
-    names = position_names(columns, table.shape[1], label)
-    return Table(label, names, _of_arrays(label, dict(zip(names, table.T))).load)
+    names = position_names(how.columns, table.shape[1], label)
+    return Table(label, names, _of_arrays(label, dict(zip(names, table.T)), how).load, how)
 
 
 # -- in blocks and parts
@@ -134,45 +180,47 @@ def is_dask(thing: Any) -> bool:
     return hasattr(thing, "__dask_graph__") and hasattr(thing, "to_delayed")
 
 
-def open_source(source: Any, chunk: int, columns: Sequence[str] | None, delimiter: str, decimal: str) -> Source:
+def open_source(source: Any, chunk: int, how: Format) -> Source:
     """Open a file, a folder of Parquet files, a mapping {channel: npy file or Dask array} or a Dask collection.
 
-    Arguments as of `optid.data.streams.open_stream`, errors as of `open_table`.
+    Arguments as of `optid.data.streams.open_stream`, errors as of `open_tables`.
     """
     if is_dask(source):
-        return _of_dask(source, chunk, columns)
+        return _of_dask(source, chunk, how)
     if isinstance(source, Mapping):
         if source and all(is_dask(item) for item in source.values()):
-            return _of_dask(_stacked(source), chunk, list(map(str, source)))
-        return _of_npy(source, chunk)
+            return _of_dask(_stacked(source), chunk, replace(how, columns=list(map(str, source))))
+        return _of_npy(source, chunk, how)
     if not isinstance(source, str | Path):
         raise DataError(f"a stream is opened from a path or a Dask collection, not from {type(source).__name__}; "
                         "use read for what is in memory.")
     if Path(source).is_dir():
-        return _of_folder(Path(source), chunk)
+        return _of_folder(Path(source), chunk, how)
     path = existing(Path(source)).absolute()
     kind = path.suffix.lower()
     if kind == ".parquet":
         from optid.data.reading.parquet import parquet_blocks, parquet_footer, parquet_parts
 
-        names, rows = parquet_footer(path)
+        names, rows, dates = parquet_footer(path)
         whole = Part(path.name, partial(parquet_blocks, path, None, chunk), rows)
-        return Source(names, rows, whole, lambda _: parquet_parts(path, chunk), path.name)
+        return Source(names, rows, whole, lambda _: parquet_parts(path, chunk), path.name, how, dates)
     if kind in TEXT:
-        file = open_csv(path, columns, "\t" if kind == ".tsv" else delimiter, decimal)
-        return _of_files(file.names, Part(path.name, partial(file.blocks, chunk)), path)
+        file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
+        found = _of_files(file.names, how, Part(path.name, partial(file.blocks, chunk)), path)
+        return replace(found, how=file.layout.how, dates=file.layout.dates, units=file.layout.units,
+                       findings=file.layout.findings)
     if kind == ".npy":
-        opened = open_npy(path, columns)
-        return _of_files(opened.names, Part(path.name, partial(opened.blocks, chunk), opened.rows), path)
+        opened = open_npy(path, how.columns)
+        return _of_files(opened.names, how, Part(path.name, partial(opened.blocks, chunk), opened.rows), path)
     raise DataError(f"{path.name}: streams are read from .csv, .txt, .tsv, .parquet and .npy files, and from "
                     "folders of .parquet files; use read.")
 
 
-def _of_files(names: Sequence[str], whole: Part, *paths: Path, label: str = "") -> Source:
-    return Source(names, whole.n_samples, whole, lambda _: file_parts([whole], *paths), label or whole.label)
+def _of_files(names: Sequence[str], how: Format, whole: Part, *paths: Path, label: str = "") -> Source:
+    return Source(names, whole.n_samples, whole, lambda _: file_parts([whole], *paths), label or whole.label, how)
 
 
-def _of_npy(paths: Mapping[Any, Any], chunk: int) -> Source:
+def _of_npy(paths: Mapping[Any, Any], chunk: int, how: Format) -> Source:
     if not paths:
         raise DataError("the mapping {channel: path of an npy file, or Dask array} is empty; give every channel.")
     for name, path in paths.items():
@@ -186,7 +234,7 @@ def _of_npy(paths: Mapping[Any, Any], chunk: int) -> Source:
     rows = _one_length({name: file.rows for name, file in files.items()})
     first = next(iter(files.values())).path.name
     whole = Part(first, partial(side_by_side, files, chunk), rows)
-    return _of_files(list(files), whole, *(file.path for file in files.values()), label="the npy files")
+    return _of_files(list(files), how, whole, *(file.path for file in files.values()), label="the npy files")
 
 
 def _one_length(lengths: Mapping[str, Any]) -> Any:
@@ -195,7 +243,7 @@ def _one_length(lengths: Mapping[str, Any]) -> Any:
     return next(iter(lengths.values()))
 
 
-def _of_folder(folder: Path, chunk: int) -> Source:
+def _of_folder(folder: Path, chunk: int, how: Format) -> Source:
     from optid.data.reading.parquet import parquet_footer, parquet_parts
 
     files = sorted(folder.glob("*.parquet"), key=_natural)
@@ -205,12 +253,13 @@ def _of_folder(folder: Path, chunk: int) -> Source:
         raise DataError(f"folder {str(folder)!r} has no .parquet file.{hint}")
     found = [parquet_footer(existing(path)) for path in files]
     names = found[0][0]
-    for path, (there, _) in zip(files, found):
+    for path, (there, *_) in zip(files, found):
         if odd := sorted(set(there) ^ set(names)):
             raise DataError(f"{path.name} has other columns than {files[0].name} (differing: {', '.join(odd)}): "
                             f"the files of {folder.name!r} are not parts of one table.")
-    return Source(names, sum(rows for _, rows in found), None,
-                  lambda _: [part for path in files for part in parquet_parts(path, chunk)], folder.name)
+    return Source(names, sum(rows for _, rows, _ in found), None,
+                  lambda _: [part for path in files for part in parquet_parts(path, chunk)], folder.name, how,
+                  found[0][2])
 
 
 def _natural(path: Any) -> list[Any]:
@@ -230,10 +279,12 @@ def _stacked(arrays: Mapping[Any, Any]) -> Any:
     return dask.array.stack(list(arrays.values()), axis=1)
 
 
-def _of_dask(collection: Any, chunk: int, columns: Sequence[str] | None) -> Source:
+def _of_dask(collection: Any, chunk: int, how: Format) -> Source:
+    dates: tuple[str, ...] = ()
     if hasattr(collection, "columns"):
         label, rows, known = "the Dask data frame", None, {str(name): name for name in collection.columns}
         names = list(known)
+        dates = tuple(str(name) for name, kind in collection.dtypes.items() if getattr(kind, "kind", "") in "Mm")
     else:
         label = "the Dask array"
         if getattr(collection, "ndim", None) not in (1, 2):
@@ -241,7 +292,7 @@ def _of_dask(collection: Any, chunk: int, columns: Sequence[str] | None) -> Sour
                             f"{getattr(collection, 'ndim', 'no')} dimensions.")
         array = collection[:, None] if collection.ndim == 1 else collection
         rows, width = array.shape
-        names, known = position_names(columns, width, label), None
+        names, known = position_names(how.columns, width, label), None
         if rows == rows and width > rows:
             raise DataError(f"the Dask array has shape {array.shape}: more channels than samples. Transpose it (x.T).")
         array = array.rechunk({1: -1})
@@ -257,4 +308,5 @@ def _of_dask(collection: Any, chunk: int, columns: Sequence[str] | None) -> Sour
         return [Part(one, partial(partition_blocks, one, there, chunk), None if n != n else int(n), content=content)
                 for one, content, n in zip(labels, contents, lengths)]
 
-    return Source(names, None if rows is None or rows != rows else int(rows), None, parts, label)
+    return Source(names, None if rows is None or rows != rows else int(rows), None, parts, label, how,
+                  dates)

@@ -4,15 +4,16 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import product
 from pathlib import PurePath
 from typing import Any
 
 from optid.backends.choice import back_ends
 from optid.bases import parse
+from optid.data.readers import Format
 from optid.data.record import Data
-from optid.errors import OptidError, nearest
+from optid.errors import DataError, OptidError, nearest
 from optid.registry import CONSTRAINTS, FORMULATIONS, named_constraint, registered
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
@@ -22,7 +23,9 @@ from optid.studies.sources.systems import SYSTEMS, simulate
 AUTO, ALL = "auto", "all"
 MOST_SEEDS, MOST_FORMULATIONS = 1_000_000, 10_000  # a study has no more cells than that
 
-READING = ("inputs", "outputs", "dt", "time", "experiment", "columns", "delimiter", "decimal")  # how files are read
+READING = ("inputs", "outputs", "dt", "time", "experiment", *(field.name for field in fields(Format)))
+"""How files are read: arguments of `optid.read`."""
+
 _TOP = ("name", "accuracy", "time_limit", "memory_limit", "repetitions", "warm", "seeds", "holdout", "data",
         "formulation", "solver", "solvers")
 _DATA = ("name", "file", "system", "samples", "noise", *READING)
@@ -108,14 +111,21 @@ def _reading(at: Place) -> Any:
     key, value = at.name, at.value
     if key == "dt":
         return at.number("a positive number", 0.0)
-    if key in ("inputs", "outputs", "columns"):
-        if isinstance(value, Mapping) and key != "columns":
+    if key in ("inputs", "outputs"):
+        if isinstance(value, Mapping):
             return {str(name): at[name].text() for name in value}
         return list(at.texts())
-    if (key == "time" and value is False) or (key in ("delimiter", "decimal") and isinstance(value, str)
-                                              and len(value) == 1):
+    if key == "time" and value is False:
         return value
-    return at.text()
+    if key in ("time", "experiment"):
+        return at.text()
+    if key == "columns":
+        return list(at.texts())
+    try:
+        Format(**{key: value})
+    except (DataError, TypeError) as error:
+        at.note(str(error))
+    return value
 
 
 def _formulations(entry: Place, data: Sequence[DataEntry]) -> list[FormulationEntry]:

@@ -69,14 +69,15 @@ class _Records:
 def _note_unreadable(path: Keys, entry: DataEntry, records: _Records, problems: Problems) -> None:
     """Note problems with the files of an entry, at the key that causes them."""
     from optid.data.reading.columns import choose
-    from optid.data.reading.sources import open_table
+    from optid.data.reading.format import Format
+    from optid.data.reading.sources import open_tables
 
     options, at = dict(entry.options), (*path, "file")
     try:
         for number, name in enumerate(entry.files):
             at = (*path, "file", number)
-            table = open_table(records.folder / name, options.get("columns"), options.get("delimiter", ","),
-                               options.get("decimal", "."))
+            words = {word: value for word, value in options.items() if word in Format.__dataclass_fields__}
+            table = open_tables(records.folder / name, Format(**words))[0]
             for key, letter in (("inputs", "u"), ("outputs", "y")):
                 at = (*path, key)
                 choose(table.names, options.get(key), letter, table.label)

@@ -1,0 +1,51 @@
+"""Long tables, one row for each tag and instant: recognised where a channel is asked for, and what to do."""
+
+from typing import Any
+
+import numpy as np
+
+from optid.data.reading.clock import is_time_name
+from optid.data.reading.sources import Table
+from optid.errors import DataError
+
+MOST_TAGS = 1000
+
+
+def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> DataError:
+    """Return the error about a missing column, or the one that the table is long where its cells name the channels."""
+    texts = [name for name in table.names if name and name not in table.dates and not is_time_name(name)]
+    try:
+        loaded = table.load(texts, set(texts))
+    except DataError:
+        return error
+    asked = [one for wanted in (inputs, outputs) if wanted is not None
+             for one in ([wanted] if isinstance(wanted, str | int) else
+                         list(wanted.values()) if hasattr(wanted, "values") else wanted)]
+    for name in texts:
+        cells = np.asarray(loaded[name])
+        if cells.dtype.kind not in "UO" or cells.ndim != 1:
+            continue
+        tags = list(dict.fromkeys(str(cell) for cell in cells[:10_000]))
+        named = [one for one in asked if one in tags]
+        repeated = len(tags) <= MOST_TAGS and len(cells) >= 4 * len(tags) > 4 and not asked
+        if named or (repeated and not any(any(sign.isdigit() for sign in tag) and tag.replace(".", "").isdigit()
+                                          for tag in tags)):
+            clock = next((one for one in table.names if one in table.dates or is_time_name(one)), "TIME")
+            value = next((one for one in table.names if one != name and one in loaded and
+                          _is_numeric(loaded[one])), "VALUE")
+            return DataError(
+                f"{table.label} is a long table: column {name!r} holds the tags ({', '.join(tags[:4])}), one row for "
+                f"each tag and instant. Make one column of each tag first, in pandas: frame.pivot(index={clock!r}, "
+                f"columns={name!r}, values={value!r}), and read the result.")
+    return error
+
+
+def _is_numeric(values: Any) -> bool:
+    array = np.asarray(values)
+    if array.dtype.kind in "iuf":
+        return True
+    try:
+        array[:100].astype(float)
+    except (ValueError, TypeError):
+        return False
+    return True

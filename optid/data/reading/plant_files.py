@@ -1,0 +1,95 @@
+"""Files of plants and test rigs that libraries of the extra `plant` read: Excel, LabVIEW TDMS and ASAM MDF."""
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optid.errors import DataError
+
+PLANT = 'pip install "optid[plant]"'
+
+LIBRARIES = {".xlsx": "fastexcel", ".tdms": "npTDMS", ".mf4": "asammdf"}
+"""The library that reads each kind of file."""
+
+
+def plant_tables(path: Path, kind: str) -> list[tuple[str, Any, Mapping[str, str] | None]]:
+    """Return the label, a frame and the units of the channels of each table of a file.
+
+    An Excel file has one table, its first sheet; a TDMS file one for each group; an MDF file one for each group of
+    channels with a clock of its own.
+
+    Raises:
+        DataError: the library is missing (with its pip line), or the file is damaged.
+    """
+    read = {".xlsx": _of_excel, ".tdms": _of_tdms, ".mf4": _of_mdf}[kind]
+    try:
+        with warnings.catch_warnings():  # about one another's versions
+            warnings.simplefilter("ignore")
+            found = read(path)
+    except ImportError:
+        raise DataError(f"{path.name}: files of kind {kind} are read by {LIBRARIES[kind]}: {PLANT}") from None
+    except (DataError, MemoryError):
+        raise
+    except Exception as error:  # whatever a library raises on a damaged file
+        raise DataError(f"{path.name} is damaged, or not a file of kind {kind}: {str(error)[:300]}") from error
+    if not found:
+        raise DataError(f"{path.name} holds no samples.")
+    return found
+
+
+def _of_excel(path: Path) -> list[tuple[str, Any, None]]:
+    import fastexcel  # noqa: F401 - the reader that polars uses
+    import polars as pl
+
+    frame: Any = pl.read_excel(path, raise_if_empty=False)
+    return [(path.name, frame, None)] if frame.width else []
+
+
+def _of_tdms(path: Path) -> list[tuple[str, Any, Mapping[str, str]]]:
+    import polars as pl
+    from nptdms import TdmsFile
+
+    found = []
+    for group in TdmsFile.read(path).groups():
+        channels = {channel.name: channel for channel in group.channels() if len(channel)}
+        if not channels:
+            continue
+        lengths = {name: len(channel) for name, channel in channels.items()}
+        if len(set(lengths.values())) > 1:
+            raise DataError(f"{path.name}, group {group.name!r}: the channels have different lengths: {lengths}.")
+        columns = {name: channel[:] for name, channel in channels.items()}
+        clock = next((c for c in channels.values() if "wf_increment" in c.properties), None)
+        if clock is not None:
+            columns = {"time (s)": _waveform_time(clock)} | columns
+        units = {name: str(channel.properties.get("unit_string", "")) for name, channel in channels.items()}
+        found.append((f"{path.name}, group {group.name!r}", pl.DataFrame(columns), units))
+    return [(path.name, *found[0][1:])] if len(found) == 1 else found
+
+
+def _waveform_time(channel: Any) -> np.ndarray:
+    """Return the instants of a waveform, dates where it says when it started."""
+    step, offset = (float(channel.properties.get(key, 0.0)) for key in ("wf_increment", "wf_start_offset"))
+    seconds = offset + step * np.arange(len(channel))
+    start = channel.properties.get("wf_start_time")
+    if not isinstance(start, np.datetime64):
+        return seconds
+    return start.astype("M8[ns]") + np.round(seconds * 1e9).astype("m8[ns]")
+
+
+def _of_mdf(path: Path) -> list[tuple[str, Any, Mapping[str, str]]]:
+    import polars as pl
+    from asammdf import MDF
+
+    found = []
+    with MDF(path) as file:
+        for number, group in enumerate(file.iter_groups(raw=False, ignore_value2text_conversions=True)):
+            if not len(group):
+                continue
+            columns: dict[str, Any] = {"time (s)": group.index.to_numpy(dtype=float)}
+            columns |= {str(name): group[name].to_numpy() for name in group.columns if group[name].dtype.kind in "iufb"}
+            units = {channel.name: channel.unit or "" for channel in file.groups[number].channels}
+            found.append((f"{path.name}, group {number}", pl.DataFrame(columns), units))
+    return [(path.name, *found[0][1:])] if len(found) == 1 else found

@@ -1,0 +1,92 @@
+"""One clock from several columns that may hold it: a date and a time of day together, or rivals that must agree."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from optid.data.reading.clock import Clock, recognise, seconds
+from optid.data.reading.sources import Table
+from optid.errors import DataError
+
+AGREEMENT = 1e-3  # share of the span by which two clocks may differ, beyond one step of the coarser one
+
+
+def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: bool
+           ) -> tuple[Clock | None, np.ndarray | None, list[str]]:
+    """Return the clock that some columns hold, its stamps (N,), and findings.
+
+    Args:
+        block: the columns.
+        names: columns named as a clock, the likeliest first.
+        table: their source.
+        asked: whether the user named them.
+
+    Raises:
+        DataError: the only column, or one that the user named, holds no stamps; or two clocks disagree.
+    """
+    found: list[tuple[Clock, np.ndarray]] = []
+    refused: list[DataError] = []
+    for name in names:
+        try:
+            clock = recognise(block, [name], table.how, table.label, table.units.get(name, ""))
+            found.append((clock, clock.stamps(block, table.label)))
+        except DataError as error:
+            if asked:
+                raise
+            refused.append(error)
+    if not found:
+        raise refused[0]
+    if refused and any("date_format=" in str(error) for error in refused):
+        raise refused[0]
+    found = _paired(found, block, table)
+    moving = [(clock, stamps) for clock, stamps in found if stamps.size < 2 or (stamps != stamps[0]).any()]
+    found = moving or found
+    clock, stamps = found[0]
+    for other, rival in found[1:]:
+        if not _agree(stamps, rival):
+            raise DataError(
+                f"{table.label}: two clocks disagree: {_told(clock, stamps)}, {_told(other, rival)}. Choose one: "
+                f"time={clock.columns[0]!r} or time={other.columns[0]!r}.")
+    if len(found) > 1:  # of clocks that agree the one with the finer stamps, dated if both are
+        clock, stamps = min(found, key=lambda one: (np.mean(np.diff(one[1]) == np.diff(one[1][:1].repeat(2)))
+                                                    if one[1].size > 1 else 0, one[1].dtype.kind != "M"))
+    return clock, stamps, [clock.finding] if clock.finding else []
+
+
+def _paired(found: list[tuple[Clock, np.ndarray]], block: Mapping[str, Any], table: Table
+            ) -> list[tuple[Clock, np.ndarray]]:
+    """Join a column of dates without a time of day, and one of times of day."""
+    days = [one for one in found if one[1].dtype.kind == "M" and not (one[1] - one[1].astype("M8[D]")).any()]
+    hours = [one for one in found if one[0].kind == "times of day"]
+    if not (days and hours):
+        return [(clock, _unwrapped(stamps) if clock.kind == "times of day" else stamps) for clock, stamps in found]
+    (day, dates), (hour, of_day) = days[0], hours[0]
+    if day.kind == "ready":
+        clock = Clock((day.columns[0],), "ready", table.how)
+        stamps = dates + of_day
+    else:
+        clock = Clock((day.columns[0], hour.columns[0]), "dates", table.how, forms=(day.forms[0], hour.forms[0]))
+        stamps = clock.stamps(block, table.label)
+    return [(clock, stamps), *(one for one in found if one not in (days[0], hours[0]))]
+
+
+def _unwrapped(of_day: np.ndarray) -> np.ndarray:
+    """Return times of day that go on after midnight."""
+    day = np.timedelta64(1, "D").astype("m8[ns]")
+    back = np.diff(of_day) < -day // 2
+    return of_day + np.concatenate([[0], np.cumsum(back)]) * day
+
+
+def _agree(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two clocks run alike: same time since the first sample, up to one step of the coarser."""
+    if one.shape != other.shape or one.size < 2:
+        return one.shape == other.shape
+    a, b = seconds(one - one[0]), seconds(other - other[0])
+    coarse = max(float(np.max(np.abs(np.diff(part)), initial=0.0)) for part in (a, b))
+    return bool(np.nanmax(np.abs(a - b)) <= coarse + AGREEMENT * max(abs(a[-1]), abs(b[-1])))
+
+
+def _told(clock: Clock, stamps: np.ndarray) -> str:
+    step = float(np.median(seconds(np.diff(stamps))))
+    return f"{clock.columns[0]!r} steps by {step:.6g} s"
