@@ -87,7 +87,7 @@ class CsvFile:
             if self.path.stat().st_size > SMALL and mark.isascii() and how.is_plain:
                 attempts = [(texts, []), (texts, NULLS)]
                 for block in cleaned:
-                    if not _is_plain(block):
+                    if not _is_plain(block) or not self._has_usual_size(block):
                         cleaned = chain([block], cleaned)
                         break
                     found: Iterable[Columns] = []
@@ -129,6 +129,11 @@ class CsvFile:
             return None
         series = [table[str(place)] for place in places]
         return {name: column if name in as_text else column.to_numpy() for name, column in zip(wanted, series)}
+
+    def _has_usual_size(self, block: bytes) -> bool:
+        """Whether a block has as many cells as its rows should have: a single long row costs polars much memory."""
+        rows = block.rstrip(b"\r\n").count(b"\n") + 1
+        return block.count(self.layout.delimiter.encode()) == rows * (len(self.names) - 1)
 
     def _has_even_rows(self, block: bytes) -> bool:
         signs = np.frombuffer(block, np.uint8)

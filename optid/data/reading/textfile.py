@@ -55,9 +55,9 @@ class TextFile:
 
     def head(self) -> tuple[str, str]:
         """Return the first lines as text, and the encoding."""
-        found = b""
-        while more := self.read(HEAD):
-            found += more
+        found, size = b"", HEAD
+        while more := self.read(size):
+            found, size = found + more, 2 * size
             if b"\n" in found or b"\r" in found[:-1] or len(found) > LONGEST_HEAD:
                 break
         more = self.read(1)  # the last line is whole where the file ends
