@@ -98,8 +98,8 @@ def test_the_refusal_of_the_command_can_be_typed(export, tmp_path):
     assert result.exit_code == 0, result.output
 
 
-@pytest.mark.parametrize("export", [one for one in EXPORTS if one.name.endswith(".csv") and "encoding" not in one.words],
-                         ids=lambda e: e.name)
+@pytest.mark.parametrize("export", [one for one in EXPORTS if one.name.endswith(".csv")
+                                    and "encoding" not in one.words], ids=lambda e: e.name)
 def test_through_frames_nothing_is_silently_wrong(export, tmp_path):
     """A frame that pandas or polars made of the file: read right, or refused by name."""
     path = export.file(tmp_path)
@@ -127,7 +127,8 @@ def outcome(export: Export, folder: Path) -> str:
     """Return the row of a file in the table of the documentation."""
     try:
         data = optid.read(export.file(folder), *export.channels)
-        default = "read" + (f"; {data.findings[0].partition('. Pass')[0].partition('; pass')[0]}" if data.findings else "")
+        finding = data.findings[0].partition(". Pass")[0].partition("; pass")[0] if data.findings else ""
+        default = f"read; {finding}" if finding else "read"
     except DataError as error:
         assert export.refusal in str(error)
         default = f"refused: {export.refusal}"

@@ -59,8 +59,9 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
         *([Section("validation", "Validation", lambda: _validations(fit, test), page_only=True)]
           if isinstance(fit.data, Data) or test is not None else []),
         Section("certificate", "Certificate", [summary.certificate_facts(fit)], page_only=True),
-        Section("data", "Data", lambda: [summary.record_facts(fit), *([summary.channel_table(fit.data)] if isinstance(fit.data, Data) else [])],
-                page_only=True),
+        Section("data", "Data", lambda: [
+            summary.record_facts(fit), *([summary.channel_table(fit.data)] if isinstance(fit.data, Data) else [])],
+            page_only=True),
         Section("solver", "Solver and times", [summary.solver_facts(fit)], page_only=True),
         Section("reproduce", "Reproduce", lambda: _reproduce(
             "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
@@ -73,7 +74,8 @@ def record_document(data: Data, *, command: str = "") -> Document:
     raw = data.raw()
     drawn = [chart for k in range(min(raw.n_experiments, charts.MOST_EXPERIMENTS))
              for chart in charts.time_charts(raw, k, [], f"time{k}")]
-    lead = " · ".join([_length(data), f"every {data.interval}", f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"])
+    channels = f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"
+    lead = " · ".join([_length(data), f"every {data.interval}", channels])
     return Document(data.name or "Record", lead, [
         *([Section("findings", "Findings", [Notes(data.findings)])] if data.findings else []),
         Section("channels", "Channels", [summary.channel_table(data)]),

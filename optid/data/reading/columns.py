@@ -172,8 +172,8 @@ def likely_marks(channels: Mapping[str, np.ndarray]) -> list[str]:
             marked = samples == value
             others = samples[~marked & np.isfinite(samples)]
             if others.size and abs(value - np.median(others)) > FAR * max(float(np.ptp(others)), 1e-3 * abs(value)):
-                found.append(f"channel {name!r}: {int(marked.sum())} samples are {value:g}, far from all others. If that "
-                             f"marks missing samples pass missing='{value:g}'")
+                found.append(f"channel {name!r}: {int(marked.sum())} samples are {value:g}, far from all others. If "
+                             f"that marks missing samples pass missing='{value:g}'")
     return found
 
 

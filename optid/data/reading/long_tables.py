@@ -35,8 +35,8 @@ def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> Data
                           _is_numeric(loaded[one])), "VALUE")
             return DataError(
                 f"{table.label} is a long table: column {name!r} holds the tags ({', '.join(tags[:4])}), one row for "
-                f"each tag and instant. Make a column of each tag first, in pandas: frame.set_index([{clock!r}, {name!r}])"
-                f"[{value!r}].unstack(), and read the result.")
+                f"each tag and instant. Make a column of each tag first, in pandas: "
+                f"frame.set_index([{clock!r}, {name!r}])[{value!r}].unstack(), and read the result.")
     return error
 
 
