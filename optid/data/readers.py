@@ -69,7 +69,7 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     for run in runs:
         if run.names != runs[0].names:
             raise DataError(f"{run.label} has channels {run.names}, {runs[0].label} has {runs[0].names}.")
-    runs, joined = _continued(runs, how) if experiment is None else (runs, [])
+    runs, joined = _continued(runs, how) if experiment is None and len(sources) > 1 else (runs, [])
     runs = _between(runs, how, dt)
     experiments, step, findings = _sampled(runs, how, dt)
     dated = all(run.is_dated for run in runs)
@@ -136,7 +136,7 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
     signals = list(dict.fromkeys([*ins.values(), *outs.values()]))
     clocks = clock_columns(table.names, time, signals, label, table.index, table.dates)
     group = None if experiment is None else known.column_name(table.names, experiment, label)
-    goods = dict(how.quality or {})
+    goods: dict[str, str] = dict(how.quality or {})
     quality = known.guarded(goods, table.names, signals, label)
     others = [name for name in (*clocks, *([group] if group is not None else []), *quality) if name not in signals]
     unused = [name for name in known.quality_columns(table.names, signals) if name not in (*quality, *others)]
@@ -240,7 +240,12 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
 
 def _continued(runs: list[_Run], how: Format) -> tuple[list[_Run], list[str]]:
     """Join runs whose clock continues that of the run before; with `gaps` or `resample` also those behind a gap."""
-    found, findings = [runs[0]], []
+    findings = []
+    if all(run.is_dated for run in runs):
+        ordered = sorted(runs, key=lambda run: run.stamps[0])  # type: ignore[index]
+        findings = ["the files are taken in the order of their dates"] * (ordered != runs)
+        runs = ordered
+    found = [runs[0]]
     for run in runs[1:]:
         last = found[-1]
         if _follows(last, run, how):

@@ -36,6 +36,10 @@ _SERIAL = {"days since 1899-12-30, as of Excel": 25569.0, "days since year 0, as
 _SERIAL_SPAN = (10957.0, 47482.0)  # days since 1970 of the years 2000 to 2100
 
 
+class NoStamps(DataError):
+    """A column named as a clock holds something else."""
+
+
 @dataclass(frozen=True)
 class Clock:
     """How the stamps of a record are read from its columns.
@@ -166,7 +170,7 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     else:
         values = np.ravel(block[name])
     if values.dtype.kind not in "iuf":
-        raise DataError(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
+        raise NoStamps(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
     return _of_numbers(values, name, how, unit)
 
 
@@ -180,9 +184,11 @@ def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
         where = f"{label}, column {name!r}"
         if not found:
             first = full[0] if full else ""
-            raise DataError(f"{where}: the stamps (first: {first!r}) are neither numbers nor ISO dates such as "
-                            "2024-05-01T12:00:00. Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to "
-                            "seconds, or pass time=False and dt=.")
+            odd = next((cell for cell in full if dates.formats(first) and not dates.formats(cell)), None)
+            what = f"(first: {first!r})" if odd is None else f"(first: {first!r}; then {odd!r})"
+            raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as "
+                           "2024-05-01T12:00:00. Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to "
+                           "seconds, or pass time=False and dt=.")
         if not how.date_format and not dates.is_unambiguous(found[0]):
             other = f" (or {found[1]!r} where the day comes first)" if len(found) > 1 else ""
             raise DataError(f"{where}: the dates (first: {full[0]!r}) do not begin with the year. Pass "

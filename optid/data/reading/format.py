@@ -69,7 +69,7 @@ class Format:
     time_tolerance: float = TIME_TOLERANCE
     gaps: str | None = None
     resample: str | float | None = None
-    quality: Mapping[str, Any] | Sequence[str] | None = None
+    quality: Any = None
     from_: Any = None
     to: Any = None
 
@@ -88,6 +88,8 @@ class Format:
                             "below 1, such as 0.05.")
         if self.gaps is not None and self.gaps not in GAPS:
             raise DataError(f"gaps={self.gaps!r}: use one of {', '.join(GAPS)}.")
+        if isinstance(self.columns, str):
+            object.__setattr__(self, "columns", [self.columns])
         for name, value in (("missing", _words(self.missing, "missing")), ("quality", _qualities(self.quality)),
                             ("resample", None if self.resample is None else duration(self.resample, "resample"))):
             object.__setattr__(self, name, value)
