@@ -129,10 +129,15 @@ def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any
 
 def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: str | int | None) -> list[_Run]:
     label, how = table.label, table.how
+    inputs = table.inputs if inputs is None else inputs
+    outputs = table.outputs if outputs is None else outputs
     try:
         ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
     except DataError as error:
         raise long_tables.explained(error, table, inputs, outputs) from None
+    if table.split is not None:
+        tables = table.split([*ins.values(), *outs.values()], time)
+        return [run for one in tables for run in _runs(one, ins, outs, None if time is True else time, experiment)]
     signals = list(dict.fromkeys([*ins.values(), *outs.values()]))
     clocks = clock_columns(table.names, time, signals, label, table.index, table.dates)
     group = None if experiment is None else known.column_name(table.names, experiment, label)
@@ -327,6 +332,9 @@ def _sampled(runs: Sequence[_Run], how: Format, dt: float | None
         pieces, found, said = regular(run.stamps, run.u, run.y, dt, how, run.label)
         findings += said
         step = agreed_step(found, step, how.time_tolerance, run.label)
+        if dt is None and found and run.step and abs(found - run.step) > how.time_tolerance * run.step:
+            raise DataError(f"{run.label}: the time stamps step by {found:.6g} s, and the sampling time beside them is "
+                            f"{run.step:.6g} s. Pass the right one as dt.")
         for piece in pieces:
             for part in (piece.u, piece.y):
                 part.flags.writeable = False

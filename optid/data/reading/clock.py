@@ -21,6 +21,11 @@ NAMES = frozenset({
 })
 """Names of columns of time, in lower case, without unit, blanks and marks."""
 
+_STEPS = ("ts", "dt", "sampletime", "samplingtime", "sampleperiod", "samplingperiod", "timestep", "samplinginterval",
+          "deltat")
+_RATES = ("fs", "samplerate", "samplingrate", "samplingfrequency", "samplefrequency")
+"""Names of a single number beside the samples: the sampling time, and the sampling rate."""
+
 _UNIT_WORDS = {"s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s", "sekunden": "s",
                "ms": "ms", "msec": "ms", "millis": "ms", "milliseconds": "ms", "us": "us", "µs": "us", "μs": "us",
                "usec": "us", "microseconds": "us", "ns": "ns", "nanoseconds": "ns", "min": "min", "mins": "min",
@@ -114,6 +119,16 @@ def seconds(stamps: np.ndarray) -> np.ndarray:
 def is_time_name(name: str) -> bool:
     """Whether a column is named as a clock, with or without a unit."""
     return _plain(_parts(name)[0]) in NAMES or _plain(name) in NAMES
+
+
+def is_step_name(name: str) -> bool:
+    """Whether a single number is named as a sampling time."""
+    return _plain(name) in _STEPS
+
+
+def is_rate_name(name: str) -> bool:
+    """Whether a single number is named as a sampling rate."""
+    return _plain(name) in _RATES
 
 
 def clock_columns(known: Sequence[str], time: Any, taken: Sequence[str], label: str, index: str | None = None,
