@@ -26,14 +26,15 @@ MINUTES = pd.date_range("2024-05-01 06:00", periods=N, freq="5min")
 
 
 @pytest.mark.parametrize("name", [
-    "t", "T", "time", "Time", "TIMESTAMP", "Timestamp", "time_stamp", "datetime", "DateTime", "Date", "Date/Time", "Zeit",
-    "Zeitstempel", "Datum Uhrzeit", "Time (s)", "time [ms]", "t [s]", "t/s", "time_s", "time_us", "Time (UTC)",
+    "t", "T", "time", "Time", "TIMESTAMP", "Timestamp", "time_stamp", "datetime", "DateTime", "Date", "Date/Time",
+    "Zeit", "Zeitstempel", "Datum Uhrzeit", "Time (s)", "time [ms]", "t [s]", "t/s", "time_s", "time_us", "Time (UTC)",
     "Elapsed Time", "X_Value", "seconds", "Timestamp (Europe/Berlin)", "Zeit in min"])
 def test_names_of_clocks_are_recognised(name):
     assert is_time_name(name)
 
 
-@pytest.mark.parametrize("name", ["temp", "u", "y", "temperature (s)", "rate", "timer_value", "date_code_2", "status", ""])
+@pytest.mark.parametrize("name", ["temp", "u", "y", "temperature (s)", "rate", "timer_value", "date_code_2", "status",
+                                  ""])
 def test_other_names_are_not(name):
     assert not is_time_name(name)
 
@@ -45,8 +46,9 @@ def test_dates_are_found_in_every_source(tmp_path, name):
     frame.to_csv(tmp_path / "r.csv", index=False)
     pl.from_pandas(frame).write_parquet(tmp_path / "r.parquet")
     pl.from_pandas(text).write_parquet(tmp_path / "text.parquet")
-    sources = [tmp_path / "r.csv", tmp_path / "r.parquet", tmp_path / "text.parquet", frame, text, pl.from_pandas(frame),
-               pl.from_pandas(text), frame.set_index(name), text.set_index(name) if name == "Timestamp" else frame,
+    sources = [tmp_path / "r.csv", tmp_path / "r.parquet", tmp_path / "text.parquet", frame, text,
+               pl.from_pandas(frame), pl.from_pandas(text), frame.set_index(name),
+               text.set_index(name) if name == "Timestamp" else frame,
                {name: MINUTES.to_numpy(), "u": U, "y": Y}, frame.set_index(MINUTES.to_period("5min"))[["u", "y"]],
                xr.Dataset({"u": (name, U), "y": (name, Y)}, coords={name: MINUTES.to_numpy()})]
     for source in sources:
@@ -58,8 +60,8 @@ def test_dates_are_found_in_every_source(tmp_path, name):
         assert sum(len(u) for u, _ in stream) == N
 
 
-@pytest.mark.parametrize(("unit", "step", "dt"), [("s", 0.5, 0.5), ("ms", 20, 0.02), ("us", 500, 5e-4), ("min", 5, 300.0),
-                                                  ("h", 1, 3600.0), ("d", 1, 86400.0)])
+@pytest.mark.parametrize(("unit", "step", "dt"), [("s", 0.5, 0.5), ("ms", 20, 0.02), ("us", 500, 5e-4),
+                                                  ("min", 5, 300.0), ("h", 1, 3600.0), ("d", 1, 86400.0)])
 def test_units_of_time_are_read_alike(tmp_path, unit, step, dt):
     named, plain = f"Time ({unit})", {"u": U, "y": Y}
     stamps = step * np.arange(N)
@@ -79,7 +81,8 @@ def test_units_of_time_are_read_alike(tmp_path, unit, step, dt):
     (1714543200000 + 100 * np.arange(N), 0.1, "2024-05-01T06:00"),
     (1714543200000000 + 50 * np.arange(N), 5e-5, "2024-05-01T06:00"),
     (1714543200000000000 + 10**9 * np.arange(N), 1.0, "2024-05-01T06:00"),
-    (45413.25 + np.arange(N) / 1440, 60.0, "2024-05-01T06:00"), (739373.25 + np.arange(N) / 24, 3600.0, "2024-05-01T06:00")])
+    (45413.25 + np.arange(N) / 1440, 60.0, "2024-05-01T06:00"),
+    (739373.25 + np.arange(N) / 24, 3600.0, "2024-05-01T06:00")])
 def test_counts_of_seconds_and_days_are_dates(values, dt, first):
     data = optid.read({"time": values, "u": U, "y": Y})
     assert data.dt == pytest.approx(dt, rel=1e-7) and data.dated and len(data.findings) == 1
@@ -156,7 +159,8 @@ def test_local_time_becomes_utc():
 
 
 @settings(deadline=None, max_examples=40)
-@given(st.sampled_from([0.1, 1 / 3, 0.02, 5.0, 60.0, 0.0125]), st.integers(20, 400), st.floats(0, 0.2), st.integers(0, 99))
+@given(st.sampled_from([0.1, 1 / 3, 0.02, 5.0, 60.0, 0.0125]), st.integers(20, 400), st.floats(0, 0.2),
+       st.integers(0, 99))
 def test_the_sampling_time_keeps_its_digits_under_jitter(dt, n, jitter, seed):
     """Stamps with jitter give the sampling time within three standard errors of the line through them."""
     r = np.random.default_rng(seed)

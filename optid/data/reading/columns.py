@@ -191,8 +191,8 @@ def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str
     """
     text, words = cell.strip(), dict[str, Any]()
     if row and all(one.strip() and not any(sign.isdigit() for sign in one) for one in row) and len(row) > 2:
-        return DataError(f"{where} holds {cell!r}, not a number. The whole row is text ({', '.join(row)[:60]}): a row of "
-                         "units or another header inside the table; remove it.")
+        return DataError(f"{where} holds {cell!r}, not a number. The whole row is text ({', '.join(row)[:60]}): a row "
+                         "of units or another header inside the table; remove it.")
     if not any(sign.isdigit() for sign in text):
         marks = dict.fromkeys(one.strip() for column in around for one in column
                               if not any(sign.isdigit() for sign in one) and not how.is_missing(one))
