@@ -46,7 +46,10 @@ def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dic
     if isinstance(wanted, Mapping):
         pairs = {str(name): column_name(known, column, label) for name, column in wanted.items()}
     else:
-        several = [wanted] if isinstance(wanted, str | int) else list(wanted)
+        if not isinstance(wanted, str | int | np.integer | list | tuple | np.ndarray):
+            raise DataError(f"{what}={wanted!r}: must be the name or position of a column, a list of these, or a mapping "
+                            "{channel name: column}.")
+        several = [wanted] if isinstance(wanted, str | int | np.integer) else list(wanted)
         columns = [column_name(known, column, label) for column in several]
         pairs = {c: c for c in columns}
         if len(pairs) < len(columns):
