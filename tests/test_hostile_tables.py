@@ -15,12 +15,12 @@ PIECES = [b",", b";", b"\t", b'"', b"'", b"\n", b"\r", b"\r\n", b"\0", b" ", b"-
           b"\xff", b"\xef\xbb\xbf", b"\xfe\xff", b"2024-05-01", b"24:00:00", b"99/99/9999", b"9999-12-31T23:59:59.999Z",
           b"0000-00-00", b"1" * 400, "\u0663".encode(), b"NaT", b"time", b"t,t", b"sep=", b"***End_of_Header***\n"]
 
-VALUES: list[Any] = [None, True, False, 0, 1, -1, 3, 1e9, 10**30, 0.5, -0.5, float("nan"), float("inf"), "", " ", "x", ",",
-                     ";", ".", "\t", "\\t", "missing", "experiments", "1s", "-1s", "5 min", "1e400", "Europe/Berlin", "%Y",
-                     "%", "%d.%m.%Y %H:%M:%S", "%f", "utf-8", "utf-16", "latin-1", "rot13", "idna", "u", "y", "time",
-                     ["u"], ["u", "y"], ["u", "y", "time"], {"u": 1}, {"u": None}, {"y": "x"}, [None], [[1]], object(), b"x",
-                     np.arange(3), "2024-05-01", "9999-99-99", np.datetime64("2024-05-01"), np.datetime64("NaT"), "u:192",
-                     "-9999", "BAD,NO DATA", ("a", 1)]
+VALUES: list[Any] = [
+    None, True, False, 0, 1, -1, 3, 1e9, 10**30, 0.5, -0.5, float("nan"), float("inf"), "", " ", "x", ",", ";", ".", "\t",
+    "\\t", "missing", "experiments", "1s", "-1s", "5 min", "1e400", "Europe/Berlin", "%Y", "%", "%d.%m.%Y %H:%M:%S", "%f",
+    "utf-8", "utf-16", "latin-1", "rot13", "idna", "u", "y", "time", ["u"], ["u", "y"], ["u", "y", "time"], {"u": 1},
+    {"u": None}, {"y": "x"}, [None], [[1]], object(), b"x", np.arange(3), "2024-05-01", "9999-99-99",
+    np.datetime64("2024-05-01"), np.datetime64("NaT"), "u:192", "-9999", "BAD,NO DATA", ("a", 1)]
 
 
 def damaged(text: bytes, r: np.random.Generator) -> bytes:
@@ -62,14 +62,13 @@ def attempt(path, seed: int) -> str:
     path = path / f"{seed % 7}{['.csv', '.txt', '.dat', '.tsv'][r.integers(0, 4)]}"
     path.write_bytes(damaged(export.write(), r) if r.random() < 0.8 else export.write())
     words = {"inputs": export.channels[0], "outputs": export.channels[1]} | (
-        dict(export.words) if r.random() < 0.5 else {}) | (arguments(r) if r.random() < 0.6 else {})
+        dict(export.words) if r.random() < 0.7 else {}) | (arguments(r) if r.random() < 0.4 else {})
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             if r.random() < 0.8:
                 data = optid.read(path, **words)
-                assert str(data) and data.n_samples and np.isfinite(data.dt) and len(data.time if data.n_experiments == 1
-                                                                                     else data.time[0])
+                assert str(data) and data.n_samples and np.isfinite(data.dt) and len(data.to_pandas()) == len(data)
             else:
                 stream = optid.open_stream(path, **words)
                 assert sum(len(u) for u, _ in stream) > 0
@@ -84,7 +83,7 @@ def attempt(path, seed: int) -> str:
 def test_no_table_and_no_word_ends_in_a_bare_error(tmp_path, monkeypatch, small, part):
     monkeypatch.setattr("optid.data.reading.csvfile.SMALL", small)
     came = [attempt(tmp_path, seed) for seed in range(1000 * part, 1000 * part + 60)]
-    assert came.count("read") > 5 and came.count("refused") > 15
+    assert came.count("read") > 3 and came.count("refused") > 15
 
 
 @pytest.mark.slow

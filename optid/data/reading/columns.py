@@ -47,8 +47,8 @@ def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dic
         pairs = {str(name): column_name(known, column, label) for name, column in wanted.items()}
     else:
         if not isinstance(wanted, str | int | np.integer | list | tuple | np.ndarray):
-            raise DataError(f"{what}={wanted!r}: must be the name or position of a column, a list of these, or a mapping "
-                            "{channel name: column}.")
+            raise DataError(f"{what}={wanted!r}: must be the name or position of a column, a list of these, or a "
+                            "mapping {channel name: column}.")
         several = [wanted] if isinstance(wanted, str | int | np.integer) else list(wanted)
         columns = [column_name(known, column, label) for column in several]
         pairs = {c: c for c in columns}
