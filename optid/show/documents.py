@@ -94,14 +94,17 @@ def _model(fit: "Fit") -> list[Any]:
 def record_document(data: Data, *, command: str = "") -> Document:
     """Return the document of a record: what reading it found, its channels, and their course."""
     raw = data.raw()
-    drawn = [chart for k in range(min(raw.n_experiments, charts.MOST_EXPERIMENTS))
-             for chart in charts.time_charts(raw, k, [], f"time{k}")]
+
+    def drawn() -> list[Any]:
+        return [Charts([chart for k in range(min(raw.n_experiments, charts.MOST_EXPERIMENTS))
+                        for chart in charts.time_charts(raw, k, [], f"time{k}")], wide=True)]
+
     channels = f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"
     lead = " · ".join([_length(data), f"every {data.interval}", channels])
     return Document(data.name or "Record", lead, [
         *([Section("findings", "Findings", [Notes(data.findings)])] if data.findings else []),
-        Section("channels", "Channels", [summary.channel_table(data)]),
-        Section("figures", "Figures", [Charts(drawn, wide=True)], page_only=True),
+        Section("channels", "Channels", lambda: [summary.channel_table(data)]),
+        Section("figures", "Figures", drawn, page_only=True),
         *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
     ])
 
