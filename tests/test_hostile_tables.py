@@ -20,7 +20,8 @@ VALUES: list[Any] = [
     "\t", "\\t", "missing", "experiments", "1s", "-1s", "5 min", "1e400", "Europe/Berlin", "%Y", "%",
     "%d.%m.%Y %H:%M:%S", "%f", "utf-8", "utf-16", "latin-1", "rot13", "idna", "u", "y", "time", ["u"],
     ["u", "y"], ["u", "y", "time"], {"u": 1}, {"u": None}, {"y": "x"}, [None], [[1]], object(), b"x", np.arange(3),
-    "2024-05-01", "9999-99-99", np.datetime64("2024-05-01"), np.datetime64("NaT"), "u:192", "-9999", "BAD,NO DATA", ("a", 1)]
+    "2024-05-01", "9999-99-99", np.datetime64("2024-05-01"), np.datetime64("NaT"), "u:192", "-9999", "BAD,NO DATA",
+    ("a", 1)]
 
 
 def damaged(text: bytes, r: np.random.Generator) -> bytes:
