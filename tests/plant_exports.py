@@ -204,7 +204,7 @@ EXPORTS = (
            refusal="separator of thousands", words={"thousands": ","}, scale=1000.0),
     Export("long.csv", "one row for each tag", _long, channels=("VALVE", "LEVEL"), refusal="is a long table"),
     Export("quality.csv", "columns of quality; frozen samples", _quality, dt=1.0,
-           words={"quality": "OP.Q:192 PV.Q:192"}, channels=("OP", "PV"), missing=20),
+           words={"quality": "OP.Q:192,PV.Q:192"}, channels=("OP", "PV"), missing=20),
     Export("offsets.csv", "the end of summer time, with offsets", lambda: table(_local(True)), dt=300.0,
            finding="dates with an offset, shown in UTC"),
     Export("summer_ends.csv", "the end of summer time, without offsets", lambda: table(_local(False)), dt=300.0,

@@ -73,7 +73,7 @@ def test_a_mark_of_missing_samples_is_told(tmp_path):
 def test_the_command_reads_the_same(export, tmp_path):
     words = ["look", export.file(tmp_path), "--inputs", export.channels[0], "--outputs", export.channels[1]]
     for word, value in export.words.items():
-        words += [option_of(word), *(value.split() if word == "quality" else [value])]
+        words += [option_of(word), value]
     result = CliRunner().invoke(app, list(map(str, words)))
     assert result.exit_code == 0, result.output
     read = optid.read(tmp_path / export.name, *export.channels, **export.words)
@@ -132,8 +132,7 @@ def outcome(export: Export, folder: Path) -> str:
     except DataError as error:
         assert export.refusal in str(error)
         default = f"refused: {export.refusal}"
-    words = " ".join(f"`{option_of(word)} {shlex.quote(str(value))}`" if word != "quality" else f"`--quality {value}`"
-                     for word, value in export.words.items())
+    words = " ".join(f"`{option_of(word)} {shlex.quote(str(value))}`" for word, value in export.words.items())
     return f"| {export.about} | {default} | {words or '–'} |"
 
 

@@ -1,8 +1,10 @@
 """From files, frames and dictionaries to `Data`."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading import columns as known
 from optid.data.reading import long_tables
-from optid.data.reading.clock import Clock, clock_columns, seconds
+from optid.data.reading.clock import Clock, clock_columns, clock_values, seconds
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.rival_clocks import settle
@@ -60,6 +62,8 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     """
     how = Format.of(format, words)
     dt = None if dt is None else sampling_time(dt)
+    if name is not None and not isinstance(name, str):
+        raise DataError(f"name={name!r}: must be a text.")
     sources = list(source) if isinstance(source, list | tuple) else [source]
     if not sources:
         raise DataError("the list of sources is empty; give at least one.")
@@ -69,6 +73,11 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     for run in runs:
         if run.names != runs[0].names:
             raise DataError(f"{run.label} has channels {run.names}, {runs[0].label} has {runs[0].names}.")
+        for channel in (name for name in run.units if run.units[name] != runs[0].units.get(name, "")):
+            if run.units[channel] and runs[0].units.get(channel) and not (how.input_units or how.output_units):
+                raise DataError(f"{run.label} has channel {channel!r} in {run.units[channel]}, {runs[0].label} in "
+                                f"{runs[0].units[channel]}. Convert one file, or give the units, input_units= and "
+                                "output_units=.")
     runs, joined = _continued(runs, how) if experiment is None and len(sources) > 1 else (runs, [])
     runs = _between(runs, how, dt)
     experiments, step, findings = _sampled(runs, how, dt)
@@ -101,6 +110,10 @@ class _Run:
     units: Mapping[str, str]
     step: float | None  # sampling time that the source states
     findings: tuple[str, ...]
+
+    @property
+    def has_offset(self) -> bool:
+        return self.clock is not None and any("%z" in form for form in self.clock.forms)
 
     @property
     def is_dated(self) -> bool:
@@ -148,6 +161,8 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
     wanted = list(dict.fromkeys([*signals, *others, *unused]))
     loaded = table.load(wanted, dict.fromkeys([*others, *unused], "clock") | ({group: "text"} if group else {}))
     findings = [*table.findings]
+    loaded |= {name: clock_values(loaded[name], f"{label}, column {name!r}") for name in clocks
+               if isinstance(loaded[name], np.ndarray | list)}
     clock, stamps, said = _clock(table, loaded, clocks, time)
     findings += said
     groups = None if group is None else np.ravel(loaded[group])
@@ -181,11 +196,10 @@ def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time:
     try:
         clock, stamps, said = settle(loaded, clocks, table, asked=time is not None and time is not True)
     except DataError as error:
-        if table.advice and "pass " not in str(error).lower():
-            raise DataError(f"{error} Pass {table.advice}.") from None
-        if table.advice and "date_format=" in str(error) and "date_format=" in table.advice:
-            raise DataError(f"{str(error).partition(' Pass ')[0]} Pass {table.advice}.") from None
-        raise
+        if not table.advice:
+            raise
+        cause = re.split(r" Pass | Name their format", str(error))[0]
+        raise DataError(f"{cause} Pass {table.advice}.") from None
     return clock, stamps, said
 
 
@@ -209,7 +223,7 @@ def _stacked(pairs: dict[str, str], loaded: dict[str, Any], table: Table, qualit
     uses = Counter(pairs.values())
     for name, column in pairs.items():
         part = as_samples(loaded[column], f"{label}, column {column!r}")
-        for guard in (guard for guard, signal in quality.items() if signal == column):
+        for guard in (guard for guard, signal in quality.items() if signal in (column, "")):
             part = np.where(good[guard][:, None], part, np.nan)
         parts.append(part)
         names += [name] if part.shape[1] == 1 else [f"{name}{c + 1}" for c in range(part.shape[1])]
@@ -233,10 +247,12 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
         raise DataError(f"{label}: row {keys.index('') + 1} does not say which experiment it belongs to.")
     starts = [0] + [k for k in range(1, rows) if keys[k] != keys[k - 1]]
     labels = [keys[k] for k in starts]
+    seen: set[str] = set()
     for k, value in enumerate(labels):
-        if value in labels[:k]:
+        if value in seen:
             raise DataError(f"{label}: experiment {value!r} starts again at row {starts[k] + 1}. Sort the rows by "
                             "experiment, or give the second run a value of its own.")
+        seen.add(value)
     return [(value, slice(a, b)) for value, a, b in zip(labels, starts, [*starts[1:], rows])]
 
 
@@ -253,6 +269,9 @@ def _continued(runs: list[_Run], how: Format) -> tuple[list[_Run], list[str]]:
     found = [runs[0]]
     for run in runs[1:]:
         last = found[-1]
+        if last.stamps is not None and run.stamps is not None and last.is_dated and run.is_dated and (
+                run.stamps[0] <= last.stamps[-1]):
+            findings.append(f"{run.label} overlaps {last.label.rpartition(' + ')[2]} in time")
         if _follows(last, run, how):
             findings.append(f"{run.label} continues {last.label.rpartition(' + ')[2]}")
             assert last.stamps is not None and run.stamps is not None
@@ -268,6 +287,8 @@ def _continued(runs: list[_Run], how: Format) -> tuple[list[_Run], list[str]]:
 
 def _follows(last: _Run, run: _Run, how: Format) -> bool:
     if last.stamps is None or run.stamps is None or last.stamps.dtype != run.stamps.dtype or last.stamps.size < 2:
+        return False
+    if last.has_offset != run.has_offset:
         return False
     border = float(seconds(run.stamps[:1] - last.stamps[-1:])[0])
     median = float(np.median(seconds(np.diff(last.stamps))))
@@ -300,8 +321,15 @@ def _between(runs: list[_Run], how: Format, dt: float | None) -> list[_Run]:
 def _instant(value: Any, name: str, stamps: np.ndarray, clock: Clock | None) -> Any:
     """Return an instant in the type of some stamps."""
     try:
+        if isinstance(value, bool):
+            raise ValueError
         if stamps.dtype.kind == "M":
-            date = np.datetime64(value).astype("M8[ns]")
+            date = np.datetime64(value).astype("M8[ns]") if not isinstance(value, str | datetime) else None
+            if date is None:
+                moment = value if isinstance(value, datetime) else datetime.fromisoformat(value.strip())
+                if moment.tzinfo is not None:
+                    return np.datetime64(moment.astimezone(UTC).replace(tzinfo=None), "ns")
+                date = np.datetime64(moment, "ns")
             if clock is not None and clock.how.time_zone is not None:
                 from optid.data.reading.dates import to_utc
 

@@ -2,20 +2,23 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from datetime import UTC, datetime, time, timedelta
 from typing import Any
 
 import numpy as np
 
 from optid.data.reading import dates
 from optid.data.reading.columns import column_name, listing, to_numbers
-from optid.data.reading.format import UNITS, Format, call
+from optid.data.reading.counts import COUNTS, meaning
+from optid.data.reading.format import UNITS, Format
 from optid.errors import DataError
 
 NAMES = frozenset({
     "t", "ts", "time", "timestamp", "timestamps", "datetime", "date", "dates", "clock", "utc", "timeutc", "utctime",
     "datetimeutc", "localtime", "sampletime", "elapsed", "elapsedtime", "reltime", "relativetime", "abstime",
-    "absolutetime", "seconds", "sec", "secs", "epoch", "unixtime", "xvalue",
+    "absolutetime", "seconds", "sec", "secs", "epoch", "unixtime", "xvalue", "tstamp", "datetimestamp", "recordtime",
+    "uptime", "runtime", "laufzeit", "secondselapsed", "mjd", "jd", "juliandate", "filetime", "ticks", "timems",
     "zeit", "zeitstempel", "datum", "uhrzeit", "datumuhrzeit", "datumzeit",
     "temps", "horodatage", "heure", "tiempo", "fecha", "fechahora", "hora", "tempo", "tijd", "tijdstip", "tid",
 })
@@ -26,20 +29,18 @@ _STEPS = ("ts", "dt", "sampletime", "samplingtime", "sampleperiod", "samplingper
 _RATES = ("fs", "samplerate", "samplingrate", "samplingfrequency", "samplefrequency")
 """Names of a single number beside the samples: the sampling time, and the sampling rate."""
 
-_UNIT_WORDS = {"s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s", "sekunden": "s",
-               "ms": "ms", "msec": "ms", "millis": "ms", "milliseconds": "ms", "us": "us", "µs": "us", "μs": "us",
-               "usec": "us", "microseconds": "us", "ns": "ns", "nanoseconds": "ns", "min": "min", "mins": "min",
-               "minutes": "min", "minuten": "min", "h": "h", "hr": "h", "hrs": "h", "hour": "h", "hours": "h",
-               "stunden": "h", "d": "d", "day": "d", "days": "d", "tage": "d"}
+_UNIT_WORDS = {word: unit for unit, words in {
+    "s": "s sec secs second seconds sek sekunden", "ms": "ms msec msecs millis millisecond milliseconds",
+    "us": "us µs μs usec usecs µsec μsec microsecond microseconds", "ns": "ns nsec nanosecond nanoseconds",
+    "min": "min mins minute minutes minuten", "h": "h hr hrs hour hours stunden", "d": "d day days tage",
+}.items() for word in words.split()}
+
+_ZONE_WORDS = ("utc", "gmt", "local", "lokal", "cet", "cest", "est", "edt", "pst", "pdt", "relative", "abs", "absolute")
+_SINCE = re.compile(r"([a-zµ]+) since (.+)")
+_OF_SIGNAL = re.compile(r"(.*?)[ ._]*\d+")
 
 _BRACKETS = re.compile(r"(.*?)[ _]*[\[({<]([^\])}>]*)[\])}>]\s*")
-_SUFFIX = re.compile(r"(.*?)(?:[ _.]*/[ _]*| in |[ _.])([a-zµμ]+)")
-
-_EPOCH = (9.4e8, 4.2e9)  # seconds since 1970 of the years 1999 to 2103
-_SERIAL = {"days since 1899-12-30, as of Excel": 25569.0, "days since year 0, as of MATLAB": 719529.0}
-"""Numbers of 1970-01-01 in counts of days."""
-_SERIAL_SPAN = (10957.0, 47482.0)  # days since 1970 of the years 2000 to 2100
-
+_SUFFIX = re.compile(r"(.*?)(?:[ _.]*/[ _]*| in |[ _.,-]+)([a-zµμ]+)")
 
 class NoStamps(DataError):
     """A column named as a clock holds something else."""
@@ -51,7 +52,8 @@ class Clock:
 
     Attributes:
         columns: the column, or those of the date and of the time of day.
-        kind: "numbers", "dates" (text), "times of day" (text) or "ready" (dates or durations already).
+        kind: "numbers", "digits" (numbers that spell dates), "dates" (text), "times of day" (text) or "ready" (dates or
+            durations already).
         scale: seconds in a unit of numbers.
         origin: number of 1970-01-01; None where the numbers count from an unknown instant.
         forms: format of each column of text.
@@ -73,11 +75,16 @@ class Clock:
         `DataError` for text that is no stamp like the others, with its row.
         """
         where = f"{label}, column {self.columns[0]!r}"
-        if self.forms:
+        if self.forms and self.kind != "digits":
             return self._of_texts(block, label, where)
         values = np.ravel(block[self.columns[0]])
+        if self.kind == "digits":
+            width = len(datetime(2024, 1, 1).strftime(self.forms[0]))
+            texts = ["" if value != value else f"{value:0{width}.0f}" for value in values.astype(float).tolist()]
+            stamps = dates.parse(texts, self.forms[0], where)[0]
+            return self._in_utc(stamps, where) if dates.has_day(self.forms[0]) else stamps.view("m8[ns]")
         if self.kind == "ready":
-            stamps = values.astype(f"{values.dtype.kind}8[ns]")
+            stamps = dates.in_nanoseconds(values, where)
             return self._in_utc(stamps, where) if values.dtype.kind == "M" else stamps
         return self._of_numbers(values, where)
 
@@ -99,16 +106,37 @@ class Clock:
             raise DataError(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
         if self.origin is None:
             return values.astype(np.float64) if self.scale == 1.0 else values * self.scale
-        if values.dtype.kind in "iu" and self.scale <= 1.0:
-            return (values.astype(np.int64) * round(self.scale * 1e9)).view("M8[ns]")
+        if values.dtype.kind in "iu" and 1e-9 <= self.scale <= 1.0 and self.origin == round(self.origin):
+            return ((values.astype(np.int64) - round(self.origin)) * round(self.scale * 1e9)).view("M8[ns]")
         lost = np.isnan(values)
         nanoseconds = np.round((np.where(lost, self.origin, values) - self.origin) * (self.scale * 1e9) / 1000) * 1000
         stamps = nanoseconds.astype(np.int64).view("M8[ns]")
         stamps[lost] = np.datetime64("NaT")
-        return stamps
+        return self._in_utc(stamps, where) if self.scale == 86400.0 else stamps
 
     def _in_utc(self, stamps: np.ndarray, where: str) -> np.ndarray:
         return stamps if self.how.time_zone is None else dates.to_utc(stamps, self.how.time_zone, where)
+
+
+def clock_values(values: Any, label: str) -> np.ndarray:
+    """Return the values of a clock (N,) as numbers, dates or texts; dates of Python, with their offset, become UTC."""
+    array = np.ravel(values)
+    if array.dtype.kind != "O" or any(isinstance(cell, str) for cell in array.tolist()):
+        return array
+    found = []
+    for cell in array.tolist():
+        if isinstance(cell, datetime) and cell.tzinfo is not None:
+            cell = cell.astimezone(UTC).replace(tzinfo=None)
+        if isinstance(cell, time):
+            cell = timedelta(hours=cell.hour, minutes=cell.minute, seconds=cell.second, microseconds=cell.microsecond)
+        found.append(cell)
+    for kind in ("M8[us]", "m8[us]", "f8"):
+        try:
+            if kind == "f8" or not any(isinstance(cell, int | float) for cell in found):
+                return np.array(found, dtype=kind)
+        except (ValueError, TypeError, OverflowError):
+            continue
+    raise NoStamps(f"{label}: the stamps (first: {array[0]!r}) are no numbers, dates or texts; convert them first.")
 
 
 def seconds(stamps: np.ndarray) -> np.ndarray:
@@ -119,6 +147,15 @@ def seconds(stamps: np.ndarray) -> np.ndarray:
 def is_time_name(name: str) -> bool:
     """Whether a column is named as a clock, with or without a unit."""
     return _plain(_parts(name)[0]) in NAMES or _plain(name) in NAMES
+
+
+def is_rival_name(name: str, signals: Sequence[str]) -> bool:
+    """Whether a column is named as another clock: "Timestamp.1", "Time (s)_2", or after a signal, "Time flow"."""
+    numbered = _OF_SIGNAL.fullmatch(name)
+    words = name.split()
+    return bool(numbered and is_time_name(numbered[1])) or any(
+        words and is_time_name(words[0]) and name == f"{words[0]} {signal}" or name == f"{signal} {words[-1]}"
+        and is_time_name(words[-1]) for signal in signals if words)
 
 
 def is_step_name(name: str) -> bool:
@@ -150,11 +187,14 @@ def clock_columns(known: Sequence[str], time: Any, taken: Sequence[str], label: 
         return []
     if time is not None and time is not True:
         several = time if isinstance(time, list | tuple) else [time]
+        if not several or not all(isinstance(one, str | int) and not isinstance(one, bool) for one in several):
+            raise DataError(f"time={time!r}: must be the name or position of a column, or two of a date and a time of "
+                            "day; False ignores the clock.")
         return [one if one == index else column_name(known, one, label) for one in several]
     named = [c for c in known if c not in taken and is_time_name(c)]
+    named += [c for c in known if c not in taken and c not in named and is_rival_name(c, taken)]
     named += [index] if index is not None and index not in taken and index not in named else []
-    free = [c for c in dated if c not in taken]
-    found = named or free
+    found = named + [c for c in dated if c not in taken and c not in named]
     if time and not found:
         raise DataError(f"{label} has no column t or time. {listing(known)}")
     return found
@@ -179,14 +219,18 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     if head.dtype.kind in "Mm":
         return Clock((name,), "ready", how)
     if head.dtype.kind in "UO":
-        values, row = to_numbers(head.astype(str).tolist(), how)
-        if row is not None:
+        cells = ["" if cell is None else str(cell) for cell in head.tolist()]
+        values, row = to_numbers(cells, how)
+        if row is not None and row > len(cells) // 2:
+            raise NoStamps(f"{where}: row {row + 1} holds {cells[row]!r}, no number like the others. Remove the row, "
+                           "or pass time=False and dt=.")
+        if row is not None or (how.date_format and how.date_format not in COUNTS):
             return _of_texts(block, columns, how, label)
     else:
         values = np.ravel(block[name])
     if values.dtype.kind not in "iuf":
         raise NoStamps(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
-    return _of_numbers(values, name, how, unit)
+    return _of_numbers(values, name, how, unit, where)
 
 
 def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str) -> Clock:
@@ -194,56 +238,60 @@ def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     for name in columns:
         cells = np.ravel(block[name][:200]).astype(str)
         full = [cell for cell in cells.tolist() if not how.is_missing(cell) and cell.strip().lower() != "nat"]
-        found = [how.date_format] if how.date_format and not dates.is_time_of_day(full[0] if full else "") else \
-            dates.agreed_format(full)
+        first = full[0] if full else ""
+        given = how.date_format
+        if given and dates.has_day(given) == dates.is_time_of_day(first):
+            given = None  # it is the format of the other column
+        if given is None and "mm:ss" in name.lower().replace(" ", "") and re.fullmatch(r"\d+:\d\d", first):
+            given = "%M:%S"
+        found = [given] if given else dates.agreed_format(full)
         where = f"{label}, column {name!r}"
         if not found:
-            first = full[0] if full else ""
             odd = next((cell for cell in full if dates.formats(first) and not dates.formats(cell)), None)
             what = f"(first: {first!r})" if odd is None else f"(first: {first!r}; then {odd!r})"
             raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as "
                            "2024-05-01T12:00:00. Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to "
                            "seconds, or pass time=False and dt=.")
-        if not how.date_format and not dates.is_unambiguous(found[0]):
-            other = f" (or {found[1]!r} where the day comes first)" if len(found) > 1 else ""
-            raise DataError(f"{where}: the dates (first: {full[0]!r}) do not begin with the year. Pass "
-                            f"{call({'date_format': found[0]})}{other}.")
+        if not given and not dates.is_unambiguous(found[0]):
+            raise DataError(f"{where}: the dates (first: {first!r}) do not begin with the year. Pass "
+                            f"{dates.choices(found)}.")
         forms.append(found[0])
-    dated = any("%d" in form or "%j" in form for form in forms)
+    dated = any(map(dates.has_day, forms))
     finding = f"clock {columns[0]!r}: dates with an offset, shown in UTC" if "%z" in forms[0] else ""
+    if forms[-1] in ("%H:%M", "%M:%S"):
+        finding = f"clock {columns[-1]!r}: read as {'hours:minutes' if forms[-1] == '%H:%M' else 'minutes:seconds'}"
     return Clock(tuple(columns), "dates" if dated else "times of day", how, forms=tuple(forms), finding=finding)
 
 
-def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str) -> Clock:
-    """Return the clock of numbers: seconds or the unit that is named, since 1970, or days as of Excel and MATLAB."""
+def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str, where: str) -> Clock:
+    """Return the clock of numbers: a count of time, or dates in digits where the user says so."""
+    if how.date_format and how.date_format not in COUNTS:
+        return Clock((name,), "digits", how, forms=(how.date_format,))
     base, word = _parts(name)
-    word = word or _UNIT_WORDS.get(unit.strip().lower().strip("[]()"), "")
-    clock = Clock((name,), "numbers", how, UNITS.get(word, 1.0))
+    stated = _UNIT_WORDS.get(unit.strip().lower().strip("[]()"), "")
+    if word and stated and word != stated:
+        raise DataError(f"{where}: its name says {word}, its unit {stated}. Correct one, or pass time=False and dt=.")
     finite = values[np.isfinite(values.astype(float))]
     if not finite.size:
-        return clock
-    first, step = float(finite[0]), _mean_step(finite)
-    for one in (word,) if word else ("s", "ms", "us", "ns"):
-        if _EPOCH[0] <= first * UNITS[one] <= _EPOCH[1] and (one != "s" or _is_round(step, 2) or step < 1):
-            called = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}.get(one, one)
-            return replace(clock, scale=UNITS[one], origin=0.0, finding=f"clock {name!r}: {called} since 1970 (UTC)")
-    for called, zero in {} if word not in ("", "d") else _SERIAL.items():
-        days = first - zero
-        serial = not _is_round(step, 2) and _is_round(step * 86400, 3)
-        if _SERIAL_SPAN[0] <= days <= _SERIAL_SPAN[1] and (serial or _plain(base) in ("date", "datum", "fecha")):
-            return replace(clock, scale=86400.0, origin=zero, finding=f"clock {name!r}: {called}")
-    if word and word != "s":
-        return replace(clock, finding=f"clock {name!r}: in {word}, read as seconds")
-    return clock
+        return Clock((name,), "numbers", how)
+    since = _SINCE.fullmatch(unit.strip().lower())
+    if since and since[1] in _UNIT_WORDS:
+        scale = UNITS[_UNIT_WORDS[since[1]]]
+        start = dates.instant(since[2])
+        if start is not None:
+            return Clock((name,), "numbers", how, scale, -start / scale, finding=f"clock {name!r}: {unit}")
+    found = meaning(finite, name, _plain(base), word or stated, how.date_format, where)
+    finding, unknown = found.finding, _unknown_unit(name)
+    if not finding and unknown and not stated:
+        finding = f"clock {name!r}: the unit {unknown!r} is not known; read as seconds"
+    return Clock((name,), "numbers", how, found.scale, found.origin, finding=finding)
 
 
-def _mean_step(values: np.ndarray) -> float:
-    return abs(float(values[-1]) - float(values[0])) / (values.size - 1) if values.size > 1 else 0.0
-
-
-def _is_round(step: float, digits: int) -> bool:
-    """Whether a step has so few digits, up to the rounding of its stamps."""
-    return step > 0 and abs(float(f"{step:.{digits}g}") / step - 1) < 1e-3
+def _unknown_unit(name: str) -> str:
+    """Return what stands in brackets behind a name, unless it is a unit of time or a time zone."""
+    found = _BRACKETS.fullmatch(name.strip())
+    text = found[2].strip() if found else ""
+    return "" if text.lower() in (*_UNIT_WORDS, *_ZONE_WORDS) or "/" in text else text
 
 
 def _parts(name: str) -> tuple[str, str]:

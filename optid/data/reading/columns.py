@@ -15,15 +15,22 @@ Wanted = str | int | Sequence[str | int] | Mapping[str, str | int] | None
 
 MOST_LISTED = 40  # columns that a message lists
 
-MARKS = {sign * value for value in (99.0, 999.0, 9999.0, 99999.0, 999999.0, 999.25, 999.99, 32767.0, 32768.0, 65535.0,
-                                    1e10, 1e20, 1e30, 1e35, 1e36, 9.96921e36, 1e37, 3.4028234663852886e38)
-         for sign in (1, -1)}
+MARKS = {sign * value for sign in (1, -1) for value in (
+    99.0, 999.0, 9999.0, 99999.0, 999999.0, 999.25, 999.99, 32767.0, 32768.0, 65535.0, 1e10, 1e20, 1e30, 1e35, 1e36,
+    9.96921e36, 1e37, 9.9e37, 9.91e37, 3.4028234663852886e38)}
 """Numbers that loggers write where they have no sample."""
+
+_SWITCH = frozenset("on off true false yes no open closed ein aus ja nein auf zu start stop running stopped".split())
 
 FAR = 5.0  # times their range beyond which such a number is far from the others
 
-_QUALITY = re.compile(r"[ ._:/-]*\(?(q|qual|qua|quality|status|state|sts|stat|qc|good|valid|flag)\)?", re.IGNORECASE)
+_QUALITY = re.compile(
+    r"[ ._:/-]*\(?(q|qual|qua|quality|status|state|sts|stat|qc|good|valid|flag|ok|bad|conf|confidence)\)?",
+    re.IGNORECASE)
 """What the name of a column of quality adds to that of its channel."""
+
+_ALL = re.compile(r"(opc)?(quality|status|confidence|validity)", re.IGNORECASE)
+"""Names of a column of quality of the whole row."""
 
 
 def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dict[str, str]:
@@ -89,25 +96,23 @@ def listing(known: Sequence[str]) -> str:
 
 
 def quality_columns(known: Sequence[str], signals: Iterable[str]) -> dict[str, str]:
-    """Return {column of quality: column of samples} by the names of the columns."""
-    found = {}
-    for signal in signals:
-        for name in known:
-            if name != signal and name.startswith(signal) and _QUALITY.fullmatch(name[len(signal) :]):
-                found[name] = signal
+    """Return {column of quality: column of samples, "" for all} by the names of the columns."""
+    found, signals = {}, list(signals)
+    for name in known:
+        guarded = [signal for signal in signals if name.startswith(signal) and _QUALITY.fullmatch(name[len(signal) :])
+                   or name.endswith(signal) and _QUALITY.fullmatch(name[: len(name) - len(signal)].strip(" ._:/-"))]
+        if name not in signals and (guarded or _ALL.fullmatch(name)):
+            found[name] = max(guarded, key=len) if guarded else ""
     return found
 
 
 def guarded(quality: Mapping[str, str], known: Sequence[str], signals: Sequence[str], label: str) -> dict[str, str]:
-    """Return {column of quality: column of samples} for the columns of quality that the user names (`DataError`)."""
+    """Return {column of quality: column of samples, "" for all} for those that the user names (`DataError`)."""
     found, named = {}, quality_columns(known, signals)
     for column in quality:
         name = column_name(known, column, label)
-        likely = [signal for signal in signals if name.startswith(signal)] or list(signals) * (len(signals) == 1)
-        if name not in named and not likely:
-            raise DataError(f"{label}: the name of the column of quality {name!r} does not begin with that of an input "
-                            f"or output ({', '.join(signals)}): rename it, such as '{signals[0]}.Q'.")
-        found[name] = named.get(name) or max(likely, key=len)
+        likely = [signal for signal in signals if name.startswith(signal)]
+        found[name] = named[name] if name in named else max(likely, key=len, default="")
     return found
 
 
@@ -117,24 +122,32 @@ def unused_quality(names: Sequence[str], loaded: Mapping[str, Any]) -> str:
     for name in names:
         cells = np.ravel(loaded[name]).astype(str)
         values, counts = np.unique(cells, return_counts=True)
-        usual = str(values[np.argmax(counts)]).removesuffix(".0")
-        words.append(f"{name}:{usual}")
-        bad += cells.size - int(counts.max())
-    return (f"columns of quality are not used: {', '.join(names)} ({bad} cells differ from the usual one). Pass "
-            f"quality={' '.join(words)!r} to count such samples as missing")
+        usual = [str(value).removesuffix(".0") for value in values[np.argsort(-counts)]]
+        opc = [value for value in usual if is_number(value) and 192 <= float(value) <= 255]  # good, as OPC has it
+        good = opc if opc else usual[:1]
+        words.append(f"{name}:{'|'.join(good)}")
+        bad += cells.size - int(sum(count for value, count in zip(values, counts)
+                                    if str(value).removesuffix(".0") in good))
+    return (f"columns of quality are not used: {', '.join(names)} ({bad} cells differ from the usual ones). Pass "
+            f"quality={','.join(words)!r} to count such samples as missing")
 
 
 def is_good(values: Any, good: str, where: str) -> np.ndarray:
     """Return which samples (N,) a column of quality marks as good: those equal to a value, as a number or as text."""
-    array = np.asarray(values)
-    if array.dtype.kind in "iufb":
-        if not is_number(good):
-            raise DataError(f"{where} holds numbers, and {good!r} is none.")
-        return array == float(good)
-    text = np.char.strip(array.astype(str))
-    if is_number(good):
-        return np.array([is_number(cell) and float(cell) == float(good) for cell in text.tolist()], dtype=bool)
-    return np.char.lower(text) == good.lower()
+    array, found = np.asarray(values), None
+    for one in good.split("|"):
+        if array.dtype.kind in "iufb":
+            if not is_number(one):
+                raise DataError(f"{where} holds numbers, and {one!r} is none.")
+            same = array == float(one)
+        else:
+            text = np.char.strip(array.astype(str))
+            same = np.char.lower(text) == one.lower()
+            if is_number(one):
+                same = np.array([is_number(cell) and float(cell) == float(one) for cell in text.tolist()], dtype=bool)
+        found = same if found is None else found | same
+    assert found is not None
+    return found
 
 
 # -- cells
@@ -193,6 +206,10 @@ def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str
         row: the cells of its row, that of the clock among them.
     """
     text, words = cell.strip(), dict[str, Any]()
+    if text.lower() in _SWITCH:
+        return DataError(f"{where} holds {cell!r}, not a number. Write 0 and 1 in place of words for off and on.")
+    if re.fullmatch(r"[+-]?[\d.,]+ *[A-Za-z%°µΩ/]+", text) and not re.fullmatch(r"[+-]?[\d.,]+ *[eEdD][+-]?\d*", text):
+        return DataError(f"{where} holds {cell!r}, a number with its unit. Remove the unit from the cells.")
     if row and all(one.strip() and not any(sign.isdigit() for sign in one) for one in row) and len(row) > 2:
         return DataError(f"{where} holds {cell!r}, not a number. The whole row is text ({', '.join(row)[:60]}): a row "
                          "of units or another header inside the table; remove it.")
@@ -210,6 +227,8 @@ def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str
         hint = "It seems to have a separator of thousands"
         if words["thousands"] == how.decimal:
             words = {"decimal": ",", "thousands": "."}
+        if "decimal=" in advice or "thousands=" in advice:
+            words = {}
     elif how.decimal == "." and re.fullmatch(r"[+-]?\d*,\d+([eE][+-]?\d+)?", text):
         hint, words["decimal"] = "It seems to be a number with a decimal comma", ","
     else:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ _DAY = re.compile(
 _HOUR = re.compile(r"(?P<gap>T| +|^)(?P<hour>\d{1,2}:\d\d|\d{4}(?=\d\d|\b))(?P<second>:?\d\d)?(?P<part>[.,:]\d+)?"
                    r"(?P<half> ?[AaPp][Mm])?")
 _ZONE = re.compile(r" ?(?P<zone>Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)")
+SECONDS = 9_200_000_000  # from 1970 to the ends of what nanoseconds in 64 bits hold
 _BLANK = ["", "nan", "na", "n/a", "null", "none", "nat"]
 _TIME_OF_DAY = re.compile(r"\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?")
 
@@ -37,12 +39,13 @@ def formats(cell: str) -> list[str]:
     day = _DAY.match(text)
     rest = text[day.end() :] if day else text
     clock = _HOUR.match(rest)
-    if clock is not None and ((day is None) == bool(clock["gap"]) or (clock["part"] and not clock["second"])):
+    if clock is not None and ((day is None) == bool(clock["gap"]) or (clock["part"] and not clock["second"])
+                              or (day is None and ":" not in clock["hour"])):
         clock = None
     after = "" if clock is None else _format_of_hour(clock)
     rest = rest[clock.end() :] if clock else rest
     zone = _ZONE.fullmatch(rest)
-    if (day is None and clock is None) or (rest and (zone is None or clock is None)):
+    if (day is None and clock is None) or (rest and (zone is None or clock is None or day is None)):
         return []
     after += "" if zone is None else rest[: zone.start("zone")] + "%z"
     return [one + after for one in ([""] if day is None else _formats_of_day(day))]
@@ -70,10 +73,12 @@ def parse(text: Any, form: str, label: str) -> tuple[np.ndarray, bool]:
 
     raw = pl.Series("", text, dtype=pl.String)
     chrono, series = _as_chrono(form, raw)
-    if not any(code in form for code in ("%Y", "%y", "%d", "%j")):
-        series, chrono = "1970-01-01 " + series, "%Y-%m-%d " + chrono
     if not any(code in form for code in ("%H", "%I")):
-        series, chrono = series + " 00:00", chrono + " %H:%M"
+        whole = "%M" not in form  # of minutes and seconds the hour is zero
+        series = series + " 00:00" if whole else "00 " + series
+        chrono = chrono + " %H:%M" if whole else "%H " + chrono
+    if not has_day(form):
+        series, chrono = "1970-01-01 " + series, "%Y-%m-%d " + chrono
     fraction = re.search(r"\.(\d{3}|\d{6}|\d{9})(?!\d)", str(series[0]) if len(series) else "")
     usual = chrono.replace("%.f", f".%{len(fraction[1])}f" if fraction else "")  # polars reads it four times as fast
     how: Any = {"time_unit": "ns", "strict": False, "cache": False}  # stamps hardly repeat
@@ -88,11 +93,20 @@ def parse(text: Any, form: str, label: str) -> tuple[np.ndarray, bool]:
         if (stripped != raw).any():  # blanks around dates are rare, and costly to look for
             return parse(stripped, form, label)
         bad = found.is_null() & ~raw.str.to_lowercase().fill_null("").is_in(_BLANK)
+        if bad.any() and (day := re.split(r"[ T]%[HI]", form)[0]) != form:
+            # at midnight many programs write the date alone
+            midnights, _ = parse(raw.filter(bad), day, label)
+            stamps = np.array(found.dt.timestamp("ns").fill_null(np.iinfo(np.int64).min).to_numpy())
+            stamps[bad.to_numpy()] = midnights.astype(np.int64)
+            return stamps.view("M8[ns]"), "%z" in form
         if bad.any():
             row = int(bad.arg_max() or 0)
             raise DataError(f"{label}, row {row + 1}: {str(raw[row])!r} is not a date of the format {form!r} of the "
                             "other rows.")
     stamps = found.dt.timestamp("ns").fill_null(np.iinfo(np.int64).min).to_numpy().view("M8[ns]")
+    if len(raw) and "%Y" in form and not np.isnat(stamps[0]) and "%z" not in form and str(
+            np.datetime64(stamps[0], "Y")) not in str(raw[0]):  # nanoseconds in 64 bits wrap round
+        raise DataError(f"{label}, row 1: {str(raw[0])!r} is outside the years 1678 to 2261.")
     return stamps, "%z" in form
 
 
@@ -117,7 +131,7 @@ def to_utc(local: np.ndarray, zone: str, label: str) -> np.ndarray:
                         "the stamps in another zone?")
     early, late = (np.array(one.to_numpy()).view("M8[ns]") for one in (first, second))
     # Of the repeated hour, what follows a step back in local time is its second half.
-    back = np.flatnonzero(np.diff(local) < np.timedelta64(0, "ns")) + 1
+    back = np.flatnonzero(np.diff(local) <= np.timedelta64(0, "ns")) + 1
     doubtful = early != late
     for row in back[doubtful[back]] if back.size else []:
         stop = row + int(np.argmin(np.append(doubtful[row:], False)))
@@ -137,8 +151,10 @@ def _formats_of_day(day: re.Match[str]) -> list[str]:
     if day["name"]:
         return [f"%d{mark}%b{mark}{year}"]
     if mark == "." or int(first) > 12:
-        return [f"%d{mark}%m{mark}{year}"]
-    return [f"%m{mark}%d{mark}{year}"] + [f"%d{mark}%m{mark}{year}"] * (int(second) <= 12)
+        early = mark != "." and year == "%y" and int(second) <= 12
+        return [f"%d{mark}%m{mark}{year}"] * (int(first) <= 31) + [f"%y{mark}%m{mark}%d"] * early
+    found = [f"%m{mark}%d{mark}{year}"] + [f"%d{mark}%m{mark}{year}"] * (int(second) <= 12)
+    return found + [f"%y{mark}%m{mark}%d"] * (year == "%y" and int(second) <= 12)
 
 
 def _format_of_hour(clock: re.Match[str]) -> str:
@@ -169,8 +185,46 @@ def _as_chrono(form: str, series: Any) -> tuple[str, Any]:
 
 def agreed_format(cells: Sequence[str]) -> list[str]:
     """Return the formats that all of some cells may have, the likeliest first."""
-    found: list[str] = []
-    for i, cell in enumerate(cells):
+    found: list[str] | None = None
+    days: list[str] = []
+    for cell in cells:
         these = [form.replace("%S.%f", "%S") for form in formats(cell)]  # whole seconds are read with a fraction too
-        found = these if i == 0 else [form for form in found if form in these]
-    return found
+        if these and not any("%H" in form or "%I" in form for form in these):
+            days = these if not days else [form for form in days if form in these]
+            if days:  # at midnight many programs write the date alone
+                continue
+        found = these if found is None else [form for form in found if form in these]
+    if found is None:
+        return days
+    return [form for form in found if not days or re.split(r"[ T]%[HI]", form)[0] in days]
+
+
+def has_day(form: str) -> bool:
+    """Whether a format has a date, not only a time of day."""
+    return any(code in form for code in ("%d", "%j", "%m", "%b", "%B", "%y", "%Y", "%D", "%F"))
+
+
+def choices(forms: Sequence[str]) -> str:
+    """Return what to type for dates that may have several formats."""
+    others = ", ".join(map(repr, forms[1:]))
+    return f"date_format={forms[0]!r}" + (f" (or {others} where day, month and year stand otherwise)" if others else "")
+
+
+def instant(text: str) -> float | None:
+    """Return a date as seconds since 1970, UTC where it has no offset; None for other text."""
+    try:
+        found = datetime.fromisoformat(text.strip())
+    except ValueError:
+        return None
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+
+
+def in_nanoseconds(values: np.ndarray, label: str) -> np.ndarray:
+    """Return dates or durations (N,) in nanoseconds; `DataError` for years that these do not hold."""
+    kind = values.dtype.kind
+    coarse = values.astype(f"{kind}8[s]").astype(np.int64)
+    bad = (np.abs(coarse) > SECONDS) & ~np.isnat(values)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise DataError(f"{label}, row {row + 1}: {values[row]} is outside the years 1678 to 2261.")
+    return values.astype(f"{kind}8[ns]")

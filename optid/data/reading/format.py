@@ -40,7 +40,8 @@ class Format:
         skip_rows: lines to skip before the header.
         units_row: row after the header that holds the units, from 1; found when not given, 0 if there is none.
         missing: further words of missing samples, such as "BAD,-9999"; a number is compared by its value.
-        date_format: format of the time stamps, such as "%d.%m.%Y %H:%M:%S"; ISO 8601 and the like when not given.
+        date_format: format of the time stamps, such as "%d.%m.%Y %H:%M:%S", or what numbers count: unix, unix ms,
+            excel, matlab, julian, labview, ...; ISO 8601 and the like, and usual counts, when not given.
         time_zone: zone of local time stamps without an offset, such as "Europe/Berlin"; they become UTC.
         time_tolerance: largest deviation of a time step from the median step, relative to it.
         gaps: what becomes of lost rows: "missing" samples, or "experiments" that begin after them; a row that
@@ -48,7 +49,8 @@ class Format:
         resample: sampling time onto which the record is brought, in seconds or such as "1s", "5min": inputs are held,
             outputs interpolated linearly; where samples come faster, both are averaged over a sampling time.
         quality: the value of each column of quality that marks a good sample, such as {"PV.Q": 192} or
-            "OP.Q:192 PV.Q:192"; where it has another value, the samples of the column it is named after are missing.
+            "OP.Q:192,PV.Q:192|216" for two such values; where it has another value, the samples of the column that it
+            is named after are missing, of all columns where it is named after none.
         from_: time of the first sample: a date of a dated clock, else seconds.
         to: time of the last sample.
     """
@@ -162,7 +164,8 @@ def is_number(cell: str) -> bool:
 
 def duration(value: Any, name: str) -> float:
     """Return a positive duration in seconds, from a number of seconds or a text such as "5min" (`DataError`)."""
-    found = _DURATION.fullmatch(str(value).strip().lower())
+    text = str(value).strip().lower() if isinstance(value, str | int | float | np.number) else ""
+    found = _DURATION.fullmatch(text)
     unit = found[2].replace("µ", "u") or "s" if found else ""
     if isinstance(value, bool) or not found or unit not in UNITS or not is_number(found[1]):
         raise DataError(f"{name}={value!r}: must be a number of seconds, or a text such as '1s', '100ms' or '5min'.")
@@ -184,8 +187,12 @@ def _check_marks(how: Format) -> None:
     elif delimiter is not None and (not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter.isalnum()
                                     or delimiter in '"\r\n+-\0'):
         raise DataError(f"delimiter={delimiter!r}: must be one character such as ',' or ';' or a tab.")
-    if decimal not in (".", ",") or decimal == delimiter:
-        raise DataError(f"decimal={decimal!r} with delimiter={delimiter!r}: '.' or ',' and not the delimiter.")
+    if decimal not in (".", ","):
+        raise DataError(f"decimal={decimal!r}: must be '.' or ','.")
+    escaped = {"\\xa0": "\u00a0", "\\u00a0": "\u00a0", "\\u202f": "\u202f", "\\u2019": "\u2019"}
+    if thousands in escaped:  # as a shell passes it
+        thousands = escaped[thousands]
+        object.__setattr__(how, "thousands", thousands)
     if thousands is not None and (thousands not in (",", ".", " ", "'", "\u2019", "\u00a0", "\u202f")
                                   or thousands == decimal):
         raise DataError(f"thousands={thousands!r} with decimal={decimal!r}: ',', '.', a blank or an apostrophe, and "
@@ -231,7 +238,10 @@ def _qualities(given: Any) -> dict[str, str] | None:
     found = {}
     if not isinstance(given, str | list | tuple):
         raise DataError(f"quality={given!r}: must be a mapping such as {{'PV.Q': 192}}, or words such as 'PV.Q:192'.")
-    for word in given.split() if isinstance(given, str) else given:
+    if isinstance(given, str):
+        blanks = "," not in given and all(":" in part for part in given.split())
+        given = given.split() if blanks else given.split(",")
+    for word in given:
         column, colon, good = str(word).rpartition(":")
         if not (column and colon and good):
             raise DataError(f"quality={word!r}: write COLUMN:VALUE with the value of a good sample, such as "

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import check_integers
-from optid.data.reading.clock import is_time_name
+from optid.data.reading.clock import clock_values, is_time_name
 from optid.data.reading.dates import is_date
 from optid.errors import DataError
 
@@ -19,6 +19,9 @@ def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
     """
     import narwhals as nw
 
+    if hasattr(frame, "index") and getattr(getattr(frame, "columns", None), "nlevels", 1) > 1:  # of pandas
+        raise DataError(f"{label} has several rows of column names; join them first: frame.columns = ['_'.join(name) "
+                        "for name in frame.columns].")
     try:
         table = nw.from_native(frame, eager_only=True)
         names = [str(name) for name in table.columns]
@@ -86,6 +89,12 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], texts: Mapping[str
         column = table[name]
         if isinstance(column.dtype, nw.Date):
             column = column.cast(nw.Datetime("us"))
+        if isinstance(column.dtype, nw.Time):
+            loaded[name] = np.array([_since_midnight(cell) for cell in column.to_list()], dtype="m8[ns]")
+            continue
+        if isinstance(column.dtype, nw.Object | nw.Unknown) and name in texts and not _is_text(column):
+            loaded[name] = clock_values(column.to_list(), f"{label}, column {name!r}")
+            continue
         if isinstance(column.dtype, nw.String) or (isinstance(column.dtype, nw.Object) and _is_text(column)):
             loaded[name] = np.array(["" if cell is None or cell != cell else str(cell) for cell in column.to_list()],
                                     dtype=object)
@@ -103,6 +112,13 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], texts: Mapping[str
                 check_integers(column.drop_nulls().to_numpy()[:, None], [f"{label}, column {name!r}"])
             loaded[name] = column.cast(nw.Float64).to_numpy()
     return loaded
+
+
+def _since_midnight(cell: Any) -> np.timedelta64:
+    if cell is None:
+        return np.timedelta64("NaT")
+    seconds = 3600 * cell.hour + 60 * cell.minute + cell.second
+    return np.timedelta64((10**6 * seconds + cell.microsecond) * 1000, "ns")
 
 
 def _is_text(column: Any) -> bool:

@@ -83,7 +83,7 @@ def find_layout(path: Path, how: Format) -> Layout:
     start = sum(map(len, lines[:first]))
     usual = 50 * max(map(len, lines[first : first + 3])) + LONGEST_LINE
     lines = lines[: next((k for k, line in enumerate(lines) if k > first and len(line) > usual), len(lines))]
-    body = [line for line in lines[first : first + SAMPLE] if not _is_comment(line, how)]
+    body = [line for line in lines[first:] if not _is_comment(line, how)][:SAMPLE]
     if not any(line.strip() for line in body):
         raise DataError(f"{where} is empty: it must have a header row and at least one row of numbers.")
     delimiter, width = (how.delimiter, 0) if how.delimiter else _delimiter(body, where)
@@ -108,7 +108,7 @@ def _declared(lines: list[str], how: Format) -> tuple[list[str], Format, int]:
         return lines, how, 0
     words = dict(line.rstrip().split("\t", 1) for line in lines[:40] if "\t" in line.rstrip() and line[0].isalpha())
     words |= dict(line.rstrip().split(",", 1) for line in lines[:40] if "," in line.rstrip() and "\t" not in line)
-    ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")]
+    ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")][:2]  # of file and channels
     marks = {"Tab": "\t", "Comma": ","}
     known = {"delimiter": how.delimiter or marks.get(words.get("Separator", ""), "\t"),
              "decimal": words.get("Decimal_Separator", how.decimal).strip()[:1] or how.decimal}
@@ -151,7 +151,7 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
     taken = [0, first, start]  # lines taken, number of the last one, characters before the next
 
     def given() -> Any:
-        for line in lines[: SAMPLE + 50]:
+        for line in lines:
             taken[0], taken[1], taken[2] = taken[0] + 1, taken[1] + 1, taken[2] + len(line)
             if not _is_comment(line, how):
                 yield line
@@ -159,8 +159,10 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
     blanks = how.delimiter == BLANKS
     try:
         for cells in (map(str.split, given()) if blanks else csv.reader(given(), delimiter=how.delimiter or ",")):
-            if any(cells) or rows:
+            if any(cells) or len(rows) > MOST_TEXT_ROWS or any(any(map(_is_value, row.cells)) for row in rows):
                 rows.append(_Row(cells, taken[1], taken[2]))
+            elif rows:  # a blank line after the header
+                rows[-1] = rows[-1]._replace(end=taken[2])
             if len(rows) >= SAMPLE:
                 break
     except csv.Error as error:
@@ -186,12 +188,22 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
         names = [str(name).strip() for name in how.columns]
         if len(names) != len(cells):
             raise DataError(f"{where} has {len(cells)} columns, columns= names {len(names)}.")
+        if len(rows) > 1 and not any(map(_is_value, cells)) and not any(map(how.is_missing, cells)):
+            raise DataError(f"{where} has a header ({', '.join(cells)[:60]}). Leave columns= out, or pass "
+                            f"{call({'skip_rows': head.line} | needed)}.")
         rows = [_Row([], head.line, head.end - len(lines[head.line - 1])), *rows]
-    elif all(map(is_number, cells)) or (all(map(_is_value, cells)) and len(rows) > 1):
+    elif len(cells) > 1 and cells == [str(place) for place in range(len(cells))] and len(rows) > 1:
+        raise DataError(f"{where}: the first row ({', '.join(cells)[:40]}) may be a header of numbers, or samples. To "
+                        f"leave it out pass {call({'skip_rows': head.line} | needed)}; if it holds samples name the "
+                        "columns, columns=[...].")
+    elif all(_is_value(cell) or how.is_missing(cell) for cell in cells) and any(map(_is_value, cells)):
         names = [str(c) for c in range(len(cells))]
         findings.append(f"no header: the columns are numbered {names[0]} to {names[-1]}")
         rows = [_Row([], head.line, head.end - len(lines[head.line - 1])), *rows]
     else:
+        if odd := [cell for cell in cells if _is_value(cell) and not cell.isdigit()]:
+            raise DataError(f"{where}: line {head.line} would be the header, but holds {odd[0]!r}. If the file has no "
+                            f"header name its columns, columns=[...]; if it begins later pass skip_rows=.")
         if len(cells) != width:
             _refuse_preamble(rows, width, where, needed)
         names = _fitted(cells, rows[1:])
@@ -199,6 +211,8 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
         if name and count > 1:
             raise DataError(f"{where} has two columns named {name!r}: rename one.")
     texts, units = _text_rows(rows[1:], names, how)
+    if how.units_row and how.units_row < len(rows) and any(map(_is_value, rows[how.units_row].cells)):
+        raise DataError(f"{where}: units_row={how.units_row}, but row {how.units_row} after the header holds numbers.")
     if how.units_row and how.units_row > len(texts):
         units = dict(zip(names, rows[how.units_row].cells)) if how.units_row < len(rows) else {}
         texts = rows[1 : how.units_row + 1]
@@ -254,7 +268,7 @@ def _is_text(cells: Sequence[str], names: Sequence[str], how: Format) -> bool:
     """Whether a row holds units or descriptions: texts, but neither values nor words of missing samples alone."""
     full = [cell.strip() for cell in cells if cell.strip()]
     return len(cells) == len(names) and bool(full) and not any(map(_is_value, full)) and not any(
-        map(how.is_missing, full))
+        map(how.is_missing, full)) and any(any(map(str.isalpha, cell)) or cell in ("%", "°", "1/s") for cell in full)
 
 
 def _is_value(cell: str) -> bool:
@@ -280,15 +294,19 @@ def _propose(columns: dict[str, tuple[str, ...]], dated: Sequence[str], how: For
         odd = [cell for cell in cells if not _NUMERIC.fullmatch(cell) and not is_number(cell)]
         if len(odd) * 2 > len(cells):
             continue
-        words += [cell for cell in dict.fromkeys(odd) if len(cell) <= LONGEST_MARK and cell not in words]
+        words += [cell for cell in dict.fromkeys(odd) if len(cell) <= LONGEST_MARK and cell not in words
+                  and cell.isprintable() and not {"\ufffd", '"'} & set(cell) and not any(map(str.isdigit, cell))]
         if how.is_plain:
             values = [cell for cell in cells if cell not in odd]
             if any(re.fullmatch(r"[+-]?\d{1,3}(,\d{3})+\.\d*", cell) for cell in values):
                 needed["thousands"] = ","
             elif any(re.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+,\d*", cell) for cell in values):
                 needed |= {"decimal": ",", "thousands": "."}
-            elif any(map(_COMMA.fullmatch, values)) and not any(map(_POINT.fullmatch, values)):
-                needed["decimal"] = ","
+            elif (commas := list(filter(_COMMA.fullmatch, values))) and not any(map(_POINT.fullmatch, values)):
+                if how.delimiter == "," and all(re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", cell) for cell in commas):
+                    needed["thousands"] = ","
+                else:
+                    needed["decimal"] = ","
             elif grouped := list(filter(_GROUPED.fullmatch, values)):
                 needed["thousands"] = re.sub(r"[\d+-]", "", grouped[0])[0]
     if words and len(words) <= 8:
@@ -298,7 +316,5 @@ def _propose(columns: dict[str, tuple[str, ...]], dated: Sequence[str], how: For
 def _advice(found: Layout, needed: dict[str, Any]) -> str:
     """Return the words to type as text; a format of dates that may be another one with it."""
     forms = needed.get("date_format")
-    if not forms:
-        return call(needed)
-    text = call({word: value for word, value in needed.items() if word != "date_format"} | {"date_format": forms[0]})
-    return text + (f" (or {forms[1]!r} where the day comes first)" if len(forms) > 1 else "")
+    others = call({word: value for word, value in needed.items() if word != "date_format"})
+    return ", ".join(part for part in (others, dates.choices(forms) if forms else "") if part)

@@ -15,6 +15,8 @@ MOST_TAGS = 1000
 def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> DataError:
     """Return the error about a missing column, or the one that the table is long where its cells name the channels."""
     texts = [name for name in table.names if name and name not in table.dates and not is_time_name(name)]
+    if not texts:
+        return error
     try:
         loaded = table.load(texts, dict.fromkeys(texts, "text"))
     except DataError:
@@ -27,12 +29,13 @@ def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> Data
         if cells.dtype.kind not in "UO" or cells.ndim != 1:
             continue
         tags = list(dict.fromkeys(str(cell) for cell in cells[:10_000]))
-        named = [one for one in asked if one in tags]
+        counts = [str(cell) for cell in cells[:10_000]]
+        named = [one for one in asked if counts.count(str(one)) > 1]
         repeated = len(tags) <= MOST_TAGS and len(cells) >= 4 * len(tags) > 4 and not asked
         if named or (repeated and not any(map(is_number, tags))):
             clock = next((one for one in table.names if one in table.dates or is_time_name(one)), "TIME")
-            value = next((one for one in table.names if one != name and one in loaded and
-                          _is_numeric(loaded[one])), "VALUE")
+            numeric = [one for one in table.names if one != name and one in loaded and _is_numeric(loaded[one])]
+            value = next((one for one in numeric if "val" in one.lower()), numeric[0] if numeric else "VALUE")
             return DataError(
                 f"{table.label} is a long table: column {name!r} holds the tags ({', '.join(tags[:4])}), one row for "
                 f"each tag and instant. Make a column of each tag first, in pandas: "

@@ -50,13 +50,17 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     if len(found) > 1:  # of clocks that agree the one with the finer stamps, dated if both are
         clock, stamps = min(found, key=lambda one: (np.mean(np.diff(one[1]) == np.diff(one[1][:1].repeat(2)))
                                                     if one[1].size > 1 else 0, one[1].dtype.kind != "M"))
+    if table.how.time_zone is not None and clock.kind == "numbers" and clock.scale != 86400.0:
+        raise DataError(f"{table.label}: time_zone={table.how.time_zone!r} is for local dates; the clock "
+                        f"{clock.columns[0]!r} holds numbers.")
     return clock, stamps, [clock.finding] * bool(clock.finding) + said
 
 
 def _paired(found: list[tuple[Clock, np.ndarray]], block: Mapping[str, Any], table: Table
             ) -> list[tuple[Clock, np.ndarray]]:
     """Join a column of dates without a time of day, and one of times of day."""
-    hours = [one for one in found if one[0].kind == "times of day"]
+    hours = [one for one in found if one[0].kind == "times of day" or (one[1].dtype.kind == "m" and (
+        one[1] < np.timedelta64(1, "D")).all() and one[0].kind == "ready")]
     days = [one for one in found if hours and one[1].dtype.kind == "M"
             and not (one[1] - one[1].astype("M8[D]")).any()]
     if not days:
@@ -79,14 +83,22 @@ def _unwrapped(of_day: np.ndarray) -> np.ndarray:
 
 
 def _agree(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two clocks run alike: same time since the first sample, up to one step of the coarser."""
+    """Whether two clocks run alike, up to one step of the coarser; two of one kind also show the same time."""
     if one.shape != other.shape or one.size < 2:
         return one.shape == other.shape
     a, b = seconds(one - one[0]), seconds(other - other[0])
-    coarse = max(float(np.max(np.abs(np.diff(part)), initial=0.0)) for part in (a, b))
+    if one.dtype.kind == other.dtype.kind:
+        b = b + float(seconds(np.atleast_1d(other[0] - one[0]))[0])
+    coarse = max(_resolution(part) for part in (a, b))
     return bool(np.nanmax(np.abs(a - b)) <= coarse + AGREEMENT * max(abs(a[-1]), abs(b[-1])))
+
+
+def _resolution(t: np.ndarray) -> float:
+    """Return the resolution of stamps that rows share, or a hundredth of the usual step."""
+    steps = np.abs(np.diff(t))
+    return float(np.max(steps)) if np.mean(steps == 0) > 0.2 else 0.01 * float(np.median(steps))
 
 
 def _told(clock: Clock, stamps: np.ndarray) -> str:
     step = float(np.median(seconds(np.diff(stamps))))
-    return f"{clock.columns[0]!r} steps by {step:.6g} s"
+    return f"{clock.columns[0]!r} steps by {step:.6g} s from {stamps[0]}"

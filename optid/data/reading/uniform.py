@@ -112,8 +112,15 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
     if stamps.size > 1 and np.mean(np.diff(stamps) == stamps[:1] - stamps[:1]) > COARSE and dt is not None:
         return [Piece(stamps[0], u, y)], dt, [_check_spread(stamps, dt, label)]
     if how.gaps is None or stamps.size < 2:
+        said = []
+        if stamps.size > 1 and (seconds(np.diff(stamps)) < 0).all():
+            stamps, u, y = stamps[::-1], u[::-1].copy(), y[::-1].copy()
+            said = ["the newest sample came first: the rows are turned round"]
         step = uniform_step(stamps, how.time_tolerance, label)
-        return [Piece(stamps[0], u, y)], step, []
+        drift = 0.0 if step is None else float(np.ptp(seconds(stamps - stamps[0]) - step * np.arange(stamps.size)))
+        if step is not None and drift > max(1.0, 3 * how.time_tolerance) * step:
+            said.append(f"clock: the stamps leave an even grid of {step:g} s by up to {drift:.3g} s")
+        return [Piece(stamps[0], u, y)], step, said
     return _without_gaps(stamps, u, y, how, label)
 
 
@@ -133,10 +140,10 @@ def _not_uniform(stamps: np.ndarray, steps: np.ndarray, median: float, bad: np.n
     summer = _summer_time(stamps, steps, median)
     if summer is not None:
         k = summer
-        reason = ("Daylight saving time ends there" if steps[k] < 0 else
+        reason = ("Daylight saving time ends there" if steps[k] < median else
                   "Daylight saving time begins there, or an hour was lost")
         remedy = "the stamps are local. Pass their time_zone='Europe/Berlin' or whichever it is"
-        remedy += " or gaps='missing'." if steps[k] > 0 else "."
+        remedy += " or gaps='missing'." if steps[k] > median else "."
     elif (size < 0).any():
         back = int(np.argmax(steps < 0))
         reason = "The clock runs backwards " + ("there" if back == k else f"at sample {first + back + 1}")
@@ -167,7 +174,7 @@ def _summer_time(stamps: np.ndarray, steps: np.ndarray, median: float) -> int | 
     """Return the step at which local dates jump by an hour in a night to Sunday; None where none does."""
     if stamps.dtype.kind != "M":
         return None
-    jump = np.flatnonzero(np.abs(np.abs(steps - median) - 3600) <= 0.01 * median + 1e-6)
+    jump = np.flatnonzero(np.abs(np.abs(steps - median) - 3600) <= min(0.01 * median, 60.0) + 1e-6)
     for k in jump:
         day = stamps[k + 1].astype("M8[D]")
         hour = float((stamps[k + 1] - day) / np.timedelta64(1, "h"))
@@ -262,7 +269,7 @@ def _resampled(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, how: Format, la
         steps = np.diff(t)
         raise _not_uniform(stamps, steps, float(np.median(steps)), steps < 0, how.time_tolerance, label, 0)
     count = int(np.floor(t[-1] / dt + 1e-9)) + 1
-    if count > MOST_INSERTED + 1000 * t.size:
+    if count > MOST_INSERTED + 20 * t.size:
         raise DataError(f"{label}: resample={dt:g} s would make {count} samples of {t.size}; is the unit right?")
     if count < 2:
         raise DataError(f"{label}: the record lasts {t[-1]:g} s, less than resample={dt:g} s.")
