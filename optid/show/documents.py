@@ -1,5 +1,6 @@
 """Documents of every result, most important facts first, which terminal, notebook and page render."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,8 +10,22 @@ from optid.errors import DataError
 from optid.identify.validation import Validation
 from optid.identify.verdict import POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
-from optid.show.sections import TONES, Banner, Charts, Code, Columns, Document, Fold, Heading, Notes, Pair, Section
-from optid.show.terminal import set_table, wrapped
+from optid.show.sections import (
+    RECORD,
+    TONES,
+    Banner,
+    Charts,
+    Code,
+    Columns,
+    Document,
+    Findings,
+    Fold,
+    Heading,
+    Notes,
+    Pair,
+    Section,
+)
+from optid.show.terminal import findings_lines, set_table, wrapped
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -44,6 +59,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
     evidence = summary.evidence_facts(fit)
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
     sections = [
+        *_record(fit.data.findings),
         *([_trust(fit, judged, test, advise)] if judged is not None else []),
         _optimum(fit),
         Section("model", "Model", [
@@ -66,6 +82,11 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
             "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
     ]
     return Document(summary.title(fit), lead, sections)
+
+
+def _record(findings: Sequence[str]) -> list[Section]:
+    """Return the section of what reading the record derived, assumed or repaired; none where there is nothing."""
+    return [Section("record", RECORD, [Findings(findings)])] if findings else []
 
 
 def _length(data: Any) -> str:
@@ -149,7 +170,8 @@ def search_document(found: "Identification", test: Data | None = None, *, comman
         checks.search_table(found), Notes([*found.reasons, *notes]),
         Code(f"--formulation {chosen.formulation} {chosen.words}"),
         Charts([charts.block_chart(found)]), Fold(table.title, [table])])
-    return Document(document.title, document.lead, [*document.sections[:2], section, *document.sections[2:]])
+    first = next(k for k, one in enumerate(document.sections) if one.id == "model")
+    return Document(document.title, document.lead, [*document.sections[:first], section, *document.sections[first:]])
 
 
 def validation_document(checked: Validation) -> Document:
@@ -164,7 +186,7 @@ def validation_document(checked: Validation) -> Document:
     tone = "bad" if not worst >= USELESS_FIT else "fair" if worst < POOR_FIT or not checked.passed else "good"
     banner = Banner(tone, f"Residual tests: {'PASS' if checked.passed else 'FAIL'}", sentence + ".", fits)
     return Document(f"Validation on {checked.data}" if checked.data else "Validation", "", [
-        Section("trust", "", [banner]), Section("tests", "Errors and tests", validation_parts(checked))])
+        *_record(checked.findings), Section("trust", "", [banner]), Section("tests", "Errors and tests", validation_parts(checked))])
 
 
 def comparison_document(found: "Comparison", *, command: str = "") -> Document:
@@ -184,7 +206,7 @@ def comparison_document(found: "Comparison", *, command: str = "") -> Document:
             for part in (Heading(name), Code(model.equation(), equation=True), *validation_parts(checked))]
     call = command or f"optid.compare_models(models, data, horizon={found.horizon})"
     return Document(title, lead, [
-        Section("fits", "Fits", [checks.comparison_table(found), checks.facts_table(found)]),
+        *_record(found.data.findings), Section("fits", "Fits", [checks.comparison_table(found), checks.facts_table(found)]),
         Section("figures", "Figures", figures, page_only=True),
         Section("validation", "Each model by itself", each, page_only=True),
         Section("reproduce", "Reproduce", lambda: _reproduce(call, str(found)), page_only=True)])
@@ -194,7 +216,7 @@ def order_document(study: "OrderStudy") -> Document:
     """Return the document of a study of the order."""
     notes = [Notes([*study.reasons, *study.notes])]
     return Document(f"Order of {study.data}" if study.data else "Order", f"recommended: nx = {study.nx}", [
-        Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
+        *_record(study.findings), Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
                                             Charts(charts.order_charts(study)),
                                             Fold("Tables", [Code(order_text(study))])])])
 
@@ -226,7 +248,7 @@ def order_text(study: "OrderStudy") -> str:
         tables.append(wording.Table("", ("lags by", "orders", "BIC", "hold-out %"), [
             (word, str(one), f"{one.bic:.1f}", f"{one.fit:.2f}" if np.isfinite(one.fit) else "")
             for word, one in best.items()]))
-    lines = [f"Order of {study.data}" if study.data else "Order", *(line for one in tables for line in set_table(one))]
+    lines = [*findings_lines(study.findings), f"Order of {study.data}" if study.data else "Order", *(line for one in tables for line in set_table(one))]
     lines.append(f"Recommended: nx = {study.nx}{'' if scan is None else '; ' + str(scan.best('bic'))}")
     for reason in (*study.reasons, *(f"note: {note}" for note in study.notes)):
         lines += wrapped(f"- {reason}")

@@ -60,7 +60,7 @@ def _breakable(equation: str) -> str:
 
 def coded(chart: Chart, most: int = MOST) -> dict[str, Any]:
     """Return a chart as JSON types for the script of the page, its curves of at most so many samples."""
-    axes = {name: {key: value for key, value in asdict(axis).items() if value not in (None, False, "")}
+    axes = {name: {key: value for key, value in asdict(axis).items() if value is not None and value is not False and value != ""}
             for name, axis in (("x", chart.x), ("y", chart.y))}
     cursor = all(one.kind in ("curve", "area", "bars") for one in chart.series)
     return {"title": chart.title, "caption": chart.caption, "group": chart.group, "equal": chart.equal,
@@ -81,13 +81,15 @@ def _series(one: Series, most: int) -> dict[str, Any]:
 def _numbers(values: np.ndarray, kind: str) -> Any:
     """Return numbers as the script reads them: an even grid, bytes, or a list with few digits."""
     steps = np.diff(values)
-    if values.size > 40 and np.ptp(steps) <= 1e-9 * abs(steps).max():
+    # dates are large numbers, whose steps are rounded
+    if values.size > 40 and np.ptp(steps) <= 1e-9 * abs(steps).max() + 4 * np.spacing(abs(values).max()):
         return {"start": float(values[0]), "step": float((values[-1] - values[0]) / (values.size - 1)),
                 "count": values.size}
     if values.size > 40:
         data = base64.b64encode(values.astype(kind).tobytes()).decode()
         return {"bytes" if kind == "<f4" else "wide": data}
-    return [float(f"{v:.9g}") if np.isfinite(v) else None for v in values]
+    digits = 9 if kind == "<f4" else 16
+    return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in values]
 
 
 def scripts(*names: str) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from optid.show import checks, documents, estimates, summary
-from optid.show.terminal import WIDTH, facts_lines, set_table, text, wrapped
+from optid.show.terminal import WIDTH, facts_lines, findings_lines, set_table, text, wrapped
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -24,13 +24,13 @@ def describe(fit: "Fit", judged: "Verdict | None" = None) -> str:
         return text(documents.fit_document(fit, judged=judged, advise=False))
     tone, word, sentence = summary.verdict(fit)
     rule = "=" * WIDTH
-    return "\n".join([rule, f"No model: {word}", rule, *wrapped(sentence), "",
+    return "\n".join([*findings_lines(fit.data.findings), rule, f"No model: {word}", rule, *wrapped(sentence), "",
                       *facts_lines(summary.certificate_facts(fit)), rule])
 
 
 def describe_checks(checked: "Validation") -> str:
     """Return what a validation found as text, at most 80 columns wide."""
-    lines = [f"Validation on {checked.data}" if checked.data else "Validation"]
+    lines = [*findings_lines(checked.findings), f"Validation on {checked.data}" if checked.data else "Validation"]
     for table in checks.validation_tables(checked):
         lines += [*set_table(table), ""]
     return "\n".join([*lines[:-1], *(line for note in checked.notes for line in wrapped(f"Note: {note}"))])
@@ -43,7 +43,7 @@ def describe_horizons(curve: "HorizonCurve") -> str:
 
 def describe_comparison(found: "Comparison") -> str:
     """Return the comparison of several models as text, at most 80 columns wide."""
-    return "\n".join(set_table(checks.comparison_table(found)))
+    return "\n".join([*findings_lines(found.data.findings), *set_table(checks.comparison_table(found))])
 
 
 def describe_parameters(found: "Parameters") -> str:

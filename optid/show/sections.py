@@ -16,6 +16,13 @@ TONES = {"good": "good", "fair": "plain", "poor": "fair", "useless": "bad"}
 """How a verdict on a model is coloured; green is left to models that are good."""
 
 
+RECORD = "The record"
+"""Heading of what reading the record derived, assumed or repaired."""
+
+MOST_FINDINGS = 6
+"""Findings that are printed before a verdict."""
+
+
 @dataclass(frozen=True)
 class Banner:
     """A verdict in one word, with a sentence."""
@@ -28,13 +35,20 @@ class Banner:
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis: its title with the unit, whether it is logarithmic, its ends where they are fixed, the bare unit."""
+    """An axis: its title with the unit, whether it is logarithmic, its ends where they are fixed, the bare unit.
+
+    The axis of a record counts samples too: `start` is the place of sample 0, `step` the sampling time. Places are
+    seconds since 1970 where they are `dates`.
+    """
 
     title: str
     log: bool = False
     low: float | None = None
     high: float | None = None
     unit: str = ""
+    dates: bool = False
+    start: float | None = None
+    step: float | None = None
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,19 @@ class Notes:
     """Remarks, each with a mark beside it."""
 
     sentences: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What reading a record derived, assumed or repaired."""
+
+    sentences: Sequence[str]
+
+    @property
+    def shown(self) -> list[str]:
+        """The first `MOST_FINDINGS` of them, and how many there are beside."""
+        more = len(self.sentences) - MOST_FINDINGS
+        return [*self.sentences[:MOST_FINDINGS], *([f"and {more} more: data.findings"] if more > 0 else [])]
 
 
 @dataclass(frozen=True)

@@ -129,10 +129,13 @@ def record_facts(fit: "Fit") -> Facts:
     count = data.n_samples
     facts = [
         ("Record", data.name or "unnamed"),
-        ("Samples", (f"{count} every {data.dt:g}" if count else f"every {data.dt:g}")),
+        ("Samples", (f"{count} every {data.interval}" if count else f"every {data.interval}")),
     ]
     if isinstance(data, Data):
         facts.append(("Experiments", str(data.n_experiments)))
+        if data.dated:
+            last = data.n_experiments - 1
+            facts.append(("Time", f"{data.instant(0)} to {data.instant(data.experiments[last].n_samples - 1, last)}"))
         missing = [f"{name} {share:.2%}" for name, share in data.missing.items() if share]
         facts.append(("Missing", ", ".join(missing) or "none"))
         if not data.transform.is_identity:

@@ -89,7 +89,7 @@ class Server(ThreadingHTTPServer):
             "samples": shortest(data), "origins": [e.start for e in data.experiments],
             "inputs": list(data.inputs), "outputs": list(data.outputs),
             "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
-        lead = f"{data.n_samples} samples every {data.dt:g}"
+        lead = f"{data.n_samples} samples every {data.interval}"
         body = template("workbench.html.j2").render(
             version=__version__, title=data.name or "Record", lead=lead, sections=[], begin=embedded(begin),
             script=script["script"])
