@@ -1,5 +1,6 @@
 """The commands `optid fit`, `optid identify` and `optid validate`."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         if found.verdict is not None and found.verdict.word in ("poor", "useless"):
             work.step("searching for advice")
             work.text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
-        _finish(work, found, held_out, saved, None if stream or scheduler else data, how)
+        _finish(work, found, record, held_out, saved, None if stream or scheduler else data, how)
         work.page(found, report, held_out)
 
 
@@ -106,11 +107,11 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
         record, held_out = words.held_out(record, split, test, how)
         found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
         work.text = str(found)
-        _finish(work, found, held_out, saved, data, how, "search")
+        _finish(work, found, record, held_out, saved, data, how, "search")
         work.page(found, report, held_out)
 
 
-def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
+def _finish(work: Work, found: Any, record: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
             what: str = "fit") -> None:
     """Validate on the held-out record and save the model; a record that was used whole is named in its file."""
     from optid.cli import arguments as words
@@ -119,13 +120,16 @@ def _finish(work: Work, found: Any, held_out: Any, saved: Path | None, data: Pat
         from optid.identify.validation.checks import validate as check
 
         work.step("validating")
-        work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{check(found.model, held_out)}"
+        checked = check(found.model, held_out)
+        if checked.findings == record.findings:  # printed before the fit
+            checked = replace(checked, findings=())
+        work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{checked}"
     if saved is not None:
-        record = None
+        read_from = None
         if data and held_out is None:
             named = {key: words.listed(value) if isinstance(value, list) else value for key, value in how.items()}
-            record = {**named, "files": [str(Path(name).resolve()) for name in data]}
-        found.model.save(saved, record)
+            read_from = {**named, "files": [str(Path(name).resolve()) for name in data]}
+        found.model.save(saved, read_from)
 
 
 def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:
@@ -143,6 +147,7 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
         from optid.identify.validation import compare_models
         from optid.identify.validation import validate as check
         from optid.models.files import load
+        from optid.show.terminal import findings_lines
 
         paths = [path for i, path in enumerate(files) if i == 0 or path.suffix.lower() == ".json"]
         data = [path for path in files if path not in paths]
@@ -158,5 +163,7 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
         if len(models) > 1:
             work.text = str(found)
         else:
-            work.text = f"{first}\n\n{found.validations[0] if compared else check(first, record, horizon=horizon)}"
+            checked = found.validations[0] if compared else check(first, record, horizon=horizon)
+            said = "\n".join([*findings_lines(checked.findings), ""]) if checked.findings else ""
+            work.text = f"{said}{first}\n\n{replace(checked, findings=())}"
         work.page(found, report)

@@ -77,7 +77,8 @@ def working(**written: Path | None) -> Iterator[Work]:
         work.heard = heard
         work.step("reading")
         yield work
-    say(coloured(work.text))
+    text = work.text.replace("pass dt= ", "pass --dt ")  # a finding of the record names the argument of Python
+    say(coloured(text))
     said = " ".join(work.text.split())
     for sentence in heard:
         if " ".join(sentence.split()) not in said:

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import as_records, frozen, one_or_all
+from optid.arrays import as_list, as_records, frozen, one_or_all
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, interval_text, listed, sampling_time
 from optid.data.description import Description, instant
+from optid.data.timeline import Timeline
 from optid.errors import DataError, nearest
 from optid.registry import render
 
@@ -155,23 +156,17 @@ class Data(Ports):
     @property
     def start(self) -> Any:
         """Time of the first sample, a date (datetime64) where the record is dated; a tuple for several experiments."""
-        return one_or_all([self._instants(e, np.zeros(1))[0] for e in self.experiments])
+        return one_or_all([timeline.instants([0])[0] for timeline in self.timelines])
 
     @property
     def time(self) -> Any:
         """Sampling instants (N,), dates where the record is dated; a tuple of such arrays for several experiments."""
-        return one_or_all([self._instants(e, np.arange(e.n_samples)) for e in self.experiments])
+        return one_or_all([line.instants(np.arange(e.n_samples)) for line, e in zip(self.timelines, self.experiments)])
 
-    def instant(self, sample: int, experiment: int = 0) -> str:
-        """Return the time of a sample (from 0) of an experiment (from 0) as text: a date, or a number with its unit."""
-        at = self._instants(self.experiments[experiment], np.array([sample]))[0]
-        return instant(at) if self.dated else f"{instant(at)} {self.time_unit}".rstrip()
-
-    def _instants(self, e: Experiment, samples: np.ndarray) -> np.ndarray:
-        if not self.dated:
-            return e.start + self.dt * samples
-        start = np.datetime64(round(e.start * 1e6), "us").astype("M8[ns]")  # seconds since 1970 hold microseconds
-        return start + np.round(self.dt * samples * 1e9).astype("m8[ns]")
+    @property
+    def timelines(self) -> tuple[Timeline, ...]:
+        """When the samples of each experiment were taken."""
+        return tuple(Timeline(e.start, self.dt, self.time_unit, self.dated) for e in self.experiments)
 
     # -- what the data look like ---------------------------------------------------------------------------------
 
@@ -221,7 +216,7 @@ class Data(Ports):
 
     def describe(self) -> Description:
         """Return range, mean, distinct levels and missing samples of each channel, and how it is sampled."""
-        ends = [self._instants(e, np.array([0, e.n_samples - 1])) for e in self.experiments]
+        ends = [line.instants([0, e.n_samples - 1]) for line, e in zip(self.timelines, self.experiments)]
         return Description(self.name, self.interval, tuple(e.n_samples for e in self.experiments),
                            tuple((a, b) for a, b in ends), self.channels, self.findings)
 
@@ -239,7 +234,7 @@ class Data(Ports):
             import pandas as pd
         except ImportError:
             raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
-        times = [pd.Index(self._instants(e, np.arange(e.n_samples)), name="time") for e in self.experiments]
+        times = [pd.Index(time, name="time") for time in as_list(self.time)]
         frames = [pd.DataFrame(record, index, [*self.inputs, *self.outputs])
                   for record, index in zip(self.records, times)]
         return frames[0] if len(frames) == 1 else pd.concat(
@@ -315,7 +310,7 @@ class Data(Ports):
         if not kept:
             raise DataError(f"data[{asked.start}:{asked.stop}] holds no samples; there are "
                             f"{', '.join(str(e.n_samples) for e in self.experiments)} "
-                            f"from {', '.join(self.instant(0, k) for k in range(self.n_experiments))}.")
+                            f"from time {', '.join(instant(line.instants([0])[0]) for line in self.timelines)}.")
         return self._with(experiments=tuple(kept))
 
     def select(self, inputs: str | Sequence[str] | None = None, outputs: str | Sequence[str] | None = None,
@@ -363,8 +358,8 @@ class Data(Ports):
                     raise DataError(f"data set {k} has {what} {getattr(part, what)}, the first has "
                                     f"{getattr(head, what)}; give them the same names and units, or use select.")
             if abs(part.dt - head.dt) > 1e-9 * head.dt:
-                raise DataError(f"data set {k} is sampled every {part.interval}, the first every {head.interval}; decimate "
-                                "the faster one.")
+                raise DataError(f"data set {k} is sampled every {part.interval}, the first every {head.interval}; "
+                                "decimate the faster one.")
             if part.transform != head.transform:
                 raise DataError(f"data set {k} was detrended or scaled differently; join first, or call raw() on both.")
             if part.dated != head.dated:

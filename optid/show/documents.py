@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.data.description import RECORD, first_findings
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation import Validation
 from optid.identify.verdict import POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
 from optid.show.sections import (
-    RECORD,
     TONES,
     Banner,
     Charts,
@@ -86,7 +86,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
 
 def _record(findings: Sequence[str]) -> list[Section]:
     """Return the section of what reading the record derived, assumed or repaired; none where there is nothing."""
-    return [Section("record", RECORD, [Findings(findings)])] if findings else []
+    return [Section("record", RECORD, [Findings(first_findings(findings))])] if findings else []
 
 
 def _length(data: Any) -> str:
@@ -186,7 +186,8 @@ def validation_document(checked: Validation) -> Document:
     tone = "bad" if not worst >= USELESS_FIT else "fair" if worst < POOR_FIT or not checked.passed else "good"
     banner = Banner(tone, f"Residual tests: {'PASS' if checked.passed else 'FAIL'}", sentence + ".", fits)
     return Document(f"Validation on {checked.data}" if checked.data else "Validation", "", [
-        *_record(checked.findings), Section("trust", "", [banner]), Section("tests", "Errors and tests", validation_parts(checked))])
+        *_record(checked.findings), Section("trust", "", [banner]),
+        Section("tests", "Errors and tests", validation_parts(checked))])
 
 
 def comparison_document(found: "Comparison", *, command: str = "") -> Document:
@@ -206,7 +207,8 @@ def comparison_document(found: "Comparison", *, command: str = "") -> Document:
             for part in (Heading(name), Code(model.equation(), equation=True), *validation_parts(checked))]
     call = command or f"optid.compare_models(models, data, horizon={found.horizon})"
     return Document(title, lead, [
-        *_record(found.data.findings), Section("fits", "Fits", [checks.comparison_table(found), checks.facts_table(found)]),
+        *_record(found.data.findings),
+        Section("fits", "Fits", [checks.comparison_table(found), checks.facts_table(found)]),
         Section("figures", "Figures", figures, page_only=True),
         Section("validation", "Each model by itself", each, page_only=True),
         Section("reproduce", "Reproduce", lambda: _reproduce(call, str(found)), page_only=True)])
@@ -248,7 +250,8 @@ def order_text(study: "OrderStudy") -> str:
         tables.append(wording.Table("", ("lags by", "orders", "BIC", "hold-out %"), [
             (word, str(one), f"{one.bic:.1f}", f"{one.fit:.2f}" if np.isfinite(one.fit) else "")
             for word, one in best.items()]))
-    lines = [*findings_lines(study.findings), f"Order of {study.data}" if study.data else "Order", *(line for one in tables for line in set_table(one))]
+    lines = [*findings_lines(study.findings), f"Order of {study.data}" if study.data else "Order",
+             *(line for one in tables for line in set_table(one))]
     lines.append(f"Recommended: nx = {study.nx}{'' if scan is None else '; ' + str(scan.best('bic'))}")
     for reason in (*study.reasons, *(f"note: {note}" for note in study.notes)):
         lines += wrapped(f"- {reason}")

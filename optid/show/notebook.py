@@ -1,9 +1,11 @@
 """What a notebook shows of a result: the verdict, the model and one table, at most one screen."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
+from optid.data.description import RECORD, first_findings
 from optid.show import documents, estimates, summary
 from optid.show.checks import comparison_table, search_table, validation_tables
 from optid.show.printing import describe
@@ -23,8 +25,8 @@ MOST_ROWS = 12
 COLOURS = {"good": "#00843f", "plain": "#1f72c9", "fair": "#b85600", "bad": "#c83350"}
 
 
-def fit_html(fit: "Fit", judged: "Verdict | None" = None) -> str:
-    """Show the verdict, the status of the solution, the equation and the parameters of a fit."""
+def fit_html(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = True) -> str:
+    """Show the verdict, the status of the solution, the equation and the parameters of a fit, below its findings."""
     if fit.model is None:
         return f"<pre>{escape(describe(fit))}</pre>"
     judged = fit.verdict if judged is None else judged
@@ -33,13 +35,15 @@ def fit_html(fit: "Fit", judged: "Verdict | None" = None) -> str:
         f"{part.name} {part.value}: FAIL" for part in judged.failed) or f"all tests pass, fit {judged.score:.1f} %")]
     fits = ", ".join(f"{name} {percent(values)}" for name, values in (
         ("one step", fit.one_step_fit), ("simulation", summary.simulation_fit(fit))))
-    return _html(summary.title(fit), [*head, Banner(tone, f"Solution: {word}", sentence), fits,
+    said = _record(fit.data.findings) if findings else []
+    return _html(summary.title(fit), [*said, *head, Banner(tone, f"Solution: {word}", sentence), fits,
                                       ("pre", fit.model.equation()), estimates.parameters_table(fit.params)])
 
 
 def search_html(found: "Identification") -> str:
     """Show the best structures by class above the fit."""
-    return _html("", [search_table(found)]) + fit_html(found.fit, found.verdict)
+    fit = found.fit
+    return _html("", [*_record(fit.data.findings), search_table(found)]) + fit_html(fit, found.verdict, findings=False)
 
 
 def parameters_html(found: "Parameters") -> str:
@@ -50,13 +54,20 @@ def parameters_html(found: "Parameters") -> str:
 def validation_html(checked: "Validation") -> str:
     """Show the outcome, the errors and the tests of a validation."""
     document = documents.validation_document(checked)
-    sections = [section.parts for section in document.sections[:1] if not callable(section.parts)]
-    return _html(document.title, [*sections[0], *validation_tables(checked)])
+    parts = [part for section in document.sections if section.id == "trust" and not callable(section.parts)
+             for part in section.parts]
+    return _html(document.title, [*_record(checked.findings), *parts, *validation_tables(checked)])
 
 
 def comparison_html(found: "Comparison") -> str:
     """Show the fits of several models."""
-    return _html("", [comparison_table(found)])
+    return _html("", [*_record(found.data.findings), comparison_table(found)])
+
+
+def _record(findings: Sequence[str]) -> list[Any]:
+    """What reading the record derived, assumed or repaired."""
+    return [Markup("<b>{}</b><ul>{}</ul>").format(RECORD, Markup("").join(
+        Markup("<li>{}</li>").format(finding) for finding in first_findings(findings)))] if findings else []
 
 
 def _html(title: str, parts: list[Any]) -> str:

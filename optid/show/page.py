@@ -60,8 +60,8 @@ def _breakable(equation: str) -> str:
 
 def coded(chart: Chart, most: int = MOST) -> dict[str, Any]:
     """Return a chart as JSON types for the script of the page, its curves of at most so many samples."""
-    axes = {name: {key: value for key, value in asdict(axis).items() if value is not None and value is not False and value != ""}
-            for name, axis in (("x", chart.x), ("y", chart.y))}
+    axes = {name: {key: value for key, value in asdict(axis).items() if value is not None and value is not False
+                   and value != ""} for name, axis in (("x", chart.x), ("y", chart.y))}
     cursor = all(one.kind in ("curve", "area", "bars") for one in chart.series)
     return {"title": chart.title, "caption": chart.caption, "group": chart.group, "equal": chart.equal,
             "height": chart.height, "cursor": cursor, **axes, "series": [_series(one, most) for one in chart.series]}

@@ -12,6 +12,7 @@ from matplotlib.patches import FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
 from optid.arrays import Array
+from optid.data.timeline import Timeline
 from optid.show.sections import Axis, Chart, extremes
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
@@ -116,14 +117,19 @@ def instants(values: Any, axis: Axis) -> Any:
 
 def show_dates(ax: Axes) -> None:
     """Set the ticks of an x axis of dates; what the ticks leave out stands at their end."""
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    width = ax.get_position().width * ax.get_figure().bbox.width / figure.dpi  # in inches, before the layout
+    figure: Any = ax.get_figure()
+    width = ax.get_position().width * figure.bbox.width / figure.dpi  # in inches, before the layout
     most = int(np.clip(width / 0.75, 2, 7))
     locator = AutoDateLocator(minticks=min(most - 1, 3), maxticks=most)
     ax.xaxis.label.set(x=0, horizontalalignment="left")
     ax.xaxis.set_major_locator(locator)
     ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+
+
+def show_times(ax: Axes, timeline: Timeline) -> None:
+    """Set the ticks of an x axis of samples, with their times below where the unit of time is known."""
+    ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    ax.xaxis.set_major_formatter(lambda k, _: f"{k:.0f}\n{timeline.text(round(k))}".rstrip())
 
 
 def liveliest(y: Array) -> slice:

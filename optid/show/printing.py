@@ -1,5 +1,6 @@
 """The printed results: text of at most 80 columns."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from optid.show import checks, documents, estimates, summary
@@ -13,15 +14,18 @@ if TYPE_CHECKING:
     from optid.identify.verdict import Verdict
 
 
-def describe(fit: "Fit", judged: "Verdict | None" = None) -> str:
+def describe(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = True) -> str:
     """Return the result of a fit as text.
 
     Args:
         fit: the fit; one without a model (``raises=False``) gives the facts about the solve.
         judged: the verdict on the model; that of the fit when not given.
+        findings: whether to begin with the findings of reading the record.
     """
     if fit.model is not None:
-        return text(documents.fit_document(fit, judged=judged, advise=False))
+        document = documents.fit_document(fit, judged=judged, advise=False)
+        shown = [one for one in document.sections if findings or one.id != "record"]
+        return text(replace(document, sections=shown))
     tone, word, sentence = summary.verdict(fit)
     rule = "=" * WIDTH
     return "\n".join([*findings_lines(fit.data.findings), rule, f"No model: {word}", rule, *wrapped(sentence), "",
@@ -53,7 +57,8 @@ def describe_parameters(found: "Parameters") -> str:
 
 def describe_search(found: "Identification") -> str:
     """Return the search and the fit it ended with as text, at most 80 columns wide."""
-    return "\n".join([*search_lines(found), "", describe(found.fit, found.verdict)])
+    return "\n".join([*findings_lines(found.fit.data.findings), *search_lines(found), "",
+                      describe(found.fit, found.verdict, findings=False)])
 
 
 def search_lines(found: "Identification") -> list[str]:

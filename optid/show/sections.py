@@ -16,13 +16,6 @@ TONES = {"good": "good", "fair": "plain", "poor": "fair", "useless": "bad"}
 """How a verdict on a model is coloured; green is left to models that are good."""
 
 
-RECORD = "The record"
-"""Heading of what reading the record derived, assumed or repaired."""
-
-MOST_FINDINGS = 6
-"""Findings that are printed before a verdict."""
-
-
 @dataclass(frozen=True)
 class Banner:
     """A verdict in one word, with a sentence."""
@@ -93,12 +86,6 @@ class Findings:
     """What reading a record derived, assumed or repaired."""
 
     sentences: Sequence[str]
-
-    @property
-    def shown(self) -> list[str]:
-        """The first `MOST_FINDINGS` of them, and how many there are beside."""
-        more = len(self.sentences) - MOST_FINDINGS
-        return [*self.sentences[:MOST_FINDINGS], *([f"and {more} more: data.findings"] if more > 0 else [])]
 
 
 @dataclass(frozen=True)

@@ -134,8 +134,8 @@ def record_facts(fit: "Fit") -> Facts:
     if isinstance(data, Data):
         facts.append(("Experiments", str(data.n_experiments)))
         if data.dated:
-            last = data.n_experiments - 1
-            facts.append(("Time", f"{data.instant(0)} to {data.instant(data.experiments[last].n_samples - 1, last)}"))
+            first, last = data.timelines[0], data.timelines[-1]
+            facts.append(("Time", f"{first.text(0)} to {last.text(data.experiments[-1].n_samples - 1)}"))
         missing = [f"{name} {share:.2%}" for name, share in data.missing.items() if share]
         facts.append(("Missing", ", ".join(missing) or "none"))
         if not data.transform.is_identity:

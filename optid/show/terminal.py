@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from itertools import zip_longest
 from textwrap import wrap
 
-from optid.show.sections import RECORD, Banner, Code, Columns, Document, Facts, Findings, Notes, Pair
+from optid.data.description import listed_findings
+from optid.show.sections import Banner, Code, Columns, Document, Facts, Findings, Notes, Pair
 from optid.show.wording import Table
 
 WIDTH, LEFT = 80, 36
@@ -74,8 +75,7 @@ def _equation(text: str) -> list[str]:
 
 def findings_lines(findings: Sequence[str]) -> list[str]:
     """Set the findings of a record under their heading; none without findings."""
-    shown = [line for sentence in Findings(findings).shown for line in wrapped(f"- {sentence}")]
-    return [RECORD, *shown] if shown else []
+    return [line for sentence in listed_findings(findings) for line in wrapped(sentence)]
 
 
 def facts_lines(facts: Facts) -> list[str]:

@@ -59,10 +59,11 @@ class Excitation:
     time_unit: str = ""
 
     def __str__(self) -> str:
+        unit = "Hz" if self.time_unit == "s" else "cycles per sample"
         facts = {
             "expected condition number": f"{self.condition:.3g}  of {self.functions} functions at {self.rows} lags",
             "levels": ", ".join(str(count_levels(x)) for x in self.u.T),
-            "band": f"{self.band[0]:.4g} to {self.band[1]:.4g} {'Hz' if self.time_unit == 's' else 'cycles per sample'}",
+            "band": f"{self.band[0]:.4g} to {self.band[1]:.4g} {unit}",
             "amplitude": ", ".join(f"{x.min():.4g} to {x.max():.4g}" for x in self.u.T),
             "crest factor": ", ".join(f"{signals.crest_factor(x):.3g}" for x in self.u.T),
             "standard deviation of y": ", ".join(f"{s:.3g}" for s in self.outputs) + " (expected)"}
@@ -74,8 +75,9 @@ class Excitation:
         """Write time (samples where its unit is unknown) and inputs as CSV with a header, as `optid.read` reads it."""
         path = Path(path)
         columns = np.column_stack([self.dt * np.arange(len(self.u)), self.u])
+        names = ["time" if self.time_unit else "sample", *self.inputs]
         # 15 digits: the values read back are those written, to rounding.
-        np.savetxt(path, columns, fmt="%.15g", delimiter=",", header=",".join(["time" if self.time_unit else "sample", *self.inputs]), comments="")
+        np.savetxt(path, columns, fmt="%.15g", delimiter=",", header=",".join(names), comments="")
         return path
 
 

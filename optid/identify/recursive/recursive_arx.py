@@ -98,7 +98,8 @@ class RecursiveARX(SavedState):
         self, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
         nk: int | Sequence[int] = 0, inputs: str | Sequence[str] = "u", outputs: str | Sequence[str] = "y",
         dt: float = 1.0, forgetting: float = 1.0, theta0: ArrayLike = 0.0, P0: ArrayLike = np.inf,
-        input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None, time_unit: str = "",
+        input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
+        time_unit: str = "",
     ) -> None:
         """Start from a prior estimate.
 

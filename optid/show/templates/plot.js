@@ -81,7 +81,7 @@ function placeText(axis, value) {
   const sample = axis.step ? Math.round((value - axis.start) / axis.step) : null;
   if (axis.dates) return `${dateText(value)}, sample ${sample}`;
   const text = `${axis.title}: ${axis.step ? Number(value.toPrecision(10)) : significant(value, 5)}`;
-  return sample === null || axis.title === "sample" ? text : `${text}, sample ${sample}`;
+  return sample === null || axis.title.includes("sample") ? text : `${text}, sample ${sample}`;
 }
 
 // Ticks of an axis between two transformed ends: [transformed place, label].
