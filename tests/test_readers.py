@@ -190,7 +190,8 @@ def test_dates_are_seconds(tmp_path):
 @pytest.mark.parametrize(
     ("t", "arguments", "parts"),
     [
-        ([0, 1, 2, 4, 5], {}, ["Sample 3", "t = 4.0", "comes 2 after", "median step is 1", "1.00%", "1 row seems to be lost", "gaps='missing'"]),
+        ([0, 1, 2, 4, 5], {}, ["Sample 3", "t = 4.0", "comes 2 after", "median step is 1", "1.00%",
+                               "1 row seems to be lost", "gaps='missing'"]),
         ([0, 1, 2, 2, 3], {}, ["Sample 3", "comes 0 after"]),
         ([0, 1, 2, 3.02], {}, ["Sample 3", "comes 1.02 after", "time_tolerance"]),
         ([3, 2, 1], {}, ["time does not increase", "sort"]),

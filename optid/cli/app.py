@@ -11,6 +11,7 @@ from optid.cli.designing import design, order
 from optid.cli.faults import diagnose, isolability, reformulate
 from optid.cli.fitting import fit, identify, validate
 from optid.cli.listings import constraints, examples, formulations, solvers
+from optid.cli.look import look
 from optid.cli.monitoring import monitor
 from optid.cli.options import register
 from optid.cli.studies import study
@@ -43,7 +44,7 @@ def main(
     """Identify Hammerstein systems by constrained optimisation with proofs of global optimality, and detect faults."""
 
 
-for function in (fit, validate, solvers, formulations, constraints, examples, identify, compare, design, diagnose,
+for function in (look, fit, validate, solvers, formulations, constraints, examples, identify, compare, design, diagnose,
                  isolability, monitor, reformulate, order, workbench):
     register(app, function, FittingCommand if function in (fit, compare) else Command)
 app.add_typer(study, name="study")

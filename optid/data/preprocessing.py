@@ -1,12 +1,14 @@
 """Changes of the samples before a fit, the methods of `Data`; what is affine is undone in reports."""
 
 from collections.abc import Mapping
+from fractions import Fraction
 from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
 
 from optid.arrays import check_integer
+from optid.data.channels import sampling_time
 from optid.errors import DataError, nearest
 
 Changed = TypeVar("Changed", bound=Any)
@@ -59,31 +61,93 @@ def scale(data: Changed, factors: Mapping[str, float] | None = None) -> Changed:
 
 
 def decimate(data: Changed, q: int) -> Changed:
-    """Low-pass every channel with zero phase and keep every q-th sample; the new dt is q * dt.
-
-    The filter is the FIR filter of `scipy.signal.decimate` (Hamming window, 20 q + 1 taps); the ends are continued
-    along the line through the first and the last sample. Filtering does not commute with a static nonlinearity:
-    decimate only where the input is slow compared with the new sampling time.
+    """Low-pass every channel with zero phase and keep every q-th sample; the new dt is q * dt; see `resample`.
 
     Raises:
         DataError: q is not a positive integer, samples are missing, or an experiment is shorter than the filter.
     """
     check_integer(q, "q", error=DataError)
-    if q == 1:
-        return data
+    return _at_ratio(data, 1, int(q))
+
+
+def resample(data: Changed, dt: float) -> Changed:
+    """Bring every channel onto another sampling time dt, in the ratio of two integers of at most 1000 to the old one.
+
+    The filter is the FIR filter of `scipy.signal.decimate` (Hamming window, 20 taps for each sample of the coarser
+    record) with zero phase; the ends are continued along the line through the first and the last sample. Filtering
+    does not commute with a static nonlinearity: use it only where the input is slow compared with the coarser
+    sampling time. Stamps that are not uniform are the matter of ``optid.read(..., resample=...)``.
+
+    Raises:
+        DataError: an impossible sampling time, missing samples, or an experiment shorter than the filter.
+    """
+    dt = sampling_time(dt)
+    ratio = Fraction(data.dt / dt).limit_denominator(1000)
+    if not 1e-3 <= ratio <= 1000 or abs(float(ratio) * dt / data.dt - 1) > 1e-9:
+        raise DataError(f"dt = {dt:g} is in no ratio of integers up to 1000 to the sampling time of the record, "
+                        f"{data.dt:g}; choose another one.")
+    found = _at_ratio(data, ratio.numerator, ratio.denominator)
+    return found.mapped(lambda u: u, lambda y: y, dt=dt)
+
+
+def filter(data: Changed, low: float | None = None, high: float | None = None, order: int = 4) -> Changed:
+    """Pass every channel through one Butterworth filter, from rest at its first sample.
+
+    The same causal filter on inputs and outputs leaves a linear plant as it is and weights its frequencies. It does
+    not commute with a static nonlinearity: filter the record of a Hammerstein system only where the nonlinearity is
+    weak, or not at all. A high-pass removes the levels.
+
+    Args:
+        data: the record.
+        low: pass frequencies above this one, in Hz (cycles per sample where the unit of time is unknown).
+        high: pass frequencies below this one.
+        order: order of the filter, 1 to 20.
+
+    Raises:
+        DataError: frequencies that are not 0 < low < high < half the sampling rate, or missing samples.
+    """
+    order = check_integer(order, "order", 1, 20, error=DataError)
+    edges = [edge for edge in (low, high) if edge is not None]
+    nyquist = 0.5 / data.dt
+    if not edges or any(isinstance(edge, bool) or not isinstance(edge, int | float | np.number) for edge in edges) or \
+            not all(a < b for a, b in zip([0.0, *edges], [*edges, nyquist])):
+        raise DataError(f"low={low!r}, high={high!r}: give one or both, 0 < low < high < {nyquist:g} (half the sampling "
+                        "rate).")
+    _check_whole(data)
+    from scipy.signal import butter, sosfilt, sosfilt_zi
+
+    kind = "bandpass" if len(edges) == 2 else "lowpass" if low is None else "highpass"
+    sections = butter(order, edges if len(edges) == 2 else edges[0], kind, fs=1 / data.dt, output="sos")
+    rest = sosfilt_zi(sections)[:, :, None]
+
+    def filtered(samples: np.ndarray) -> np.ndarray:
+        return sosfilt(sections, samples, axis=0, zi=rest * samples[:1])[0]
+
+    return data.mapped(filtered, filtered)
+
+
+def _check_whole(data: Any) -> None:
     for channel, share in data.missing.items():
         if share:
             raise DataError(f"channel {channel!r}: {share:.2%} of the samples are missing, and a filter would spread "
                             "the gaps. Cut the record around them with window, or fit at the original sampling time.")
+
+
+def _at_ratio(data: Changed, up: int, down: int) -> Changed:
+    """Return the record with `up` samples for each `down`."""
+    if up == down:
+        return data
+    _check_whole(data)
+    q = max(up, down)
     for k, e in enumerate(data.experiments):
-        if e.n_samples <= 20 * q:
+        if e.n_samples * up <= 20 * q:
             raise DataError(f"experiment {k + 1} has {e.n_samples} samples, the anti-alias filter for q = {q} has "
-                            f"{20 * q + 1} taps; use a smaller q.")
+                            f"{20 * q + 1} taps; use a sampling time nearer to that of the record.")
     from scipy.signal import firwin, resample_poly
 
     taps = firwin(20 * q + 1, 1.0 / q, window="hamming")
-    lowpass = partial(resample_poly, up=1, down=int(q), axis=0, window=taps, padtype="line")
-    return data.mapped(lowpass, lowpass, dt=data.dt * int(q))
+    lowpass = partial(resample_poly, up=up, down=down, axis=0, window=taps, padtype="line")
+    return data.mapped(lowpass, lowpass, dt=data.dt * down / up)
 
 
 def _rescaled(data: Changed, scale: np.ndarray, shift: np.ndarray) -> Changed:

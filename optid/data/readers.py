@@ -155,6 +155,8 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
         raise DataError(f"{label}: u has {len(u)} samples and y has {len(y)}. Cut both to the common part.")
     if stamps is not None and len(stamps) != len(u):
         raise DataError(f"{label}: {clocks[0]!r} has {len(stamps)} stamps for {len(u)} samples; time=False ignores it.")
+    if not how.numbers:
+        findings += known.likely_marks({**dict(zip(u_names, u.T)), **dict(zip(y_names, y.T))})
     units = {name: table.units.get(column, "") for name, column in (ins | outs).items()}
     whole = _Run(label, (u_names, y_names), u, y, stamps, clock, units, table.step, tuple(findings))
     runs = []

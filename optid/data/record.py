@@ -373,6 +373,7 @@ class Data(Ports):
     # -- changes of the samples --------------------------------------------------------------------------------------
 
     detrend, scale, decimate = preprocessing.detrend, preprocessing.scale, preprocessing.decimate
+    resample, filter = preprocessing.resample, preprocessing.filter
 
     def raw(self) -> "Data":
         """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""

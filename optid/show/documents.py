@@ -75,8 +75,9 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
         *([Section("validation", "Validation", lambda: _validations(fit, test), page_only=True)]
           if isinstance(fit.data, Data) or test is not None else []),
         Section("certificate", "Certificate", [summary.certificate_facts(fit)], page_only=True),
-        Section("data", "Data", lambda: [summary.record_facts(fit), *filter(None, [summary.channel_table(fit)])],
-                page_only=True),
+        Section("data", "Data", lambda: [
+            summary.record_facts(fit), *([summary.channel_table(fit.data)] if isinstance(fit.data, Data) else [])],
+            page_only=True),
         Section("solver", "Solver and times", [summary.solver_facts(fit)], page_only=True),
         Section("reproduce", "Reproduce", lambda: _reproduce(
             "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
@@ -87,6 +88,21 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
 def _record(findings: Sequence[str]) -> list[Section]:
     """Return the section of what reading the record derived, assumed or repaired; none where there is nothing."""
     return [Section("record", RECORD, [Findings(first_findings(findings))])] if findings else []
+
+
+def record_document(data: Data, *, command: str = "") -> Document:
+    """Return the document of a record: what reading it found, its channels, and their course."""
+    raw = data.raw()
+    drawn = [chart for k in range(min(raw.n_experiments, charts.MOST_EXPERIMENTS))
+             for chart in charts.time_charts(raw, k, [], f"time{k}")]
+    channels = f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"
+    lead = " · ".join([_length(data), f"every {data.interval}", channels])
+    return Document(data.name or "Record", lead, [
+        *_record(data.findings),
+        Section("channels", "Channels", [summary.channel_table(data)]),
+        Section("figures", "Figures", [Charts(drawn, wide=True)], page_only=True),
+        *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
+    ])
 
 
 def _length(data: Any) -> str:

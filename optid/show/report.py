@@ -40,6 +40,11 @@ def render(fit: "Fit", test: Data | None = None, *, command: str = "") -> str:
     return page.render(documents.fit_document(fit, test, command=command))
 
 
+def write_record(data: Data, path: str | Path, *, command: str = "") -> Path:
+    """Write the page of a record; arguments as in `write`."""
+    return page.write(documents.record_document(data, command=command), path)
+
+
 def write_search(found: "Identification", path: str | Path, test: Data | None = None, *, command: str = "") -> Path:
     """Write the page of a search for a structure and of the fit it ended with; arguments as in `write`."""
     return page.write(documents.search_document(found, test, command=command), path)

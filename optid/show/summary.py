@@ -184,14 +184,12 @@ def theta_singular_values(fit: "Fit") -> dict[str, np.ndarray]:
     return found
 
 
-def channel_table(fit: "Fit") -> Table | None:
-    """Range, mean, spread, levels and missing share of every channel; None for a stream."""
-    if not isinstance(fit.data, Data):
-        return None
+def channel_table(data: Data) -> Table:
+    """Range, mean, spread, levels and missing share of every channel."""
     rows = [
         (c.name, c.role, c.unit or "-", *(number(value, 4) for value in (c.low, c.high, c.mean, c.std)),
          str(c.levels) if c.levels <= 1000 else "many", f"{c.missing:.2%}")
-        for c in fit.data.raw().channels
+        for c in data.raw().channels
     ]
     return Table("Channels", ("channel", "role", "unit", "lowest", "highest", "mean", "std", "levels", "missing"), rows)
 

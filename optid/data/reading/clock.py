@@ -64,16 +64,18 @@ class Clock:
         `DataError` for text that is no stamp like the others, with its row.
         """
         where = f"{label}, column {self.columns[0]!r}"
+        if self.forms:
+            return self._of_texts(block, label, where)
         values = np.ravel(block[self.columns[0]])
         if self.kind == "ready":
             stamps = values.astype(f"{values.dtype.kind}8[ns]")
             return self._in_utc(stamps, where) if values.dtype.kind == "M" else stamps
-        if self.kind == "numbers":
-            return self._of_numbers(values, where)
-        stamps, has_offset = dates.parse(values.astype(str), self.forms[0], where)
+        return self._of_numbers(values, where)
+
+    def _of_texts(self, block: Mapping[str, Any], label: str, where: str) -> np.ndarray:
+        stamps, has_offset = dates.parse(block[self.columns[0]], self.forms[0], where)
         if len(self.columns) > 1:
-            of_day, more = dates.parse(np.ravel(block[self.columns[1]]).astype(str), self.forms[1],
-                                       f"{label}, column {self.columns[1]!r}")
+            of_day, more = dates.parse(block[self.columns[1]], self.forms[1], f"{label}, column {self.columns[1]!r}")
             stamps, has_offset = stamps + of_day.view("m8[ns]"), has_offset or more
         if self.kind == "times of day":
             return stamps.view("m8[ns]")  # times of day are read as of 1970-01-01
@@ -81,7 +83,7 @@ class Clock:
 
     def _of_numbers(self, values: np.ndarray, where: str) -> np.ndarray:
         if values.dtype.kind in "UO":
-            values, row = to_numbers(values.astype(str).tolist(), self.how)
+            values, row = to_numbers(["" if cell is None else str(cell) for cell in values.tolist()], self.how)
             if row is not None:
                 raise DataError(f"{where}: the stamp of row {row + 1} is no number, those before are.")
         if values.dtype.kind not in "iuf":
@@ -154,25 +156,25 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     """
     name = columns[0]
     where = f"{label}, column {name!r}"
-    values = np.ravel(block[name])
-    if values.dtype.kind in "Mm":
+    head = np.ravel(block[name][:2000])
+    if head.dtype.kind in "Mm":
         return Clock((name,), "ready", how)
-    if values.dtype.kind in "UO":
-        texts = values.astype(str)
-        numbers, row = to_numbers(texts[:2000].tolist(), how)
+    if head.dtype.kind in "UO":
+        values, row = to_numbers(head.astype(str).tolist(), how)
         if row is not None:
-            return _of_texts(block, columns, texts, how, label)
-        values = numbers
+            return _of_texts(block, columns, how, label)
+    else:
+        values = np.ravel(block[name])
     if values.dtype.kind not in "iuf":
         raise DataError(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
     return _of_numbers(values, name, how, unit)
 
 
-def _of_texts(block: Mapping[str, Any], columns: Sequence[str], texts: np.ndarray, how: Format, label: str) -> Clock:
+def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str) -> Clock:
     forms = []
     for name in columns:
-        cells = texts if name == columns[0] else np.ravel(block[name]).astype(str)
-        full = [cell for cell in cells[:200].tolist() if not how.is_missing(cell) and cell.strip().lower() != "nat"]
+        cells = np.ravel(block[name][:200]).astype(str)
+        full = [cell for cell in cells.tolist() if not how.is_missing(cell) and cell.strip().lower() != "nat"]
         found = [how.date_format] if how.date_format and not dates.is_time_of_day(full[0] if full else "") else \
             dates.agreed_format(full)
         where = f"{label}, column {name!r}"

@@ -15,6 +15,13 @@ Wanted = str | int | Sequence[str | int] | Mapping[str, str | int] | None
 
 MOST_LISTED = 40  # columns that a message lists
 
+MARKS = {sign * value for value in (99.0, 999.0, 9999.0, 99999.0, 999999.0, 999.25, 999.99, 32767.0, 32768.0, 65535.0,
+                                    1e10, 1e20, 1e30, 1e35, 1e36, 9.96921e36, 1e37, 3.4028234663852886e38)
+         for sign in (1, -1)}
+"""Numbers that loggers write where they have no sample."""
+
+FAR = 5.0  # times their range beyond which such a number is far from the others
+
 _QUALITY = re.compile(r"[ ._:/-]*\(?(q|qual|qua|quality|status|state|sts|stat|qc|good|valid|flag)\)?", re.IGNORECASE)
 """What the name of a column of quality adds to that of its channel."""
 
@@ -153,6 +160,21 @@ def without_marks(samples: np.ndarray, how: Format) -> np.ndarray:
         return samples
     lost = np.isin(samples, marks)
     return np.where(lost, np.nan, samples) if lost.any() else samples
+
+
+def likely_marks(channels: Mapping[str, np.ndarray]) -> list[str]:
+    """Return findings about channels whose lowest or highest value is a usual mark of missing samples, far away."""
+    found = []
+    for name, samples in channels.items():
+        for value in (float(np.fmin.reduce(samples)), float(np.fmax.reduce(samples))):
+            if value not in MARKS:
+                continue
+            marked = samples == value
+            others = samples[~marked & np.isfinite(samples)]
+            if others.size and abs(value - np.median(others)) > FAR * max(float(np.ptp(others)), 1e-3 * abs(value)):
+                found.append(f"channel {name!r}: {int(marked.sum())} samples are {value:g}, far from all others. If "
+                             f"that marks missing samples pass missing='{value:g}'")
+    return found
 
 
 def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str]] = (), advice: str = "") -> DataError:

@@ -31,8 +31,8 @@ SMALL = 1 << 18  # bytes up to which the csv module reads a file in less time th
 ROWS = 65536  # rows that the csv module converts at a time
 SPARE = 1000  # cells beyond twice those of the header with which a row is not even cut
 
-Columns = dict[str, np.ndarray]
-"""{column: (n,) samples}, or its text."""
+Columns = dict[str, Any]
+"""{column: (n,) samples}, or its texts as objects or as a series of polars."""
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ class CsvFile:
             blocks = file.blocks(self.layout.offset, 2 * len(self.names) + SPARE, mark.encode())
             cleaned = (clean(block, how.comment, how.delimiter == BLANKS) for block in blocks)
             if self.path.stat().st_size > SMALL and mark.isascii() and how.is_plain:
-                attempts = [(texts, NULLS), (texts, [])]
+                attempts = [(texts, []), (texts, NULLS)]
                 for block in cleaned:
-                    if not _is_plain(block):
+                    if not _is_plain(block) or not self._has_usual_size(block):
                         cleaned = chain([block], cleaned)
                         break
                     found: Iterable[Columns] = []
@@ -118,7 +118,7 @@ class CsvFile:
         places = [self._places[name] for name in wanted]
         schema = dict.fromkeys(map(str, range(len(self.names))), pl.Float64)
         schema |= {str(self._places[name]): pl.String for name in as_text}
-        nulls = [*nulls, *self._how.missing] if nulls or self._how.missing else []
+        nulls = [*nulls, *self._how.missing]
         try:
             table = pl.read_csv(block, has_header=False, columns=sorted(set(places)), schema=schema, quote_char=None,
                                 separator=self.layout.delimiter, null_values=nulls or None)
@@ -128,8 +128,12 @@ class CsvFile:
         if (table.width < len(self.names) or table[:, -1].null_count()) and not self._has_even_rows(block):
             return None
         series = [table[str(place)] for place in places]
-        return {name: column.fill_null("").to_numpy() if name in as_text else column.to_numpy()
-                for name, column in zip(wanted, series)}
+        return {name: column if name in as_text else column.to_numpy() for name, column in zip(wanted, series)}
+
+    def _has_usual_size(self, block: bytes) -> bool:
+        """Whether a block has as many cells as its rows should have: a single long row costs polars much memory."""
+        rows = block.rstrip(b"\r\n").count(b"\n") + 1
+        return block.count(self.layout.delimiter.encode()) == rows * (len(self.names) - 1)
 
     def _has_even_rows(self, block: bytes) -> bool:
         signs = np.frombuffer(block, np.uint8)
@@ -195,7 +199,16 @@ def open_csv(path: Path, how: Format) -> CsvFile:
 
 def _joined(blocks: list[Columns], wanted: Sequence[str]) -> Columns:
     """Join blocks, each column freed as soon as it is copied."""
-    return {name: np.concatenate([block.pop(name) for block in blocks]) for name in dict.fromkeys(wanted)}
+    joined = {}
+    for name in dict.fromkeys(wanted):
+        parts = [block.pop(name) for block in blocks]
+        if all(isinstance(part, np.ndarray) for part in parts):
+            joined[name] = np.concatenate(parts)
+        else:
+            import polars as pl
+
+            joined[name] = pl.concat([pl.Series("", part, dtype=pl.String) for part in parts])
+    return joined
 
 
 def _text(block: bytes, label: str) -> str:

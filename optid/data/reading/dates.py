@@ -14,6 +14,7 @@ _DAY = re.compile(
 _HOUR = re.compile(r"(?P<gap>T| +|^)(?P<hour>\d{1,2}:\d\d|\d{4}(?=\d\d|\b))(?P<second>:?\d\d)?(?P<part>[.,:]\d+)?"
                    r"(?P<half> ?[AaPp][Mm])?")
 _ZONE = re.compile(r" ?(?P<zone>Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)")
+_BLANK = ["", "nan", "na", "n/a", "null", "none", "nat"]
 _TIME_OF_DAY = re.compile(r"\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?[AaPp][Mm])?")
 
 
@@ -58,7 +59,7 @@ def parse(text: Any, form: str, label: str) -> tuple[np.ndarray, bool]:
     Blank text is NaT. A time of day counts from 1970-01-01.
 
     Args:
-        text: (N,) texts.
+        text: (N,) texts, or a series of polars.
         form: format in the notation of `strptime`.
         label: of the column, for messages.
 
@@ -67,22 +68,29 @@ def parse(text: Any, form: str, label: str) -> tuple[np.ndarray, bool]:
     """
     import polars as pl
 
-    series = pl.Series("", text, dtype=pl.String).str.strip_chars()
-    blank = series.str.to_lowercase().is_in(["", "nan", "na", "n/a", "null", "none", "nat"])
-    chrono, series = _as_chrono(form, series)
+    raw = pl.Series("", text, dtype=pl.String)
+    chrono, series = _as_chrono(form, raw)
     if not any(code in form for code in ("%Y", "%y", "%d", "%j")):
         series, chrono = "1970-01-01 " + series, "%Y-%m-%d " + chrono
     if not any(code in form for code in ("%H", "%I")):
         series, chrono = series + " 00:00", chrono + " %H:%M"
+    fraction = re.search(r"\.(\d{3}|\d{6}|\d{9})(?!\d)", str(series[0]) if len(series) else "")
+    usual = chrono.replace("%.f", f".%{len(fraction[1])}f" if fraction else "")  # polars reads it four times as fast
     try:
-        found = series.str.to_datetime(chrono, time_unit="ns", strict=False)
+        found = series.str.to_datetime(usual, time_unit="ns", strict=False)
+        if found.null_count() and usual != chrono:
+            found = series.str.to_datetime(chrono, time_unit="ns", strict=False)
     except pl.exceptions.PolarsError as error:
         raise DataError(f"{label}: date_format={form!r} is no format of dates ({error}).") from None
-    bad = found.is_null() & ~blank
-    if bad.any():
-        row = int(bad.arg_max() or 0)
-        raise DataError(f"{label}, row {row + 1}: {str(text[row])!r} is not a date of the format {form!r} of the "
-                        "other rows.")
+    if found.null_count():
+        stripped = raw.str.strip_chars()
+        if (stripped != raw).any():  # blanks around dates are rare, and costly to look for
+            return parse(stripped, form, label)
+        bad = found.is_null() & ~raw.str.to_lowercase().fill_null("").is_in(_BLANK)
+        if bad.any():
+            row = int(bad.arg_max() or 0)
+            raise DataError(f"{label}, row {row + 1}: {str(raw[row])!r} is not a date of the format {form!r} of the "
+                            "other rows.")
     stamps = found.dt.timestamp("ns").fill_null(np.iinfo(np.int64).min).to_numpy().view("M8[ns]")
     return stamps, "%z" in form
 

@@ -23,6 +23,7 @@ BLANKS = " "
 """The delimiter of a table whose cells any number of blanks separates."""
 
 SAMPLE = 200  # rows from which the layout is derived
+LONGEST_LINE = 10_000  # characters beyond fifty times the first lines of a line that is left to the reader of rows
 MOST_TEXT_ROWS = 3  # rows of units and descriptions after the header
 LONGEST_UNIT = 10  # characters; a longer text describes the channel
 LONGEST_MARK = 20  # characters of a word that may mark a missing sample
@@ -80,6 +81,8 @@ def find_layout(path: Path, how: Format) -> Layout:
     if first >= len(lines):
         raise DataError(f"{where} has {len(lines)} lines; skip_rows={how.skip_rows} leaves none.")
     start = sum(map(len, lines[:first]))
+    usual = 50 * max(map(len, lines[first : first + 3])) + LONGEST_LINE
+    lines = lines[: next((k for k, line in enumerate(lines) if k > first and len(line) > usual), len(lines))]
     body = [line for line in lines[first : first + SAMPLE] if not _is_comment(line, how)]
     if not any(line.strip() for line in body):
         raise DataError(f"{where} is empty: it must have a header row and at least one row of numbers.")

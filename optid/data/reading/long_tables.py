@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from optid.data.reading.clock import is_time_name
+from optid.data.reading.format import is_number
 from optid.data.reading.sources import Table
 from optid.errors import DataError
 
@@ -28,15 +29,14 @@ def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> Data
         tags = list(dict.fromkeys(str(cell) for cell in cells[:10_000]))
         named = [one for one in asked if one in tags]
         repeated = len(tags) <= MOST_TAGS and len(cells) >= 4 * len(tags) > 4 and not asked
-        if named or (repeated and not any(any(sign.isdigit() for sign in tag) and tag.replace(".", "").isdigit()
-                                          for tag in tags)):
+        if named or (repeated and not any(map(is_number, tags))):
             clock = next((one for one in table.names if one in table.dates or is_time_name(one)), "TIME")
             value = next((one for one in table.names if one != name and one in loaded and
                           _is_numeric(loaded[one])), "VALUE")
             return DataError(
                 f"{table.label} is a long table: column {name!r} holds the tags ({', '.join(tags[:4])}), one row for "
-                f"each tag and instant. Make one column of each tag first, in pandas: frame.pivot(index={clock!r}, "
-                f"columns={name!r}, values={value!r}), and read the result.")
+                f"each tag and instant. Make a column of each tag first, in pandas: "
+                f"frame.set_index([{clock!r}, {name!r}])[{value!r}].unstack(), and read the result.")
     return error
 
 

@@ -40,7 +40,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     if refused and any("date_format=" in str(error) for error in refused):
         raise refused[0]
     found = _paired(found, block, table)
-    moving = [(clock, stamps) for clock, stamps in found if stamps.size < 2 or (stamps != stamps[0]).any()]
+    moving = [one for one in found if one[1].size < 2 or one[1][0] != one[1][-1] or (one[1] != one[1][0]).any()]
     found = moving or found
     clock, stamps = found[0]
     for other, rival in found[1:]:

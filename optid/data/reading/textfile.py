@@ -55,9 +55,9 @@ class TextFile:
 
     def head(self) -> tuple[str, str]:
         """Return the first lines as text, and the encoding."""
-        found = b""
-        while more := self.read(HEAD):
-            found += more
+        found, size = b"", HEAD
+        while more := self.read(size):
+            found, size = found + more, 2 * size
             if b"\n" in found or b"\r" in found[:-1] or len(found) > LONGEST_HEAD:
                 break
         more = self.read(1)  # the last line is whole where the file ends
@@ -77,12 +77,13 @@ class TextFile:
 
         A `DataError` for a line that is longer than a block and holds more than `most` of the delimiter `mark`.
         """
+        rest, size = b"", BLOCK
         if self._decoder is None:
             self._file.seek(self._start + offset)
-        else:
-            while offset:
-                offset -= len(self.read(min(offset, BLOCK)))
-        rest, size = b"", BLOCK
+        while self._decoder is not None and len(rest) < offset and (more := self.read(HEAD)):
+            rest += more
+        if self._decoder is not None:
+            rest = rest[offset:]
         while more := self.read(size):
             block = rest + more
             end = block.rfind(b"\n") + 1 or block[:-1].rfind(b"\r") + 1

@@ -12,6 +12,7 @@ from optid.errors import DataError
 MOST_INSERTED = 1 << 20  # missing samples that gaps may add beyond twenty times the samples of a record
 COARSE = 0.2  # share of stamps equal to the one before from which the resolution of the stamps is too low
 FEWEST = 10  # stamps from which that is told
+LINE = 1 << 16  # stamps to which a line is fitted
 WHOLE = 0.25  # deviation of a step from a multiple of the median step up to which rows are said to be lost
 
 
@@ -61,7 +62,8 @@ def sampling_time(stamps: np.ndarray, positions: np.ndarray) -> float:
     Of the numbers within three standard errors it is the one with the fewest digits: stamps that are rounded or
     jitter hide no digits of the sampling time.
     """
-    k = positions - positions.mean()
+    every = max(1, stamps.size // LINE)
+    k, stamps = positions[::every] - positions[::every].mean(), stamps[::every]
     t = seconds(stamps - stamps[0])
     square = float(k @ k)
     if not square:
@@ -285,7 +287,7 @@ def _resampled(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, how: Format, la
                                                                                   + 1e-9 * dt)
         far |= (grid < where[0] - 1e-9 * dt) | (grid > where[-1] + max(step, dt))
         whole[grid < where[0] - 1e-9 * dt, c] = np.nan
-        bridged += int(far.sum())
+        bridged = max(bridged, int(far.sum()))
         if how.gaps == "missing":
             whole[far, c] = np.nan
     m = u.shape[1]

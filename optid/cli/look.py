@@ -1,0 +1,21 @@
+"""The command `optid look`: a record before any fit."""
+
+from typing import Any
+
+from optid.cli.options import File, Paths
+from optid.cli.results import working
+
+
+def look(data: Paths = None, example: str | None = None, *, how: dict[str, Any], seed: int = 0, report: File = None,
+         picture: File = None) -> None:
+    """Show a record before any fit: its clock, its channels, and what reading it derived, assumed or repaired.
+
+    Example: optid look data.csv --inputs u --outputs y --report record.html
+    """
+    with working(report=report, picture=picture) as work:
+        from optid.cli import arguments as words
+
+        record: Any = words.record(data, how, example, seed)[0]
+        work.text = str(record)
+        work.draw(record.plot, picture)
+        work.page(record, report)
