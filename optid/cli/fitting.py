@@ -7,7 +7,7 @@ from typing import Any
 
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import Work, check_names, working
+from optid.cli.results import Work, check_names, reading_for, working
 from optid.errors import DataError
 from optid.lazy import import_cvxpy
 
@@ -156,7 +156,7 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
         distinct = len({path.stem for path in paths}) == len(paths)
         models = {path.stem if distinct else str(path): load(path) for path in paths}
         first = next(iter(models.values()))
-        record: Any = words.read_record(data, words.as_modelled(how, first))
+        record: Any = words.read_record(data, reading_for(first, how))
         work.step("validating")
         compared = len(models) > 1 or report is not None
         found: Any = compare_models(models, record, horizon) if compared else None

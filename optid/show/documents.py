@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.data.description import RECORD, first_findings
+from optid.data.description import RECORD
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation import Validation
@@ -87,7 +87,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
 
 def _record(findings: Sequence[str]) -> list[Section]:
     """Return the section of what reading the record derived, assumed or repaired; none where there is nothing."""
-    return [Section("record", RECORD, [Findings(first_findings(findings))])] if findings else []
+    return [Section("record", RECORD, [Findings(findings)])] if findings else []
 
 
 def record_document(data: Data, *, command: str = "") -> Document:

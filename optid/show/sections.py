@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.data.description import first_findings
 from optid.show.wording import Table
 
 Facts = list[tuple[str, str]]
@@ -86,6 +87,11 @@ class Findings:
     """What reading a record derived, assumed or repaired."""
 
     sentences: Sequence[str]
+
+    @property
+    def shown(self) -> list[str]:
+        """The first of them, and how many there are beside."""
+        return first_findings(self.sentences)
 
 
 @dataclass(frozen=True)
