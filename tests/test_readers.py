@@ -75,31 +75,7 @@ def test_arrays_npz_and_npy(tmp_path):
     assert read(tmp_path / "r.npy", columns=["a", "b", "c"], inputs=0, outputs=2).inputs == ("a",)
 
 
-def test_mat_files_of_both_kinds(tmp_path, monkeypatch):
-    savemat(tmp_path / "r.mat", {"u": U, "y": Y, "title": "run 1", "log": {"u": U[:, :1], "y": Y}})
-    same(read(tmp_path / "r.mat"))
-    part = read(tmp_path / "r.mat", inputs={"u": "log.u"}, outputs={"y": "log.y"})
-    np.testing.assert_array_equal(part.u, U[:, :1])
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "new.mat", "w", userblock_size=512) as file:
-        for name, value in {"u": U, "y": Y}.items():
-            file[name] = value.T  # MATLAB writes columns first
-        file["log/y"] = Y.T
-        file["title"] = np.array([[114], [117]], dtype=np.uint16)
-        file["title"].attrs["MATLAB_class"] = np.bytes_("char")
-    with open(tmp_path / "new.mat", "r+b") as file:
-        file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM")
-    same(read(tmp_path / "new.mat"))
-    refuses(DataError, "no column 'title'", read, tmp_path / "new.mat", inputs="title")
-    np.testing.assert_array_equal(read(tmp_path / "new.mat", outputs={"y": "log.y"}).y, Y)
-    monkeypatch.setitem(sys.modules, "h5py", None)
-    refuses(DataError, r'7.3, which needs h5py: pip install "optid\[mat\]"', read, tmp_path / "new.mat")
-
-
-def test_matlab_bytes_are_doubles_again(tmp_path):
-    # MATLAB stores small whole doubles as bytes: 255 is then a value like any other, not a saturated one.
-    savemat(tmp_path / "r.mat", {"u": np.array([[255.0], [3.0]]), "y": np.ones((2, 1))})
-    assert read(tmp_path / "r.mat").u[0, 0] == 255.0
+def test_bytes_at_their_limit_look_saturated():
     with pytest.warns(DataWarning, match="column 'u': 1 sample"):
         read({"u": np.array([255, 3], np.uint8), "y": np.ones(2)})
 

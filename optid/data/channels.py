@@ -127,7 +127,12 @@ def count_levels(x: np.ndarray, most: int = MOST_LEVELS) -> int:
 
 def listed(names: str | Sequence[str] | None) -> list[str] | None:
     """Return one name or several as a list; None stays None."""
-    return [names] if isinstance(names, str) else None if names is None else list(names)
+    if names is None or isinstance(names, str):
+        return None if names is None else [names]
+    try:
+        return list(names)
+    except TypeError:
+        raise DataError(f"{names!r}: must be a text, or a list of texts, one for each channel.") from None
 
 
 def numbered_names(letter: str, count: int) -> tuple[str, ...]:

@@ -111,8 +111,8 @@ def filter(data: Changed, low: float | None = None, high: float | None = None, o
     nyquist = 0.5 / data.dt
     if not edges or any(isinstance(edge, bool) or not isinstance(edge, int | float | np.number) for edge in edges) or \
             not all(a < b for a, b in zip([0.0, *edges], [*edges, nyquist])):
-        raise DataError(f"low={low!r}, high={high!r}: give one or both, 0 < low < high < {nyquist:g} (half the sampling "
-                        "rate).")
+        raise DataError(f"low={low!r}, high={high!r}: give one or both, 0 < low < high < {nyquist:g} (half the "
+                        "sampling rate).")
     _check_whole(data)
     from scipy.signal import butter, sosfilt, sosfilt_zi
 

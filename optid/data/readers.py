@@ -69,7 +69,7 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     for run in runs:
         if run.names != runs[0].names:
             raise DataError(f"{run.label} has channels {run.names}, {runs[0].label} has {runs[0].names}.")
-    runs, joined = _continued(runs, how) if experiment is None else (runs, [])
+    runs, joined = _continued(runs, how) if experiment is None and len(sources) > 1 else (runs, [])
     runs = _between(runs, how, dt)
     experiments, step, findings = _sampled(runs, how, dt)
     dated = all(run.is_dated for run in runs)
@@ -129,14 +129,19 @@ def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any
 
 def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: str | int | None) -> list[_Run]:
     label, how = table.label, table.how
+    inputs = table.inputs if inputs is None else inputs
+    outputs = table.outputs if outputs is None else outputs
     try:
         ins, outs = choose(table.names, inputs, "u", label), choose(table.names, outputs, "y", label)
     except DataError as error:
         raise long_tables.explained(error, table, inputs, outputs) from None
+    if table.split is not None:
+        tables = table.split([*ins.values(), *outs.values()], time)
+        return [run for one in tables for run in _runs(one, ins, outs, None if time is True else time, experiment)]
     signals = list(dict.fromkeys([*ins.values(), *outs.values()]))
     clocks = clock_columns(table.names, time, signals, label, table.index, table.dates)
     group = None if experiment is None else known.column_name(table.names, experiment, label)
-    goods = dict(how.quality or {})
+    goods: dict[str, str] = dict(how.quality or {})
     quality = known.guarded(goods, table.names, signals, label)
     others = [name for name in (*clocks, *([group] if group is not None else []), *quality) if name not in signals]
     unused = [name for name in known.quality_columns(table.names, signals) if name not in (*quality, *others)]
@@ -240,7 +245,12 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
 
 def _continued(runs: list[_Run], how: Format) -> tuple[list[_Run], list[str]]:
     """Join runs whose clock continues that of the run before; with `gaps` or `resample` also those behind a gap."""
-    found, findings = [runs[0]], []
+    findings = []
+    if all(run.is_dated for run in runs):
+        ordered = sorted(runs, key=lambda run: run.stamps[0])  # type: ignore[index]
+        findings = ["the files are taken in the order of their dates"] * (ordered != runs)
+        runs = ordered
+    found = [runs[0]]
     for run in runs[1:]:
         last = found[-1]
         if _follows(last, run, how):
@@ -322,6 +332,9 @@ def _sampled(runs: Sequence[_Run], how: Format, dt: float | None
         pieces, found, said = regular(run.stamps, run.u, run.y, dt, how, run.label)
         findings += said
         step = agreed_step(found, step, how.time_tolerance, run.label)
+        if dt is None and found and run.step and abs(found - run.step) > how.time_tolerance * run.step:
+            raise DataError(f"{run.label}: the time stamps step by {found:.6g} s, and the sampling time beside them is "
+                            f"{run.step:.6g} s. Pass the right one as dt.")
         for piece in pieces:
             for part in (piece.u, piece.y):
                 part.flags.writeable = False

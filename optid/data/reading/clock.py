@@ -21,6 +21,11 @@ NAMES = frozenset({
 })
 """Names of columns of time, in lower case, without unit, blanks and marks."""
 
+_STEPS = ("ts", "dt", "sampletime", "samplingtime", "sampleperiod", "samplingperiod", "timestep", "samplinginterval",
+          "deltat")
+_RATES = ("fs", "samplerate", "samplingrate", "samplingfrequency", "samplefrequency")
+"""Names of a single number beside the samples: the sampling time, and the sampling rate."""
+
 _UNIT_WORDS = {"s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s", "sekunden": "s",
                "ms": "ms", "msec": "ms", "millis": "ms", "milliseconds": "ms", "us": "us", "µs": "us", "μs": "us",
                "usec": "us", "microseconds": "us", "ns": "ns", "nanoseconds": "ns", "min": "min", "mins": "min",
@@ -34,6 +39,10 @@ _EPOCH = (9.4e8, 4.2e9)  # seconds since 1970 of the years 1999 to 2103
 _SERIAL = {"days since 1899-12-30, as of Excel": 25569.0, "days since year 0, as of MATLAB": 719529.0}
 """Numbers of 1970-01-01 in counts of days."""
 _SERIAL_SPAN = (10957.0, 47482.0)  # days since 1970 of the years 2000 to 2100
+
+
+class NoStamps(DataError):
+    """A column named as a clock holds something else."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +121,16 @@ def is_time_name(name: str) -> bool:
     return _plain(_parts(name)[0]) in NAMES or _plain(name) in NAMES
 
 
+def is_step_name(name: str) -> bool:
+    """Whether a single number is named as a sampling time."""
+    return _plain(name) in _STEPS
+
+
+def is_rate_name(name: str) -> bool:
+    """Whether a single number is named as a sampling rate."""
+    return _plain(name) in _RATES
+
+
 def clock_columns(known: Sequence[str], time: Any, taken: Sequence[str], label: str, index: str | None = None,
                   dated: Sequence[str] = ()) -> list[str]:
     """Return the columns that may hold the clock, the likeliest first.
@@ -166,7 +185,7 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     else:
         values = np.ravel(block[name])
     if values.dtype.kind not in "iuf":
-        raise DataError(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
+        raise NoStamps(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
     return _of_numbers(values, name, how, unit)
 
 
@@ -180,9 +199,11 @@ def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
         where = f"{label}, column {name!r}"
         if not found:
             first = full[0] if full else ""
-            raise DataError(f"{where}: the stamps (first: {first!r}) are neither numbers nor ISO dates such as "
-                            "2024-05-01T12:00:00. Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to "
-                            "seconds, or pass time=False and dt=.")
+            odd = next((cell for cell in full if dates.formats(first) and not dates.formats(cell)), None)
+            what = f"(first: {first!r})" if odd is None else f"(first: {first!r}; then {odd!r})"
+            raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as "
+                           "2024-05-01T12:00:00. Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to "
+                           "seconds, or pass time=False and dt=.")
         if not how.date_format and not dates.is_unambiguous(found[0]):
             other = f" (or {found[1]!r} where the day comes first)" if len(found) > 1 else ""
             raise DataError(f"{where}: the dates (first: {full[0]!r}) do not begin with the year. Pass "

@@ -46,7 +46,10 @@ def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dic
     if isinstance(wanted, Mapping):
         pairs = {str(name): column_name(known, column, label) for name, column in wanted.items()}
     else:
-        several = [wanted] if isinstance(wanted, str | int) else list(wanted)
+        if not isinstance(wanted, str | int | np.integer | list | tuple | np.ndarray):
+            raise DataError(f"{what}={wanted!r}: must be the name or position of a column, a list of these, or a "
+                            "mapping {channel name: column}.")
+        several = [wanted] if isinstance(wanted, str | int | np.integer) else list(wanted)
         columns = [column_name(known, column, label) for column in several]
         pairs = {c: c for c in columns}
         if len(pairs) < len(columns):
@@ -177,7 +180,8 @@ def likely_marks(channels: Mapping[str, np.ndarray]) -> list[str]:
     return found
 
 
-def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str]] = (), advice: str = "") -> DataError:
+def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str]] = (), advice: str = "",
+               row: Sequence[str] = ()) -> DataError:
     """Return the error about a cell that is no number, with what to type.
 
     Args:
@@ -186,8 +190,12 @@ def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str
         how: the format by which it was read.
         around: columns of cells of the same rows, which may hold further words of missing samples.
         advice: what the layout of the file proposes.
+        row: the cells of its row, that of the clock among them.
     """
     text, words = cell.strip(), dict[str, Any]()
+    if row and all(one.strip() and not any(sign.isdigit() for sign in one) for one in row) and len(row) > 2:
+        return DataError(f"{where} holds {cell!r}, not a number. The whole row is text ({', '.join(row)[:60]}): a row "
+                         "of units or another header inside the table; remove it.")
     if not any(sign.isdigit() for sign in text):
         marks = dict.fromkeys(one.strip() for column in around for one in column
                               if not any(sign.isdigit() for sign in one) and not how.is_missing(one))

@@ -177,7 +177,7 @@ class CsvFile:
         if row is not None:
             number = first + row + 1 + self.layout.text_rows
             raise cell_error(f"{self.path.name}: column {column!r}, row {number} after the header", cells[row],
-                             self._how, around, self.layout.advice)
+                             self._how, around, self.layout.advice, [column[row] for column in around])
         return values
 
     def _without_tail(self, block: list[list[str]], reader: Any, done: int) -> list[list[str]]:

@@ -69,11 +69,17 @@ class Format:
     time_tolerance: float = TIME_TOLERANCE
     gaps: str | None = None
     resample: str | float | None = None
-    quality: Mapping[str, Any] | Sequence[str] | None = None
+    quality: Any = None
     from_: Any = None
     to: Any = None
 
     def __post_init__(self) -> None:
+        for name in ("delimiter", "decimal", "thousands", "encoding", "comment", "date_format", "time_zone", "gaps"):
+            value = getattr(self, name)
+            if not isinstance(value, str) and (value is not None or name == "decimal"):
+                raise DataError(f"{name}={value!r}: must be a text.")
+        for name in ("columns", "input_units", "output_units"):
+            object.__setattr__(self, name, _texts(getattr(self, name), name))
         _check_marks(self)
         check_integer(self.skip_rows, "skip_rows", 0, error=DataError)
         if self.units_row is not None:
@@ -196,8 +202,18 @@ def _check_encoding(name: Any) -> None:
                         "'cp1252' and 'utf-16'.") from None
 
 
+def _texts(given: Any, name: str) -> list[str] | None:
+    """Return one text or several as a list; None stays None."""
+    if given is None:
+        return None
+    several = [given] if isinstance(given, str) else given
+    if not isinstance(several, list | tuple) or not all(isinstance(one, str) for one in several):
+        raise DataError(f"{name}={given!r}: must be a list of texts.")
+    return list(several)
+
+
 def _words(given: Any, name: str) -> tuple[str, ...]:
-    several = given.split(",") if isinstance(given, str) else [given] if isinstance(given, int | float) else given or ()
+    several = given if isinstance(given, list | tuple | set | frozenset) else [given] * (given is not None)
     words = []
     for word in several:
         if isinstance(word, bool) or not isinstance(word, str | int | float | np.number):
@@ -213,6 +229,8 @@ def _qualities(given: Any) -> dict[str, str] | None:
     if isinstance(given, Mapping):
         return {str(column): str(good) for column, good in given.items()}
     found = {}
+    if not isinstance(given, str | list | tuple):
+        raise DataError(f"quality={given!r}: must be a mapping such as {{'PV.Q': 192}}, or words such as 'PV.Q:192'.")
     for word in given.split() if isinstance(given, str) else given:
         column, colon, good = str(word).rpartition(":")
         if not (column and colon and good):

@@ -36,7 +36,9 @@ def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
         table = nw.from_native(frame, eager_only=True)
     index = index_name(frame, names)
     if index is not None:
-        values = frame.index
+        values = frame.index.to_timestamp() if hasattr(frame.index, "to_timestamp") and str(
+            frame.index.dtype).startswith("period") else frame.index
+        frame = frame.set_axis(values)
         # A series of the same index joins the frame row by row, whatever the index holds twice.
         table = nw.from_native(frame.assign(**{index: values.to_series(index=values).array}), eager_only=True)
     return names, table
@@ -45,6 +47,8 @@ def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
 def index_name(frame: Any, names: Sequence[str]) -> str | None:
     """Return the name by which the time index of a pandas frame is read; None where its index is no time."""
     index = getattr(frame, "index", None)
+    if hasattr(index, "to_timestamp") and str(index.dtype).startswith("period"):
+        return None if index.name in names else str(index.name or "index")
     kind = getattr(getattr(index, "dtype", None), "kind", "")
     name = getattr(index, "name", None)
     if kind not in ("M", "m") and not (name is not None and is_time_name(str(name)) and kind in ("i", "u", "f", "O")):

@@ -19,9 +19,9 @@ def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> Data
         loaded = table.load(texts, set(texts))
     except DataError:
         return error
-    asked = [one for wanted in (inputs, outputs) if wanted is not None
-             for one in ([wanted] if isinstance(wanted, str | int) else
-                         list(wanted.values()) if hasattr(wanted, "values") else wanted)]
+    asked = [one for wanted in (inputs, outputs) for one in (
+        wanted.values() if isinstance(wanted, dict) else wanted if isinstance(wanted, list | tuple) else [wanted])
+        if one is not None]
     for name in texts:
         cells = np.asarray(loaded[name])
         if cells.dtype.kind not in "UO" or cells.ndim != 1:

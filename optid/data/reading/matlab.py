@@ -1,26 +1,30 @@
-"""MAT files of version 5 and 7.3, read in a child process: a damaged file may crash the library or exhaust memory."""
+"""MAT files of versions 4 to 7.3, read in a child process: a damaged file may crash the library or exhaust memory."""
 
 import os
-import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from optid.data.reading.clock import is_time_name
+from optid.data.reading.mat_contents import MatContents, read_contents
+from optid.data.reading.mat_tree import open_tree
 from optid.errors import DataError
 from optid.processes import run_forked
 
 MAT = 'pip install "optid[mat]"'
-TEXT = (b"char", b"cell", b"function_handle")
 MEMORY, EXPANSION = 4 << 30, 32  # memory limit in bytes, or `EXPANSION` times the size of the file if that is more
 SECONDS, PACE = 60.0, 1 << 30  # time limit, and again for each `PACE` bytes
 
 
-def mat_variables(path: Path, names: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return numeric variables by name, fields of structures as "structure.field"; without names {name: None} of all.
+def mat_contents(path: Path, names: Sequence[str] | None = None) -> MatContents:
+    """Return the variables of these names, by default only the names of all, their clocks and what is refused.
 
-    `DataError`: a damaged file, a link to another file, too much time or memory for its size, or h5py is missing.
+    `DataError`: a damaged file, a link to another file, too much time or memory for its size, h5py is missing, no such
+    name, or an experiment that lacks a variable that others have.
     """
     if not hasattr(os, "fork"):
         return _variables(path, names)
@@ -34,67 +38,87 @@ def mat_variables(path: Path, names: Sequence[str] | None = None) -> dict[str, A
         raise DataError(f"{damaged}: the process that read it crashed ({death}).") from None
 
 
-def _variables(path: Path, names: Sequence[str] | None) -> dict[str, Any]:
-    """Return {name: array} of these numeric variables; {name: None} of all where no names are given."""
+@dataclass(frozen=True)
+class MatExperiment:
+    """One experiment of some signals."""
+
+    label: str  # name of the file and number of the experiment, for messages
+    names: list[str]  # names that can be loaded
+    load: Callable[..., dict[str, Any]]  # function of names, returning {name: array}
+    index: str | None  # name of the time vector
+    step: float | None  # sampling time in seconds that a scalar beside the signals says
+    findings: tuple[str, ...]
+
+
+def split_experiments(path: Path, listing: MatContents, signals: Sequence[str], time: Any) -> list[MatExperiment]:
+    """Return the experiments of some signals, with the clock beside them.
+
+    Args:
+        path: the file.
+        listing: its contents without arrays.
+        signals: names of inputs and outputs.
+        time: as of `optid.data.readers.read`; None and True take the clock beside the signals.
+
+    Raises:
+        DataError: a signal or its clock cannot be read, or time is True and there is none; loading raises it also where
+            the clocks of the signals differ, or where an experiment lacks a signal that another one has.
+    """
+    by_default = time is None or time is True
+    clocks = [listing.clocks[name] for name in signals if name in listing.clocks] if by_default else []
+    clocks = [name for name in dict.fromkeys(clocks) if name not in signals]
+    if time is True and not clocks:
+        raise DataError(f"{path.name} has no time vector t or time, and no scalar Ts or fs, beside the signals.")
+    for name in [name for name in (*signals, *clocks) if name in listing.refused]:
+        ignored = " (time=False ignores it)" if name in clocks else ""
+        raise DataError(f"{path.name}: {name!r} {listing.refused[name]}{ignored}")
+    vectors = [name for name in clocks if name not in listing.steps]
+    beside = {name: listing.clocks.get(name, "") for name in vectors}
+    rivals = [rival for name, rival in beside.items() if rival.rpartition(".")[0] == name.rpartition(".")[0]]
+    steps = {name: listing.steps[name] for name in (*clocks, *rivals) if name in listing.steps}
+    if steps and max(steps.values()) > min(steps.values()) * (1 + 1e-9):
+        raise DataError(f"{path.name}: the sampling times of the signals differ: {steps}. Resample the signals.")
+    count = max(listing.counts[name] for name in signals)
+
+    @cache
+    def read(wanted: tuple[str, ...]) -> Sequence[dict[str, Any]]:
+        used = vectors if set(vectors) & set(wanted) else []
+        contents = mat_contents(path, list(dict.fromkeys([*wanted, *used])))
+        for name, reason in contents.refused.items():
+            raise DataError(f"{path.name}: {name!r} {reason}")
+        if len(contents.experiments) != count:
+            raise DataError(f"{path.name}: the inputs and outputs have {count} experiments, with "
+                            f"{', '.join(wanted)} there are {len(contents.experiments)}.")
+        for arrays in contents.experiments:
+            arrays |= {name: step * np.arange(len(arrays[signals[0]])) for name, step in contents.steps.items()}
+            if not all(_is_same(arrays[name], arrays[used[0]]) for name in used):
+                raise DataError(f"{path.name}: the clocks of its signals differ ({', '.join(used)}). Resample the "
+                                "signals onto one of them, or pass time=False and dt.")
+        return contents.experiments
+
+    def load(number: int, wanted: Sequence[str], *_: Any) -> dict[str, Any]:
+        arrays = read(tuple(wanted))[number]
+        return {name: arrays[name] for name in wanted}
+
+    names = [name for name in listing.experiments[0] if not by_default or name in signals or not is_time_name(name)]
+    findings = tuple(f"clock {name!r}: {step:g} s" for name, step in steps.items() if not vectors)
+    return [MatExperiment(path.name if count == 1 else f"{path.name}, experiment {number + 1}", names,
+                          partial(load, number), vectors[0] if vectors else None, next(iter(steps.values()), None),
+                          findings) for number in range(count)]
+
+
+def _is_same(one: np.ndarray, other: np.ndarray) -> bool:
+    return one.shape == other.shape and np.allclose(one, other, rtol=1e-9, equal_nan=True)
+
+
+def _variables(path: Path, names: Sequence[str] | None) -> MatContents:
+    """Return these variables; the child process runs this."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            try:
-                found = _of_version_5(path, names)
-            except NotImplementedError:
-                found = _of_version_7(path, names)
+        with open_tree(path) as tree:
+            return read_contents(tree, names)
+    except DataError as error:
+        raise DataError(f"{path.name}: {error}") from None
     except Exception as error:  # whatever a library raises on a damaged file
         if isinstance(error, ImportError) and "h5py" in str(error):
             raise DataError(f"{path.name} is a MAT file of version 7.3, which needs h5py: {MAT}") from None
         text = str(error) or type(error).__name__
         raise DataError(f"{path.name} is damaged, or not a MAT file: {text}") from None
-    return dict.fromkeys(found) if names is None else found
-
-
-def _of_version_5(path: Path, names: Sequence[str] | None) -> dict[str, Any]:
-    """Return the numeric variables, and the fields of structures as "structure.field"."""
-    from scipy.io import loadmat
-
-    wanted = None if names is None else sorted({name.split(".")[0] for name in names} | set(names))
-    # With mat_dtype a double that MATLAB packed into bytes comes back as a double.
-    content = loadmat(path, mat_dtype=True, variable_names=wanted)
-    found = {}
-    for name, value in content.items():
-        if not isinstance(value, np.ndarray) or name.startswith("__"):
-            continue
-        if value.dtype.names and value.size == 1:
-            found |= {f"{name}.{part}": value.flat[0][part] for part in value.dtype.names}
-        else:
-            found[name] = value
-    return {name: value for name, value in found.items() if getattr(value, "dtype", np.dtype(object)).kind in "biufc"}
-
-
-def _of_version_7(path: Path, names: Collection[str] | None) -> dict[str, Any]:
-    """Return the numeric data sets of an HDF5 file; a ValueError where one is in another file."""
-    import h5py
-
-    found: dict[str, Any] = {}
-
-    def visit(group: Any, prefix: str, above: list[Any]) -> None:
-        for key in group:
-            link = group.get(key, getlink=True)
-            if isinstance(link, h5py.ExternalLink):
-                raise ValueError(f"{prefix + key!r} is a link to another file, {link.filename!r}: optid follows none")
-            if isinstance(link, h5py.SoftLink) or key.startswith("#"):
-                continue
-            item, name = group[key], prefix + key
-            if isinstance(item, h5py.Group):
-                if item.id not in above:  # groups can hold each other
-                    visit(item, name + ".", [*above, item.id])
-            elif isinstance(item, h5py.Dataset) and item.dtype.kind in "iuf" and \
-                    item.attrs.get("MATLAB_class", b"") not in TEXT:
-                if item.external or item.is_virtual:
-                    raise ValueError(f"the samples of {name!r} are stored in another file: optid opens none")
-                if names is None:
-                    found[name] = None
-                elif name in names:
-                    found[name] = item[()].T  # HDF5 stores MATLAB's columns as rows
-
-    with h5py.File(path, "r") as file:
-        visit(file, "", [file.id])
-    return found

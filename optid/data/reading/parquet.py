@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.data.reading.chunks import Block
-from optid.data.reading.frames import load_frame
+from optid.data.reading.frames import dated_columns, load_frame
 from optid.data.reading.parts import Part, file_parts
 from optid.errors import DataError
 
@@ -43,10 +43,12 @@ def load_parquet(path: Path, wanted: Sequence[str], texts: Set[str]) -> dict[str
 def parquet_footer(path: Path) -> tuple[list[str], int, tuple[str, ...]]:
     """Return columns, number of rows and columns of dates; `DataError` if the file is damaged or pyarrow is missing."""
     parquet = _pyarrow_parquet(path)
-    with _undamaged(path):
-        schema = parquet.read_schema(path)
-        dates = tuple(field.name for field in schema if str(field.type).startswith(("timestamp", "date", "duration")))
-        return list(schema.names), parquet.read_metadata(path).num_rows, dates
+    import pyarrow as pa
+
+    with _undamaged(path), parquet.ParquetFile(path) as file:
+        head = next(file.iter_batches(50), None)
+        dates = () if head is None else dated_columns(pa.Table.from_batches([head]))
+        return list(file.schema_arrow.names), file.metadata.num_rows, dates
 
 
 def parquet_blocks(path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], texts: Set[str]

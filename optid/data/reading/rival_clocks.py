@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.data.reading.clock import Clock, recognise, seconds
+from optid.data.reading.clock import Clock, NoStamps, recognise, seconds
 from optid.data.reading.sources import Table
 from optid.errors import DataError
 
@@ -25,20 +25,19 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     Raises:
         DataError: the only column, or one that the user named, holds no stamps; or two clocks disagree.
     """
-    found: list[tuple[Clock, np.ndarray]] = []
-    refused: list[DataError] = []
+    clocks: list[Clock] = []
+    refused: dict[str, NoStamps] = {}
     for name in names:
         try:
-            clock = recognise(block, [name], table.how, table.label, table.units.get(name, ""))
-            found.append((clock, clock.stamps(block, table.label)))
-        except DataError as error:
+            clocks.append(recognise(block, [name], table.how, table.label, table.units.get(name, "")))
+        except NoStamps as error:
             if asked:
                 raise
-            refused.append(error)
-    if not found:
-        raise refused[0]
-    if refused and any("date_format=" in str(error) for error in refused):
-        raise refused[0]
+            refused[name] = error
+    if not clocks:
+        raise next(iter(refused.values()))
+    said = [f"column {name!r} holds no time stamps and is not taken as the clock" for name in refused]
+    found = [(clock, clock.stamps(block, table.label)) for clock in clocks]
     found = _paired(found, block, table)
     moving = [one for one in found if one[1].size < 2 or one[1][0] != one[1][-1] or (one[1] != one[1][0]).any()]
     found = moving or found
@@ -51,7 +50,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     if len(found) > 1:  # of clocks that agree the one with the finer stamps, dated if both are
         clock, stamps = min(found, key=lambda one: (np.mean(np.diff(one[1]) == np.diff(one[1][:1].repeat(2)))
                                                     if one[1].size > 1 else 0, one[1].dtype.kind != "M"))
-    return clock, stamps, [clock.finding] if clock.finding else []
+    return clock, stamps, [clock.finding] * bool(clock.finding) + said
 
 
 def _paired(found: list[tuple[Clock, np.ndarray]], block: Mapping[str, Any], table: Table

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.data.reading.clock import is_rate_name, is_step_name
 from optid.data.reading.columns import position_names
 from optid.data.reading.csvfile import open_csv
 from optid.data.reading.format import Format
@@ -20,8 +21,6 @@ from optid.errors import DataError
 
 TEXT = (".csv", ".txt", ".tsv", ".lvm", ".dat", ".asc")
 PLANT = (".xlsx", ".tdms", ".mf4")
-STEPS = ("ts", "dt", "sampletime", "samplingtime", "timestep", "samplinginterval", "deltat")
-RATES = ("fs", "samplerate", "samplingrate", "samplingfrequency", "samplefrequency")
 
 
 @dataclass(frozen=True)
@@ -40,6 +39,11 @@ class Table:
     step: float | None = None  # sampling time that stands beside the samples
     advice: str = ""  # what a refusal proposes to type
     findings: tuple[str, ...] = ()
+    # function of the columns of inputs and outputs, and of `time` as of `optid.data.readers.read`, where they decide
+    # which experiments there are, and with which clock: returns a table for each
+    split: Callable[[Sequence[str], Any], "list[Table]"] | None = None
+    inputs: Mapping[str, str] | None = None  # {channel: column} of the inputs, where the source says it
+    outputs: Mapping[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -110,7 +114,7 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[Table]:
         return [Table(path.name, list(head.columns), partial(load_parquet, path), how, None, dated_columns(head))]
     if kind == ".npz":
         names = list(npz_arrays(path))
-        known = npz_arrays(path, [name for name in names if name.lower().replace("_", "") in (*STEPS, *RATES)])
+        known = npz_arrays(path, [name for name in names if is_step_name(name) or is_rate_name(name)])
         step, rest = _stated_step(known, path.name)
         names = [name for name in names if name not in known or name in rest]
         return [Table(path.name, names, lambda wanted, _: npz_arrays(path, wanted), how, step=step)]
@@ -122,12 +126,24 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[Table]:
 
         return [_of_frame(label, frame, how) if units is None else replace(_of_frame(label, frame, how), units=units)
                 for label, frame, units in plant_tables(path, kind)]
-    from optid.data.reading.matlab import mat_variables
+    return [_of_mat(path, how)]
 
-    names = list(mat_variables(path))
-    if not names:
-        raise DataError(f"{path.name} holds no arrays of numbers.")
-    return [Table(path.name, names, lambda wanted, _: mat_variables(path, wanted), how)]
+
+def _of_mat(path: Path, how: Format) -> Table:
+    from optid.data.reading.matlab import mat_contents, split_experiments
+
+    contents = mat_contents(path)
+    names = list(contents.experiments[0])
+    if not set(names) - contents.refused.keys():
+        reasons = " ".join(f"{name!r} {reason}" for name, reason in list(contents.refused.items())[:3])
+        raise DataError(f"{path.name} holds no arrays of numbers. {reasons}".rstrip())
+
+    def split(signals: Sequence[str], time: Any) -> list[Table]:
+        return [Table(one.label, one.names, one.load, how, one.index, units=contents.units, step=one.step,
+                      findings=one.findings) for one in split_experiments(path, contents, signals, time)]
+
+    return Table(path.name, names, lambda wanted, _: mat_contents(path, wanted).experiments[0], how, split=split,
+                 inputs=contents.inputs or None, outputs=contents.outputs or None)
 
 
 def _of_frame(label: str, frame: Any, how: Format) -> Table:
@@ -152,14 +168,14 @@ def _stated_step(named: Mapping[str, Any], label: str) -> tuple[float | None, di
     """Return the sampling time that stands beside the samples as a single number, and the other variables."""
     step, others = None, dict(named)
     for name, value in named.items():
-        word = name.rpartition(".")[2].lower().replace("_", "")
-        if word in (*STEPS, *RATES) and np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf":
+        word = name.rpartition(".")[2]
+        if (is_step_name(word) or is_rate_name(word)) and np.size(value) == 1 and np.asarray(value).dtype.kind in "iuf":
             number = float(np.ravel(value)[0])
             if not 0 < number < np.inf:
-                kind = "rate" if word in RATES else "time"
+                kind = "rate" if is_rate_name(word) else "time"
                 raise DataError(f"{label}: {name} = {number:g}: the sampling {kind} that stands beside the samples "
                                 "must be positive; leave it out and pass dt=.")
-            step = 1 / number if word in RATES else number
+            step = 1 / number if is_rate_name(word) else number
             del others[name]
     return step, others
 
