@@ -64,8 +64,8 @@ def test_the_findings_of_the_record_come_before_every_verdict(clockless):
         warnings.simplefilter("ignore")
         found = optid.identify(clockless, budget=2, workers=1, classes=["linear"])
     checked, compared = optid.validate(fit.model, clockless), optid.compare_models({"a": fit.model}, clockless)
-    for text, verdict in ((str(fit), "The model on this record"), (str(checked), "Validation on"), (str(found), "Search"),
-                          (str(compared), "Fit on"), (str(optid.order(clockless)), "Order of"),
+    for text, verdict in ((str(fit), "The model on this record"), (str(checked), "Validation on"),
+                          (str(found), "Search"), (str(compared), "Fit on"), (str(optid.order(clockless)), "Order of"),
                           (fit_html(fit), "The model on this record"), (search_html(found), "Search"),
                           (checked._repr_html_(), "Residual tests"), (report.render(fit), "The model on this record")):
         before(text, verdict)
@@ -112,7 +112,8 @@ def test_a_fit_without_a_model_begins_with_the_findings(clockless):
     ({"dt": 60.0, "start": DATE}, "s", "sampling time: 60 s")])
 @pytest.mark.parametrize(("formulation", "words"), [
     ("arx", {"na": 1, "nb": 2}), ("hammerstein_arx.exact", {"na": 1, "nb": 2, "basis": "triangular:4"}),
-    ("hammerstein_oe.exact", {"na": 1, "nb": 2, "basis": "triangular:4"}), ("armax.exact", {"na": 1, "nb": 2, "nc": 1}),
+    ("hammerstein_oe.exact", {"na": 1, "nb": 2, "basis": "triangular:4"}),
+    ("armax.exact", {"na": 1, "nb": 2, "nc": 1}),
     ("hammerstein_ss.asivid", {"nx": 1, "basis": "triangular:4"}), ("hammerstein_ss.exact", {"nx": 1, "basis": "triangular:4"})])
 def test_a_model_carries_the_unit_of_time_of_its_record(formulation, words, clock, unit, sampled, tmp_path):
     model = optid.fit(record(300, **clock), formulation, **words).model
