@@ -114,7 +114,8 @@ def test_a_fit_without_a_model_begins_with_the_findings(clockless):
     ("arx", {"na": 1, "nb": 2}), ("hammerstein_arx.exact", {"na": 1, "nb": 2, "basis": "triangular:4"}),
     ("hammerstein_oe.exact", {"na": 1, "nb": 2, "basis": "triangular:4"}),
     ("armax.exact", {"na": 1, "nb": 2, "nc": 1}),
-    ("hammerstein_ss.asivid", {"nx": 1, "basis": "triangular:4"}), ("hammerstein_ss.exact", {"nx": 1, "basis": "triangular:4"})])
+    ("hammerstein_ss.asivid", {"nx": 1, "basis": "triangular:4"}),
+    ("hammerstein_ss.exact", {"nx": 1, "basis": "triangular:4"})])
 def test_a_model_carries_the_unit_of_time_of_its_record(formulation, words, clock, unit, sampled, tmp_path):
     model = optid.fit(record(300, **clock), formulation, **words).model
     assert model.time_unit == unit
