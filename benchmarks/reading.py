@@ -52,7 +52,7 @@ def main() -> None:
     rounds = argparse.ArgumentParser(description=__doc__)
     rounds.add_argument("--rounds", type=int, default=5)
     count = rounds.parse_args().rounds
-    print(f"{'clock':<28} {'MB':>4}  {'reader':<7} {'wall s':>7} {'CPU s':>7} {'memory MB':>10}   ratio of wall, CPU, memory")
+    print(f"{'clock':<28} {'MB':>4}  {'reader':<7} {'wall s':>7} {'CPU s':>7} {'memory MB':>10}   ratios of the three")
     with tempfile.TemporaryDirectory() as folder:
         for name, unit in STAMPS.items():
             path = Path(folder) / "record.csv"
@@ -66,7 +66,8 @@ def main() -> None:
             medians = {reader: [statistics.median(one) for one in zip(*runs)] for reader, runs in found.items()}
             for reader, (wall, cpu, memory) in medians.items():
                 ratios = [a / b for a, b in zip(medians[reader], medians["pandas"])]
-                print(f"{name:<28} {path.stat().st_size / 1e6:>4.0f}  {reader:<7} {wall:>7.2f} {cpu:>7.2f} {memory:>10.0f}"
+                size = path.stat().st_size / 1e6
+                print(f"{name:<28} {size:>4.0f}  {reader:<7} {wall:>7.2f} {cpu:>7.2f} {memory:>10.0f}"
                       + (f"   {ratios[0]:.2f} {ratios[1]:.2f} {ratios[2]:.2f}" if reader != "pandas" else ""))
 
 

@@ -136,17 +136,17 @@ def one_of(name: str, value: Any, known: Sequence[str]) -> None:
         raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
 
 
-def finite(values: Any, name: str) -> np.ndarray:
-    """Copy coefficients into a read-only float64 array; refuse values that are not finite (`StructureError`)."""
+def finite(values: Any, name: str, largest: float = LARGEST) -> np.ndarray:
+    """Copy coefficients into a read-only float64 array; refuse those not finite or too large (`StructureError`)."""
     try:
         array = np.array(values, dtype=float)
     except (OverflowError, TypeError, ValueError) as error:
         raise StructureError(f"{name} must be an array of real numbers ({error}).") from error
-    if not (np.abs(array) <= LARGEST).all():
+    if not (np.abs(array) <= largest).all():
         if not np.isfinite(array).all():
             at = ",".join(str(i) for i in np.argwhere(~np.isfinite(array))[0])
             raise StructureError(f"{name} contains a value that is not finite, {name}[{at}].")
-        raise StructureError(f"{name} contains a value above {LARGEST:g}, whose square overflows.")
+        raise StructureError(f"{name} contains a value above {largest:g}: take larger units.")
     array.flags.writeable = False
     return array
 

@@ -16,11 +16,12 @@ PIECES = [b",", b";", b"\t", b'"', b"'", b"\n", b"\r", b"\r\n", b"\0", b" ", b"-
           b"0000-00-00", b"1" * 400, "\u0663".encode(), b"NaT", b"time", b"t,t", b"sep=", b"***End_of_Header***\n"]
 
 VALUES: list[Any] = [
-    None, True, False, 0, 1, -1, 3, 1e9, 10**30, 0.5, -0.5, float("nan"), float("inf"), "", " ", "x", ",", ";", ".", "\t",
-    "\\t", "missing", "experiments", "1s", "-1s", "5 min", "1e400", "Europe/Berlin", "%Y", "%", "%d.%m.%Y %H:%M:%S", "%f",
-    "utf-8", "utf-16", "latin-1", "rot13", "idna", "u", "y", "time", ["u"], ["u", "y"], ["u", "y", "time"], {"u": 1},
-    {"u": None}, {"y": "x"}, [None], [[1]], object(), b"x", np.arange(3), "2024-05-01", "9999-99-99",
-    np.datetime64("2024-05-01"), np.datetime64("NaT"), "u:192", "-9999", "BAD,NO DATA", ("a", 1)]
+    None, True, False, 0, 1, -1, 3, 1e9, 10**30, 0.5, -0.5, float("nan"), float("inf"), "", " ", "x", ",", ";", ".",
+    "\t", "\\t", "missing", "experiments", "1s", "-1s", "5 min", "1e400", "Europe/Berlin", "%Y", "%",
+    "%d.%m.%Y %H:%M:%S", "%f", "utf-8", "utf-16", "latin-1", "rot13", "idna", "u", "y", "time", ["u"],
+    ["u", "y"], ["u", "y", "time"], {"u": 1}, {"u": None}, {"y": "x"}, [None], [[1]], object(), b"x", np.arange(3),
+    "2024-05-01", "9999-99-99", np.datetime64("2024-05-01"), np.datetime64("NaT"), "u:192", "-9999", "BAD,NO DATA",
+    ("a", 1)]
 
 
 def damaged(text: bytes, r: np.random.Generator) -> bytes:

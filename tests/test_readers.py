@@ -264,7 +264,7 @@ def test_a_file_of_old_line_ends(tmp_path):
 
 @pytest.mark.parametrize("delimiter", ["", ",,", "a", '"', "\n", 3])
 def test_bad_delimiter(tmp_path, delimiter):
-    refuses(DataError, "one character", read, write(tmp_path, CSV), delimiter=delimiter)
+    refuses(DataError, "one character|must be a text", read, write(tmp_path, CSV), delimiter=delimiter)
 
 
 def test_a_hundred_thousand_columns(tmp_path):

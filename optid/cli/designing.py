@@ -40,7 +40,7 @@ def design(like: Words = None, example: str | None = None, *, how: dict[str, Any
     for name, value in (("--band", band), ("--amplitude", amplitude)):
         if value is not None and (len(value) % 2 or (name == "--band" and len(value) != 2)):
             raise StructureError(f"{name} {' '.join(f'{v:g}' for v in value)}: give two numbers, low and high.")
-    with working(excitation=output) as work:
+    with working(output) as work:
         record: Any = words.record(like, how, example, seed, asked="--like FILE")[0]
         work.step(f"designing a {kind}")
         from optid.identify.design import design as designed
@@ -52,8 +52,7 @@ def design(like: Words = None, example: str | None = None, *, how: dict[str, Any
             seed=seed, rows=rows, basis=words.one_or_all(words.listed(basis)) or "polynomial:4",
             feedback_basis=words.one_or_all(words.listed(feedback_basis)),
         )
-        if output is not None:
-            found.save(output)
+        work.write("excitation", output, found.save)
         work.text = str(found)
 
 
@@ -75,7 +74,7 @@ def order(data: Paths = None, example: str | None = None, *, how: dict[str, Any]
         holdout (SHARE): Share of the record held out.
         level: Probability of rejecting the true order. [dim]at most 0.01[/]
     """
-    with working(picture=picture) as work:
+    with working(picture) as work:
         from optid.cli import arguments as words
 
         record: Any = words.record(data, how, example, seed)[0]
@@ -85,5 +84,5 @@ def order(data: Paths = None, example: str | None = None, *, how: dict[str, Any]
         found = study(record, basis=words.one_or_all(words.listed(basis)),
                       feedback_basis=words.one_or_all(words.listed(feedback_basis)), block_rows=block_rows, nx=nx,
                       na=na, nb=nb, nk=nk, holdout=holdout, level=level)
-        work.draw(found.plot, picture)
         work.text = str(found)
+        work.draw(found.plot, picture)

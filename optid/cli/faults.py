@@ -30,7 +30,7 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
 
     if onset != "unknown" and not onset.isdecimal():
         raise StructureError(f"--onset {onset}: must be the number of a sample, or unknown")
-    with working(picture=picture) as work:
+    with working(picture) as work:
         from optid.faults import dictionary
 
         plant = words.state_space_model(model)
@@ -41,8 +41,8 @@ def isolability(model: Path, window: int = 100, onset: str = "unknown", prob: fl
         work.step("simulating faults")
         study = found.isolability(window, onset=onset if onset == "unknown" else int(onset), prob=prob,
                                   false_alarm=false_alarm, draws=draws, seed=seed)
-        work.draw(study.plot, picture)
         work.text = str(study)
+        work.draw(study.plot, picture)
 
 
 def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how: dict[str, Any], healthy: Paths = None,
@@ -75,7 +75,7 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
     The result:
         out (FILE): Write the diagnosis (.json).
     """
-    with working(diagnosis=out, report=report, picture=picture) as work:
+    with working(out, report, picture) as work:
         from optid.cli import arguments as words
         from optid.errors import DataError
         from optid.faults import diagnose as judge
@@ -105,20 +105,19 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
             plant, record, found, false_alarm=false_alarm, max_faults=max_faults, method=method, coverage=coverage,
             model_uncertainty=uncertainty, robust=robust, healthy=sound, rescale=rescale, seed=seed, solver=solver,
         )
-        if out is not None:
-            answer.save(out)
-        if report is not None:
-            from optid.faults.diagnosis.page import write
-
-            work.step("report")
-            write(answer, report, record=record.name, command=command_line())
-        work.draw(answer.plot, picture)
+        work.write("diagnosis", out, answer.save)
+        work.text = str(answer)
         if origin is None and answer.detected:
             work.heard.append(
                 "The model is assumed exact: a model error may appear as a fault. --identified FILE (the record "
                 "from which the model was identified) accounts for its uncertainty."
             )
-        work.text = str(answer)
+        if report is not None:
+            from optid.faults.diagnosis.page import write
+
+            work.write("report", report, lambda path: write(
+                answer, path, record=record.name, command=command_line()))
+        work.draw(answer.plot, picture)
 
 
 def _origin(identified: list[Path] | None, how: dict[str, Any]) -> Any:
@@ -162,7 +161,7 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
         target (Y...): Check whether these constant outputs are attainable; one number per output.
         saved (--model -m FILE): Write the model of the damaged system (JSON).
     """
-    with working(model=saved, report=report, picture=picture) as work:
+    with working(saved, report, picture) as work:
         from optid.cli import arguments as words
         from optid.faults import load_diagnosis
         from optid.faults import reformulate as rebuild
@@ -177,14 +176,13 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
             stage=stage, nodes=nodes, low=words.numbers(low, "--low"), high=words.numbers(high, "--high"),
             if_ambiguous=if_ambiguous, solver=solver, seed=seed,
         )
+        work.write("model", saved, lambda path: built.model.save(path))
         work.text = str(built)
         if target is not None:
             work.text += f"\ntarget {built.attainable(words.numbers(target, '--target') or [])}"
-        if saved is not None:
-            built.model.save(saved)
         if report is not None:
             from optid.faults.repair.page import write
 
-            work.step("report")
-            write(built, report, record=record.name or (data[0].name if data else ""), command=command_line())
+            work.write("report", report, lambda path: write(
+                built, path, record=record.name or (data[0].name if data else ""), command=command_line()))
         work.draw(built.plot, picture)

@@ -44,14 +44,14 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
     if data and formulation == DEFAULT and not stream and all(word is None for word in asked):
         _search(data, example, how, seed, split, test, constraint, solver, saved, report, accuracy=accuracy)
         return
-    with working(model=saved, report=report) as work:
+    with working(saved, report) as work:
         from optid.cli import arguments as words
 
         record, suggestion = words.record(data, how, example, seed, stream=stream, scheduler=scheduler)
         import_cvxpy()
         from optid.identify.fitting import fit as fit_model
         from optid.identify.selection import fit_by_holdout
-        from optid.show.printing import describe
+        from optid.show.printing import describe, describe_advice
 
         arguments = words.suited(suggestion, formulation) if suggestion else {}
         arguments |= words.pairs(settings, "--set") | ({"constraints": constraint} if constraint else {})
@@ -63,12 +63,12 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
             record, formulation, solver=solver, accuracy=accuracy, time_limit=time_limit, prove=prove,
             solver_options=words.pairs(option, "--option"), **arguments,
         )
+        _save(work, found, held_out, saved, None if stream or scheduler else data, how)
         work.step("standard errors")
         work.text = describe(found)
-        if found.verdict is not None and found.verdict.word in ("poor", "useless"):
-            work.step("searching for advice")
-            work.text += "".join(f"\nAdvice: {advice}" for advice in found.advice)
-        _finish(work, found, record, held_out, saved, None if stream or scheduler else data, how)
+        work.step("searching for advice")
+        work.text += describe_advice(found)
+        _check(work, found, record, held_out, "fit")
         work.page(found, report, held_out)
 
 
@@ -97,7 +97,7 @@ def identify(data: Paths = None, example: str | None = None, *, how: dict[str, A
 def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
             constraint: Words, solver: str, saved: File, report: File, **settings: Any) -> None:
     check_names(constraint, solver)
-    with working(model=saved, report=report) as work:
+    with working(saved, report) as work:
         from optid.cli import arguments as words
 
         record: Any = words.record(data, how, example, seed)[0]
@@ -106,30 +106,33 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
 
         record, held_out = words.held_out(record, split, test, how)
         found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
+        _save(work, found, held_out, saved, data, how)
         work.text = str(found)
-        _finish(work, found, record, held_out, saved, data, how, "search")
+        _check(work, found, record, held_out, "search")
         work.page(found, report, held_out)
 
 
-def _finish(work: Work, found: Any, record: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any],
-            what: str = "fit") -> None:
-    """Validate on the held-out record and save the model; a record that was used whole is named in its file."""
+def _save(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any]) -> None:
+    """Save the model; a record that was used whole is named in its file."""
     from optid.cli import arguments as words
 
+    record = None
+    if data and held_out is None:
+        named = {key: words.listed(value) if isinstance(value, list) else value for key, value in how.items()}
+        record = {**named, "files": [str(Path(name).resolve()) for name in data]}
+    work.write("model", saved, lambda path: found.model.save(path, record))
+
+
+def _check(work: Work, found: Any, record: Any, held_out: Any, what: str) -> None:
+    """Validate on the held-out record, if there is one; findings that were printed before are not repeated."""
     if held_out is not None:
         from optid.identify.validation.checks import validate as check
 
         work.step("validating")
         checked = check(found.model, held_out)
-        if checked.findings == record.findings:  # printed before the fit
+        if checked.findings == record.findings:
             checked = replace(checked, findings=())
         work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{checked}"
-    if saved is not None:
-        read_from = None
-        if data and held_out is None:
-            named = {key: words.listed(value) if isinstance(value, list) else value for key, value in how.items()}
-            read_from = {**named, "files": [str(Path(name).resolve()) for name in data]}
-        found.model.save(saved, read_from)
 
 
 def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:
@@ -142,7 +145,7 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
     The result:
         horizon (N): Also compute N-step-ahead predictions.
     """
-    with working(report=report) as work:
+    with working(report) as work:
         from optid.cli import arguments as words
         from optid.identify.validation import compare_models
         from optid.identify.validation import validate as check

@@ -12,7 +12,7 @@ def look(data: Paths = None, example: str | None = None, *, how: dict[str, Any],
 
     Example: optid look data.csv --inputs u --outputs y --report record.html
     """
-    with working(report=report, picture=picture) as work:
+    with working(report, picture) as work:
         from optid.cli import arguments as words
 
         record: Any = words.record(data, how, example, seed)[0]

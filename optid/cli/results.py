@@ -51,52 +51,65 @@ def check_folders(*paths: Path | None) -> None:
 
 
 class Work(Waiting):
-    """The progress of a command, and the text that it prints at the end.
+    """The progress of a command, and what it prints at the end, also where an error ends it.
 
     Attributes:
         text: the result.
         heard: warnings for the user, which the result may already contain.
+        written: files by their content, such as ``{"model": path}``.
     """
 
-    text = ""
-    heard: list[str]
+    def __init__(self) -> None:
+        super().__init__()
+        self.text, self.heard, self.written = "", [], {}
+
+    def write(self, what: str, path: Path | None, write: Callable[[Path], Any]) -> None:
+        """Write a file by a function if a path is given."""
+        if path is not None:
+            self.step(f"writing the {what}")
+            write(path)
+            self.written[what] = path
 
     def draw(self, figure: Callable[[], Any], path: Path | None) -> None:
         """Write a figure of matplotlib if a path is given; `DataError` for an unknown ending."""
-        if path is not None:
-            self.step("drawing")
+        def save(path: Path) -> None:
             try:
                 figure().savefig(path, dpi=150)
             except ValueError as error:
                 raise DataError(f"{path}: {error}") from None
 
+        self.write("picture", path, save)
+
     def page(self, result: Any, path: Path | None, *more: Any) -> None:
         """Write the report of a result if a path is given; more arguments are those of its renderer."""
-        if path is not None:
-            self.step("writing the report")
-            render(result, "page", path, *more, command=command_line())
+        self.write("report", path, lambda path: render(result, "page", path, *more, command=command_line()))
+
+    def print(self) -> None:
+        """Print the result, the warnings that it does not contain, and the files written."""
+        if self.text:
+            say(coloured(self.text.replace("pass dt= ", "pass --dt ")))  # a finding names the argument of Python
+        said = " ".join(self.text.split())
+        for sentence in self.heard:
+            if " ".join(sentence.split()) not in said:
+                note(sentence)
+        for what, path in self.written.items():
+            say(f"{what} written to {path}")
 
 
 @contextmanager
-def working(**written: Path | None) -> Iterator[Work]:
-    """Give a command its `Work`; then print its result, the warnings that this does not contain, and the files written.
-
-    The files are given by their content, such as ``report=path``; `DataError` where one cannot be written.
-    """
-    check_folders(*written.values())
-    with hearing() as heard, Work() as work:
-        work.heard = heard
-        work.step("reading")
-        yield work
-    text = work.text.replace("pass dt= ", "pass --dt ")  # a finding of the record names the argument of Python
-    say(coloured(text))
-    said = " ".join(work.text.split())
-    for sentence in heard:
-        if " ".join(sentence.split()) not in said:
-            note(sentence)
-    for what, path in written.items():
-        if path is not None:
-            say(f"{what} written to {path}")
+def working(*files: Path | None) -> Iterator[Work]:
+    """Give a command its `Work`, and print that at the end; `DataError` where one of the files cannot be written."""
+    check_folders(*files)
+    work = Work()
+    try:
+        with hearing() as work.heard, work:
+            work.step("reading")
+            yield work
+    except BaseException:
+        work.heard = []  # printed already
+        work.print()
+        raise
+    work.print()
 
 
 def command_line() -> str:

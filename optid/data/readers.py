@@ -146,7 +146,7 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
     others = [name for name in (*clocks, *([group] if group is not None else []), *quality) if name not in signals]
     unused = [name for name in known.quality_columns(table.names, signals) if name not in (*quality, *others)]
     wanted = list(dict.fromkeys([*signals, *others, *unused]))
-    loaded = table.load(wanted, {*others, *unused} | ({group} if group is not None else set()))
+    loaded = table.load(wanted, dict.fromkeys([*others, *unused], "clock") | ({group: "text"} if group else {}))
     findings = [*table.findings]
     clock, stamps, said = _clock(table, loaded, clocks, time)
     findings += said

@@ -14,7 +14,16 @@ import numpy as np
 from optid.bases import Linear, fitted_bases
 from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
-from optid.errors import DataError, DataWarning, InfeasibleError, SolverFailed, StructureError, UnboundedError, nearest
+from optid.errors import (
+    DataError,
+    DataWarning,
+    InfeasibleError,
+    OptidError,
+    SolverFailed,
+    StructureError,
+    UnboundedError,
+    nearest,
+)
 from optid.identify.arguments import violations
 from optid.identify.parameters import Parameters, criteria, parameters
 from optid.identify.record_checks import examine, examine_figures
@@ -75,8 +84,12 @@ class Fit(Rendered):
     @cached_property
     def _completed(self) -> tuple[Any, dict[str, Any]]:
         evidence = self.outcome.evidence
-        model, figures = evidence.extended() if evidence else (self.outcome.model, {})
-        return _in_raw_units(model, self.data), {**self.outcome.figures, **figures}
+        try:
+            model, figures = evidence.extended() if evidence else (self.outcome.model, {})
+            return _in_raw_units(model, self.data), {**self.outcome.figures, **figures}
+        except OptidError as reason:  # of the noise model: the model alone was accepted by `fit`
+            model, figures = self.outcome.model, {"noise model": f"none: {reason}"}
+            return _in_raw_units(model, self.data), {**self.outcome.figures, **figures}
 
     @property
     def model(self) -> Any:

@@ -5,6 +5,7 @@ The covariance of gauge-free quantities, such as ``mu bᵀ`` or a prediction, do
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -22,6 +23,7 @@ from optid.identify.intervals import LocalEstimate
 from optid.program.expressions import differences, flat_value, jacobians, side_by_side
 from optid.program.limits import EQUALITIES, rows_of
 from optid.program.program import Program
+from optid.program.solution import Status
 from optid.structures.whitening import symmetric_root
 
 NO_EFFECT = 1e-10
@@ -50,7 +52,7 @@ class Tangent:
     meaning: str  # of the intervals, one of `MEANINGS`
 
     def __getstate__(self) -> dict[str, Any]:
-        _ = self._neighbours  # `rebuild`, which holds the programme, is not needed afterwards
+        _ = self.neighbours  # `rebuild`, which holds the programme, is not needed afterwards
         return {**vars(self), "rebuild": None}
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
@@ -58,9 +60,9 @@ class Tangent:
         return self.local.limits(self.slopes(quantity), level)
 
     def slopes(self, quantity: Quantity) -> Array:
-        """Derivatives (q, n) of a quantity in the whitened tangent coordinates, by central differences."""
+        """Derivatives (q, n) of a quantity in the whitened tangent coordinates, by differences of `neighbours`."""
         columns = []
-        for above, below, gap in self._neighbours:
+        for above, below, gap in self.neighbours:
             high, low = (np.ravel(np.asarray(quantity(model), dtype=float)) for model in (above, below))
             if high.shape != low.shape:
                 raise StructureError("the quantity changes its shape with the model, so it has no derivative")
@@ -68,15 +70,27 @@ class Tangent:
         return np.column_stack(columns) @ self.directions
 
     @cached_property
-    def _neighbours(self) -> list[tuple[Any, Any, float]]:
-        """Models a small step above and below in every unknown of the programme, and the distance between them."""
+    def neighbours(self) -> list[tuple[Any, Any, float]]:
+        """Models a small step above and below in every unknown of the programme, and the distance between them.
+
+        At the edge of the models, such as a zero of C on the unit circle, the model of the fit takes the place of the
+        one beyond; an unknown that cannot move to either side is a `StructureError`.
+        """
         sizes, found = np.abs(self.x), []
         scale = np.concatenate([np.full(part.size, max(float(np.max(part)), 1e-300))
                                 for part in _unpacked(self.shapes, sizes).values()])
         for j, step in enumerate(STEP * np.maximum(sizes, 1e-2 * scale)):
-            ends = self.x + np.outer([step, -step], np.eye(self.x.size)[j])
-            above, below = (self.rebuild(_unpacked(self.shapes, x)) for x in ends)
-            found.append((above, below, float(ends[0, j] - ends[1, j])))
+            ends = []
+            for x in self.x + np.outer([step, -step, 0.0], np.eye(self.x.size)[j]):
+                with suppress(StructureError):
+                    ends.append((self.rebuild(_unpacked(self.shapes, x)), float(x[j])))
+                if len(ends) == 2:
+                    break
+            else:
+                raise StructureError("the fit lies at the edge of the possible models, where no standard errors hold; "
+                                     "choose other orders, or a constraint such as stable:0.999")
+            (above, high), (below, low) = ends
+            found.append((above, below, high - low))
         return found
 
 
@@ -124,6 +138,8 @@ def _unpacked(shapes: dict[str, tuple[int, ...]], x: Array) -> dict[str, Array]:
 def _refuse(fit: Any) -> None:
     if not fit.solution.has_point:
         raise StructureError("the fit has no point, so that there are no intervals")
+    if fit.solution.status is Status.LIMIT:
+        raise StructureError(f"they hold at an optimum, and the solver stopped before one: {fit.solution.reason}")
     if fit.program.compressed is None:
         advice = "; use optid.bootstrap" if fit.model is not None and fit.model.structure == "arx" else ""
         raise StructureError("they follow from compressed least squares, which "

@@ -6,6 +6,7 @@ manifold. Near inequality constraints the interval is that of `optid.identify.in
 gives the same quantities from refits.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -15,9 +16,10 @@ from numpy.typing import ArrayLike
 
 from optid.arrays import Array, check_probability
 from optid.bases.expansions import Linear
-from optid.errors import StructureError
+from optid.errors import DataError, StructureError
 from optid.identify.intervals import DRAWS
 from optid.identify.tangent import Quantity, Tangent, linearise
+from optid.models.state_simulation import prepared, visited
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +70,14 @@ class Uncertainty:
     Attributes:
         source: where they come from.
         point: (m,) inputs at which `table` lists the static gain of a state-space model; None for zero.
+        state: (n,) from which its equilibrium there is looked for; None for zero.
     """
 
     model: Any = field(repr=False)
     level: float
     source: Tangent | Refits = field(repr=False)
     point: Array | None = field(default=None, repr=False)
+    state: Array | None = field(default=None, repr=False)
 
     @property
     def meaning(self) -> str:
@@ -142,10 +146,11 @@ class Uncertainty:
         points = np.linspace(nyquist / 200, nyquist, 200) if w is None else np.atleast_1d(np.asarray(w, dtype=float))
         reference = self.model.frequency_response(points)
         phase = np.unwrap(np.angle(reference), axis=0)
-        log = self.of(lambda model: np.log(np.abs(model.frequency_response(points))))
-        turn = self.of(lambda model: phase + np.angle(model.frequency_response(points) / reference))
-        value = np.exp(log.value)
-        size = Interval(value, value * log.error, np.exp(log.lower), np.exp(log.upper), points)
+        with np.errstate(all="ignore"):  # a response of zero has no logarithm, and a wide band may have no upper end
+            log = self.of(lambda model: np.log(np.abs(model.frequency_response(points))))
+            turn = self.of(lambda model: phase + np.angle(model.frequency_response(points) / reference))
+            value = np.exp(log.value)
+            size = Interval(value, value * log.error, np.exp(log.lower), np.exp(log.upper), points)
         return size, replace(turn, at=points)
 
     def of(self, quantity: Quantity) -> Interval:
@@ -165,34 +170,34 @@ class Uncertainty:
         """Return (name, estimate, standard error, lower, upper) of what tables of the model show.
 
         Those are the coefficients of a transfer function. Of a state-space model, whose matrices depend on the choice
-        of its states, they are the poles and the static gain.
+        of its states, they are the poles and, where the model and its neighbours rest, the static gain.
         """
-        names, quantity = self._state_quantities() if self.model.structure == "ss" else (
-            [name for name, _ in self.model.coefficients()],
-            lambda model: np.array([value for _, value in model.coefficients()]))
+        if self.model.structure != "ss":
+            names = [name for name, _ in self.model.coefficients()]
+            return self._rows(names, lambda model: np.array([value for _, value in model.coefficients()]))
+        poles = self.model.poles[self.model.poles.imag >= 0]
+        names = [f"pole {i + 1}{part}" for i, pole in enumerate(poles)
+                 for part in ([", real", ", imaginary"] if pole.imag else [""])]
+
+        def parts(model: Any) -> Array:
+            nearest = [model.poles[np.argmin(np.abs(model.poles - pole))] for pole in poles]
+            return np.array([part for now, pole in zip(nearest, poles)
+                             for part in ([now.real, now.imag] if pole.imag else [now.real])])
+
+        rows, names = self._rows(names, parts), [
+            f"static gain[{y},{u}]" for y in self.model.outputs for u in self.model.inputs]
+        point = np.zeros(self.model.m) if self.point is None else self.point
+        try:
+            near = self.model.equilibrium(point, self.state)[0]  # its neighbours might find another one from elsewhere
+            return rows + self._rows(names, lambda model: np.ravel(model.gain_at_rest(point, near)))
+        except StructureError:  # a pole at one, or no rest there
+            return rows
+
+    def _rows(self, names: Sequence[str], quantity: Quantity) -> list[tuple[str, float, float, float, float]]:
+        """Return (name, estimate, standard error, lower, upper) of every entry of a quantity."""
         found = self.of(quantity)
         rows = np.column_stack([found.value, found.error, found.lower, found.upper]).tolist()
         return [(name, *row) for name, row in zip(names, rows)]
-
-    def _state_quantities(self) -> tuple[list[str], Quantity]:
-        model, point = self.model, np.zeros(self.model.m) if self.point is None else self.point
-        poles = model.poles[model.poles.imag >= 0]
-        names = [f"pole {i + 1}{part}" for i, pole in enumerate(poles)
-                 for part in ([", real", ", imaginary"] if pole.imag else [""])]
-        try:
-            model.static_gain(point)
-            names += [f"static gain[{y},{u}]" for y in model.outputs for u in model.inputs]
-            gains = True
-        except StructureError:  # a pole at one, or no rest there
-            gains = False
-
-        def quantity(model: Any) -> Array:
-            nearest = [model.poles[np.argmin(np.abs(model.poles - pole))] for pole in poles]
-            parts = [part for now, pole in zip(nearest, poles)
-                     for part in ([now.real, now.imag] if pole.imag else [now.real])]
-            return np.append(parts, np.ravel(model.static_gain(point)) if gains else [])
-
-        return names, quantity
 
 
 def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0) -> Uncertainty:
@@ -222,10 +227,21 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
         return aligned(model, fit.model)
 
     source = linearise(fit, rebuild, draws, seed)
+    _ = source.neighbours  # so that models which cannot be differentiated are refused here, not by a table of them
     if fit.model.structure != "ss":
         return Uncertainty(fit.model, float(level), source)
-    inputs = np.vstack([e.u for e in fit.data.raw().experiments])
-    return Uncertainty(fit.model, float(level), source, np.nanmean(inputs, axis=0))
+    experiments = fit.data.raw().experiments
+    point = np.nanmean(np.vstack([e.u for e in experiments]), axis=0)
+    return Uncertainty(fit.model, float(level), source, point, _mean_state(fit.model, experiments))
+
+
+def _mean_state(model: Any, experiments: Sequence[Any]) -> Array | None:
+    """Return the mean state (n,) of a free run over the longest experiment; None where there is none."""
+    try:
+        u = max((e.u for e in experiments), key=len)
+        return visited(prepared(model, "free", u, None, None, ""), np.zeros(model.nx)).mean(axis=0)
+    except DataError:
+        return None
 
 
 def aligned(model: Any, reference: Any) -> Any:

@@ -20,7 +20,7 @@ from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.delays import shown_delays
 from optid.identify.validation.checks import record_structure, shares_outside
 from optid.identify.validation.correlations import cross_correlation
-from optid.identify.validation.predictions import fit_percent, one_step, simulated_or_nan
+from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.models.functions import has_feedback
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
@@ -80,7 +80,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     """
     raw = data.raw()
     y = np.vstack([e.y for e in raw.experiments])
-    runs, predicted = simulated_or_nan(model, raw), one_step(model, raw)
+    runs, predicted = simulated_or_nan(model, raw), one_step_or_nan(model, raw)
     own, ahead = (float(np.mean(fit_percent(y, np.vstack(found)))) for found in (runs, predicted))
     score, lost = (own, 0.0) if pooled is None else (pooled, own - pooled)
     parts = [Finding("simulation fit" if pooled is None else "cross-validated fit", _points(score), score >= POOR_FIT)]
@@ -110,14 +110,16 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
 def _residuals(data: Data, predicted: Sequence[Array]) -> Finding:
     residuals = [e.y - p for e, p in zip(data.experiments, predicted)]
     lags = min(LAGS, max(e.n_samples for e in data.experiments) // 4)
-    largest, place = 0.0, ""
+    largest, place, name = 0.0, "", "largest correlation of residuals and inputs"
+    if all(np.isnan(r).all() for r in residuals):
+        return Finding(name, "none: no one-step prediction", False)
     for (o, output), (c, channel) in product(enumerate(data.outputs), enumerate(data.inputs)):
         found = cross_correlation([r[:, o] for r in residuals], [e.u[:, c] for e in data.experiments], output, channel,
                                   lags)
         size = float(np.nanmax(np.abs(found.values[found.lags >= 0]), initial=0.0))
         if size > largest:
             largest, place = size, f" ({output} on {channel})" if data.m * data.l > 1 else ""
-    return Finding("largest correlation of residuals and inputs", f"{largest:.2f}{place}", largest <= CORRELATED)
+    return Finding(name, f"{largest:.2f}{place}", largest <= CORRELATED)
 
 
 def _delays(model: Any, data: Data) -> list[Finding]:

@@ -12,19 +12,24 @@ from optid.errors import OptidError, StructureError, nearest
 from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, LINEAR, USER, tabulated
 from optid.models.nonlinearity import Nonlinearity
 
+DROPPED = 1e-14  # leading coefficients of a numerator that SciPy takes for zero
+
 
 def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
     """Return the linear part as a `scipy.signal.dlti` with the model's dt.
 
     The nonlinearity and the constant are not part of it. A state-space model is returned whole, from every f to every
     output. Of a transfer function it is the part from one f to one output: with one output a transfer function, with
-    several a state-space system. An unknown channel, a name or an index, raises a `StructureError`.
+    several, or a leading coefficient so small that SciPy would drop it, a state-space system. An unknown channel, a
+    name or an index, raises a `StructureError`.
     """
     from scipy.signal import dlti
 
     o, c = _position(output, model.outputs, "output"), _position(input, model.inputs, "input")
     if model.structure != "ss" and model.l == 1:
-        return dlti(*_polynomials(model, c), dt=model.dt)
+        numerator, denominator = _polynomials(model, c)
+        if abs(numerator[0]) > DROPPED or not numerator.any():
+            return dlti(numerator, denominator, dt=model.dt)
     a, b, c_matrix, d = state_space(model)
     if model.structure == "ss":
         return dlti(a, b, c_matrix, d, dt=model.dt)

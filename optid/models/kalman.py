@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optid.arrays import Array, finite
+from optid.arrays import LARGEST, Array, finite
 from optid.errors import StructureError
 
 ROUNDING = -1e-4  # smallest eigenvalue of a correlation matrix that may be a rounding error of an estimate
@@ -33,7 +33,7 @@ class NoiseCovariances:
 
     def __post_init__(self) -> None:
         for name in ("Q", "R", "S", "innovation"):
-            object.__setattr__(self, name, finite(getattr(self, name), name))
+            object.__setattr__(self, name, finite(getattr(self, name), name, LARGEST**2))
         if self.S.ndim != 2:
             raise StructureError(f"S has shape {self.S.shape}; it must be a matrix.")
         n, outputs = self.S.shape

@@ -14,6 +14,7 @@ from optid.bases import Linear
 from optid.data.channels import Transform
 from optid.errors import StructureError
 from optid.models import roots
+from optid.models.equilibria import equilibria
 from optid.models.feedback_tables import tabulated
 from optid.models.gauges import leading_sign
 from optid.models.kalman import NoiseCovariances
@@ -27,8 +28,6 @@ MATRICES = {
     "Ez": "nk", "Fz": "lk", "Cz": "kn", "Dz": "km", "offset_z": "k"}
 COVARIANCES = {"Q": "nn", "R": "ll", "S": "nl", "innovation": "ll"}
 
-NEWTON_STEPS = 100
-RESTS = 1e-12  # a state that moves by less than this share of the largest term of its equation rests
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -182,16 +181,17 @@ class StateSpace(Model):
         """Return C (zI - A)^-1 B + D at the frequencies w (radians per unit of time), complex (len(w), l, r)."""
         return frequency_response(self.A, self.B, self.C, self.D, w, self.dt)
 
-    def equilibrium(self, u0: ArrayLike) -> tuple[Array, Array]:
+    def equilibrium(self, u0: ArrayLike, near: ArrayLike | None = None) -> tuple[Array, Array]:
         """Return a state (n,) and outputs (l,) at which the model rests under constant inputs u0 (m,).
 
-        With feedback there may be several; the one that Newton's method finds from x = 0 is returned.
+        With feedback there may be several: the one that damped Newton steps find from the state `near`, zero by
+        default, or else from where a free run under u0 ends.
 
         Raises:
             StructureError: u0 of the wrong size, a pole at 1, or no equilibrium found.
         """
         u = self._operating_point(u0)[None]
-        x, y = self._at_rest(self.expanded(u), u)
+        x, y = equilibria(self, self.expanded(u), u, None if near is None else np.reshape(near, (1, self.nx)))
         return x[0], y[0]
 
     def static_curve(self, c: int, points: Array) -> Array:
@@ -203,37 +203,18 @@ class StateSpace(Model):
         u[:, c] = points
         for j in np.flatnonzero(np.equal(self.input_of, c)):
             f[:, j] = self.nonlinearities[j](points)
-        return self._at_rest(f, u)[1]
-
-    def _at_rest(self, f: Array, u: Array) -> tuple[Array, Array]:
-        """Return states (N, n) and outputs (N, l) at rest under inputs u (N, m) with function values f (N, r)."""
-        x = np.zeros((len(u), self.nx))
-        curved = bool(self.feedback or self.latent)
-        own = slice(None if curved else 1)  # else the tangent is the same everywhere
-        for _ in range(NEWTON_STEPS):
-            h = self.latent_values(self.latent_signals(x, u))
-            y = x @ self.C.T + f @ self.D.T + h @ self.Fz.T + self.offset_y
-            moves = [x @ self.A.T, f @ self.B.T, y @ self.L.T, h @ self.Ez.T, np.tile(self.offset_x, (len(u), 1)), -x]
-            moves += [np.outer(g(y[:, o]), e) for g, o, e in zip(self.feedback, self.output_of, self.E.T)]
-            change = sum(moves, np.zeros_like(x))
-            sizes = np.max([np.abs(move).max(axis=1, initial=0.0) for move in moves], axis=0)
-            if np.all(np.abs(change).max(axis=1, initial=0.0) <= RESTS * sizes):
-                return x, y
-            slope = self._tangent(x[own], y[own], u[own])[0] - np.eye(self.nx)
-            if not np.all(np.isfinite(slope)):
-                break
-            x = x - (np.linalg.pinv(slope) @ change[:, :, None])[:, :, 0]
-        if not curved:
-            static_solution(self.A + self.L @ self.C - np.eye(self.nx), self.B)
-        raise StructureError(
-            f"No equilibrium was found at u0 = {u[0].tolist()}: the feedback does not let the model rest there.")
+        return equilibria(self, f, u)[1]
 
     def _static_gain(self, points: Array) -> Array:
-        x, y = self.equilibrium(points)
-        A, B, C, D = (one[0] for one in self._tangent(x[None], y[None], points[None]))
+        return self.gain_at_rest(points)
+
+    def gain_at_rest(self, u0: Array, near: ArrayLike | None = None) -> Array:
+        """Return the slope (l, m) of the steady-state characteristic at an equilibrium; arguments as `equilibrium`."""
+        x, y = self.equilibrium(u0, near)
+        A, B, C, D = (one[0] for one in self.tangent(x[None], y[None], u0[None]))
         return D - C @ static_solution(A - np.eye(self.nx), B)
 
-    def _tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
+    def tangent(self, x: Array, y: Array, u: Array) -> tuple[Array, Array, Array, Array]:
         """Return A, B, C, D of the free run near states (N, n), outputs (N, l) and inputs (N, m), N of each."""
         slopes = np.zeros((len(u), len(self.nonlinearities), self.m))
         for j, (f, c) in enumerate(zip(self.nonlinearities, self.input_of)):

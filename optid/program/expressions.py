@@ -35,10 +35,23 @@ def tangent_product(mu: cp.Expression, b: cp.Expression, mu0: np.ndarray, b0: np
 
 
 def solve_quietly(problem: cp.Problem, solver: str = "CLARABEL", **options: Any) -> None:
-    """Solve a problem by CVXPY; a point that may be inaccurate is ours to judge, and no reason for a warning."""
+    """Solve a problem by CVXPY; a point that may be inaccurate is ours to judge, and no reason for a warning.
+
+    A solver that crashes is a `cvxpy.SolverError`, also where a panic of Rust ends it, which is no `Exception`.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        problem.solve(solver=solver, **options)
+        try:
+            problem.solve(solver=solver, **options)
+        except BaseException as error:
+            if isinstance(error, Exception) or not is_crash(error):
+                raise
+            raise cp.SolverError(f"{solver} crashed: {error}") from error
+
+
+def is_crash(error: BaseException) -> bool:
+    """Whether an error comes from a solver: an exception, or a panic of Rust, which is none; not an interruption."""
+    return isinstance(error, Exception) or type(error).__name__ == "PanicException"
 
 
 def flat_value(expression: cp.Expression) -> np.ndarray:

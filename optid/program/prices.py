@@ -59,7 +59,8 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     program.assign(solution.values)
     unit = program.unit
     energy = solution.scale if program.compressed is None else unit * float(np.sum(program.compressed.energy))
-    worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy) * energy) if energy > 0 else np.nan
+    # two roots: the product of two sums of squares may leave the range of numbers
+    worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy)) / np.sqrt(energy) if energy > 0 else np.nan
     found, usual = [], program.usual_sizes
     for name, group in program.user_constraints.items():
         limits = program.limits.get(name) or tuple(Limit.of(member) for member in group)

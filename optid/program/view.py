@@ -57,7 +57,7 @@ class View(Mapping[str, cp.Expression]):
     def _expressions(self) -> Mapping[str, cp.Expression]:
         if self.units is None:
             return self.inner
-        return outward(self.inner, self.units, self.channels, states="C" in self.reference)
+        return outward(self.inner, self.units, self.channels, states="A" in self.reference)
 
     def __getitem__(self, name: str) -> cp.Expression:
         try:

@@ -11,7 +11,7 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning
 from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
-from optid.identify.validation.predictions import one_step, simulated
+from optid.identify.validation.predictions import one_step_or_nan, simulated
 from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions, step_length
 from optid.show import summary
 from optid.show.estimates import uncertainty
@@ -88,7 +88,7 @@ def runs_of(models: dict[str, Any], record: Data, ahead: bool = True) -> list[Li
         (label if len(models) > 1 else "simulated", free_run(model, record), {"colour": colour, "width": 1.9})
         for (label, model), colour in zip(models.items(), COLOURS * len(models))]
     if ahead:
-        predicted = one_step(next(iter(models.values())), record)
+        predicted = one_step_or_nan(next(iter(models.values())), record)
         runs.append(("one step ahead", predicted, {"colour": "c1", "dash": "4 2", "width": 1.3}))
     return runs
 

@@ -1,6 +1,7 @@
 """Documents of every result, most important facts first, which terminal, notebook and page render."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from optid.data.description import RECORD
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation import Validation
+from optid.identify.validation.predictions import SIMULATION, prediction_fit
 from optid.identify.verdict import POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
 from optid.show.sections import (
@@ -24,6 +26,7 @@ from optid.show.sections import (
     Notes,
     Pair,
     Section,
+    attempt,
 )
 from optid.show.terminal import findings_lines, set_table, wrapped
 
@@ -52,37 +55,43 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
         command: the command line behind the fit.
         advise: whether to say what would help a poor model, which takes time.
     """
-    judged = fit.verdict if judged is None else judged
-    tables = [*estimates.parameter_tables(fit), *estimates.nonlinearity_tables(fit), summary.fit_table(fit)]
-    noise = summary.noise_table(fit)
-    coefficients = estimates.coefficient_table(fit)
-    evidence = summary.evidence_facts(fit)
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
     sections = [
         *_record(fit.data.findings),
-        *([_trust(fit, judged, test, advise)] if judged is not None else []),
-        _optimum(fit),
-        Section("model", "Model", [
-            Code(fit.model.equation(), equation=True),
-            summary.model_facts(fit),
-            Pair([*tables, *([noise] if noise else [])]),
-            *([Heading("Intermediate results"), evidence] if evidence else []),
-            *([Fold("Coefficients of the basis", [coefficients])] if coefficients else []),
-        ]),
-        *([Section("constraints", "Constraints and their prices", [summary.constraint_table(fit)])]
-          if fit.prices else []),
+        Section("trust", "", lambda: _trust(fit, fit.verdict if judged is None else judged, test, advise)),
+        Section("optimum", "", lambda: _optimum(fit)),
+        Section("model", "Model", lambda: _model(fit)),
+        Section("constraints", "Constraints and their prices", lambda: [summary.constraint_table(fit)]),
         Section("figures", "Figures", lambda: _fit_charts(fit), page_only=True),
-        *([Section("validation", "Validation", lambda: _validations(fit, test), page_only=True)]
-          if isinstance(fit.data, Data) or test is not None else []),
-        Section("certificate", "Certificate", [summary.certificate_facts(fit)], page_only=True),
+        Section("validation", "Validation", lambda: _validations(fit, test), page_only=True),
+        Section("certificate", "Certificate", lambda: [summary.certificate_facts(fit)], page_only=True),
         Section("data", "Data", lambda: [
             summary.record_facts(fit), *([summary.channel_table(fit.data)] if isinstance(fit.data, Data) else [])],
             page_only=True),
-        Section("solver", "Solver and times", [summary.solver_facts(fit)], page_only=True),
+        Section("solver", "Solver and times", lambda: [summary.solver_facts(fit)], page_only=True),
         Section("reproduce", "Reproduce", lambda: _reproduce(
             "\n".join(part for part in (command, summary.call(fit)) if part), str(fit)), page_only=True),
     ]
-    return Document(summary.title(fit), lead, sections)
+    judgeable = isinstance(fit.data, Data)
+    left_out = {"trust": not judgeable and judged is None, "constraints": not fit.prices,
+                "validation": not judgeable and test is None}
+    return Document(summary.title(fit), lead, [one for one in sections if not left_out.get(one.id)])
+
+
+def _model(fit: "Fit") -> list[Any]:
+    """Return equation, facts, tables and intermediate results; each fails without the others."""
+    tables = [*attempt("The table of the parameters", lambda: estimates.parameter_tables(fit)),
+              *attempt("The table of the nonlinearities", lambda: estimates.nonlinearity_tables(fit)),
+              *attempt("The fit on the estimation record", lambda: [summary.fit_table(fit)]),
+              *attempt("The table of the noise", lambda: filter(None, [summary.noise_table(fit)]))]
+    evidence = attempt("The intermediate results", lambda: filter(None, [summary.evidence_facts(fit)]))
+    coefficients = attempt("The coefficients of the basis", lambda: filter(None, [estimates.coefficient_table(fit)]))
+    return [
+        *attempt("The equation", lambda: [Code(fit.model.equation(), equation=True)]),
+        *attempt("The facts about the model", lambda: [summary.model_facts(fit)]),
+        Pair(tables),
+        *([Heading("Intermediate results"), *evidence] if evidence else []),
+        *([Fold("Coefficients of the basis", coefficients)] if coefficients else [])]
 
 
 def _record(findings: Sequence[str]) -> list[Section]:
@@ -93,14 +102,17 @@ def _record(findings: Sequence[str]) -> list[Section]:
 def record_document(data: Data, *, command: str = "") -> Document:
     """Return the document of a record: what reading it found, its channels, and their course."""
     raw = data.raw()
-    drawn = [chart for k in range(min(raw.n_experiments, charts.MOST_EXPERIMENTS))
-             for chart in charts.time_charts(raw, k, [], f"time{k}")]
+
+    def drawn() -> list[Any]:
+        return [Charts([chart for k in range(min(raw.n_experiments, charts.MOST_EXPERIMENTS))
+                        for chart in charts.time_charts(raw, k, [], f"time{k}")], wide=True)]
+
     channels = f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"
     lead = " · ".join([_length(data), f"every {data.interval}", channels])
     return Document(data.name or "Record", lead, [
         *_record(data.findings),
-        Section("channels", "Channels", [summary.channel_table(data)]),
-        Section("figures", "Figures", [Charts(drawn, wide=True)], page_only=True),
+        Section("channels", "Channels", lambda: [summary.channel_table(data)]),
+        Section("figures", "Figures", drawn, page_only=True),
         *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
     ])
 
@@ -109,20 +121,24 @@ def _length(data: Any) -> str:
     return f"{data.n_samples} samples" if data.n_samples else ""
 
 
-def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> Section:
+def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> list[Any]:
     which = ", lowest output" if fit.model.l > 1 else ""
-    fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
-    if test is not None:
-        simulated = [q.fit for q in charts.validated(fit.model, test).simulation.values()]
-        fits.append(("simulation fit, test record", np.array(simulated or np.nan)))
-    cards = tuple((label + which, wording.percent(np.min(values))) for label, values in fits)
-    advice = [str(one) for one in fit.advice] if advise and judged.word in ADVISED else []
-    parts = [Banner(TONES[judged.word], f"The model on this record: {judged.word}", summary.judgement(judged), cards),
-             summary.verdict_table(judged)]
-    return Section("trust", "", [*parts, *([Notes(advice)] if advice else [])])
+
+    def cards() -> Iterator[tuple[str, str]]:
+        fits = [("one-step fit", fit.one_step_fit), ("simulation fit", summary.simulation_fit(fit))]
+        if test is not None:
+            fits.append(("simulation fit, test record", prediction_fit(fit.model, test, SIMULATION)))
+        return ((label + which, wording.percent(np.min(values))) for label, values in fits)
+
+    found = attempt("The fit at first glance", cards)
+    advice = attempt("The advice", lambda: [Notes([str(one) for one in fit.advice])] if fit.advice else []) if (
+        advise and judged.word in ADVISED) else []
+    return [Banner(TONES[judged.word], f"The model on this record: {judged.word}", summary.judgement(judged),
+                   tuple(one for one in found if isinstance(one, tuple))),
+            *(one for one in found if isinstance(one, Notes)), summary.verdict_table(judged), *advice]
 
 
-def _optimum(fit: "Fit") -> Section:
+def _optimum(fit: "Fit") -> list[Any]:
     tone, word, sentence = summary.verdict(fit)
     solution = fit.solution
     cards = [("relative gap to the bound", "none" if solution.bound is None else wording.gap_text(solution.gap))]
@@ -132,19 +148,22 @@ def _optimum(fit: "Fit") -> Section:
     right = [(name, value) for name, value in summary.certificate_facts(fit)
              if name in ("Objective", "Bound", "Relative gap")]
     right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "Total")]
-    return Section("optimum", "", [Banner(tone, f"Solution: {word}", sentence, tuple(cards)),
-                                   Columns(summary.record_facts(fit), right),
-                                   *([Notes(fit.findings)] if fit.findings else [])])
+    return [Banner(tone, f"Solution: {word}", sentence, tuple(cards)), Columns(summary.record_facts(fit), right),
+            *([Notes(fit.findings)] if fit.findings else [])]
 
 
 def _fit_charts(fit: "Fit") -> list[Any]:
     parts: list[Any] = []
-    if isinstance(fit.data, Data):
-        parts.append(Charts(charts.record_charts({"": fit.model}, fit.data), wide=True))
-    several = [*charts.nonlinearity_charts(fit), *charts.dynamics_charts({"": fit.model}, fit),
-               *charts.theta_charts(fit), *charts.spectrum_charts(fit)]
-    if summary.has_noise(fit.model):
-        several.append(charts.noise_chart(fit.model))
+    data, models = fit.data, {"": fit.model}
+    if isinstance(data, Data):
+        parts += attempt("The figure of the record", lambda: [Charts(charts.record_charts(models, data), wide=True)])
+    several = [
+        *attempt("The figure of the nonlinearities", lambda: charts.nonlinearity_charts(fit)),
+        *attempt("The figure of the dynamics", lambda: charts.dynamics_charts(models, fit)),
+        *attempt("The figure of Theta", lambda: charts.theta_charts(fit)),
+        *attempt("The figure of the singular values", lambda: charts.spectrum_charts(fit)),
+        *attempt("The figure of the noise", lambda: [charts.noise_chart(fit.model)] if summary.has_noise(fit.model)
+                 else [])]
     return [*parts, Charts(several)]
 
 
@@ -152,10 +171,21 @@ def _validations(fit: "Fit", test: Data | None) -> list[Any]:
     parts: list[Any] = []
     for title, record in (("Estimation record", fit.data), ("Test record, not seen by the fit", test)):
         if isinstance(record, Data):
-            parts += [Heading(title), *validation_parts(charts.validated(fit.model, record))]
+            parts += [Heading(title), *attempt("The validation", partial(_validation, fit.model, record))]
             if record is test:
-                parts.append(Charts(charts.record_charts({"": fit.model}, record, group="test"), wide=True))
+                parts += attempt("The figure of the test record", partial(_test_charts, fit.model, record))
     return parts
+
+
+def _validation(model: Any, record: Data) -> list[Any]:
+    try:
+        return validation_parts(charts.validated(model, record))
+    except DataError as error:
+        return [Notes([f"No validation: {error}"])]
+
+
+def _test_charts(model: Any, record: Data) -> list[Any]:
+    return [Charts(charts.record_charts({"": model}, record, group="test"), wide=True)]
 
 
 def validation_parts(checked: Validation) -> list[Any]:
@@ -173,6 +203,12 @@ def _reproduce(call: str, text: str) -> list[Any]:
 def search_document(found: "Identification", test: Data | None = None, *, command: str = "") -> Document:
     """Return the document of a search: verdict, structures on trial, score by block, then the fit it ended with."""
     document = fit_document(found.fit, test, judged=found.verdict, command=command)
+    section = Section("search", "Search for the structure", lambda: _search(found))
+    first = next(k for k, one in enumerate(document.sections) if one.id == "model")
+    return Document(document.title, document.lead, [*document.sections[:first], section, *document.sections[first:]])
+
+
+def _search(found: "Identification") -> list[Any]:
     chosen = found.chosen.candidate
     ended = f"The search was ended by {found.stopped}; more time may find a better structure."
     notes = [ended] if found.stopped else []
@@ -182,12 +218,9 @@ def search_document(found: "Identification", test: Data | None = None, *, comman
                           [(f"{t.candidate.kind}: {t.candidate.formulation} {t.candidate.words}", f"{t.score:.1f}",
                             f"{t.by_block.min():.1f}", str(t.parameters), wording.seconds(t.seconds))
                            for t in sorted(trials, key=lambda t: -t.score)])
-    section = Section("search", "Search for the structure", [
-        checks.search_table(found), Notes([*found.reasons, *notes]),
-        Code(f"--formulation {chosen.formulation} {chosen.words}"),
-        Charts([charts.block_chart(found)]), Fold(table.title, [table])])
-    first = next(k for k, one in enumerate(document.sections) if one.id == "model")
-    return Document(document.title, document.lead, [*document.sections[:first], section, *document.sections[first:]])
+    return [checks.search_table(found), Notes([*found.reasons, *notes]),
+            Code(f"--formulation {chosen.formulation} {chosen.words}"), Charts([charts.block_chart(found)]),
+            Fold(table.title, [table])]
 
 
 def validation_document(checked: Validation) -> Document:
@@ -202,8 +235,8 @@ def validation_document(checked: Validation) -> Document:
     tone = "bad" if not worst >= USELESS_FIT else "fair" if worst < POOR_FIT or not checked.passed else "good"
     banner = Banner(tone, f"Residual tests: {'PASS' if checked.passed else 'FAIL'}", sentence + ".", fits)
     return Document(f"Validation on {checked.data}" if checked.data else "Validation", "", [
-        *_record(checked.findings), Section("trust", "", [banner]),
-        Section("tests", "Errors and tests", validation_parts(checked))])
+        *_record(checked.findings),
+        Section("trust", "", [banner]), Section("tests", "Errors and tests", lambda: validation_parts(checked))])
 
 
 def comparison_document(found: "Comparison", *, command: str = "") -> Document:
@@ -214,17 +247,21 @@ def comparison_document(found: "Comparison", *, command: str = "") -> Document:
     lead = " · ".join(part for part in (found.data.name, _length(found.data)) if part)
 
     def figures() -> list[Any]:
-        linear = [*charts.dynamics_charts(models)] if len({(m.l, m.m) for m in found.models}) == 1 else [
-            charts.pole_chart({name: model.poles for name, model in models.items()})]
-        return [Charts(charts.record_charts(models, found.data, ahead=False), wide=True),
+        alike = len({(m.l, m.m) for m in found.models}) == 1
+        linear = attempt("The figure of the dynamics", lambda: charts.dynamics_charts(models) if alike else [
+            charts.pole_chart({name: model.poles for name, model in models.items()})])
+        return [*attempt("The figure of the record", lambda: [
+                    Charts(charts.record_charts(models, found.data, ahead=False), wide=True)]),
                 Charts([*charts.horizon_charts(found), *linear])]
 
-    each = [part for name, model, checked in zip(found.names, found.models, found.validations)
-            for part in (Heading(name), Code(model.equation(), equation=True), *validation_parts(checked))]
+    def each() -> list[Any]:
+        return [part for name, model, checked in zip(found.names, found.models, found.validations)
+                for part in (Heading(name), Code(model.equation(), equation=True), *validation_parts(checked))]
+
     call = command or f"optid.compare_models(models, data, horizon={found.horizon})"
     return Document(title, lead, [
         *_record(found.data.findings),
-        Section("fits", "Fits", [checks.comparison_table(found), checks.facts_table(found)]),
+        Section("fits", "Fits", lambda: [checks.comparison_table(found), checks.facts_table(found)]),
         Section("figures", "Figures", figures, page_only=True),
         Section("validation", "Each model by itself", each, page_only=True),
         Section("reproduce", "Reproduce", lambda: _reproduce(call, str(found)), page_only=True)])

@@ -9,7 +9,7 @@ from optid.data.description import RECORD, first_findings
 from optid.show import documents, estimates, summary
 from optid.show.checks import comparison_table, search_table, validation_tables
 from optid.show.printing import describe
-from optid.show.sections import TONES, Banner
+from optid.show.sections import TONES, Banner, Notes, attempt
 from optid.show.wording import Table, percent
 
 if TYPE_CHECKING:
@@ -29,15 +29,27 @@ def fit_html(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = Tr
     """Show the verdict, the status of the solution, the equation and the parameters of a fit, below its findings."""
     if fit.model is None:
         return f"<pre>{escape(describe(fit))}</pre>"
-    judged = fit.verdict if judged is None else judged
+    return _html(summary.title(fit), [
+        *(_record(fit.data.findings) if findings else []),
+        *attempt("The verdict on the model", lambda: _verdict(fit.verdict if judged is None else judged)),
+        *attempt("The verdict on the solution", lambda: [_solution(fit)]),
+        *attempt("The fit", lambda: [", ".join(f"{name} {percent(values)}" for name, values in (
+            ("one step", fit.one_step_fit), ("simulation", summary.simulation_fit(fit))))]),
+        *attempt("The equation", lambda: [("pre", fit.model.equation())]),
+        *attempt("The table of the parameters", lambda: [estimates.parameters_table(fit.params)])])
+
+
+def _verdict(judged: "Verdict | None") -> list[Banner]:
+    if judged is None:
+        return []
+    failed = "; ".join(f"{part.name} {part.value}: FAIL" for part in judged.failed)
+    return [Banner(TONES[judged.word], f"The model on this record: {judged.word}",
+                   failed or f"all tests pass, fit {judged.score:.1f} %")]
+
+
+def _solution(fit: "Fit") -> Banner:
     tone, word, sentence = summary.verdict(fit)
-    head = [] if judged is None else [Banner(TONES[judged.word], f"The model on this record: {judged.word}", "; ".join(
-        f"{part.name} {part.value}: FAIL" for part in judged.failed) or f"all tests pass, fit {judged.score:.1f} %")]
-    fits = ", ".join(f"{name} {percent(values)}" for name, values in (
-        ("one step", fit.one_step_fit), ("simulation", summary.simulation_fit(fit))))
-    said = _record(fit.data.findings) if findings else []
-    return _html(summary.title(fit), [*said, *head, Banner(tone, f"Solution: {word}", sentence), fits,
-                                      ("pre", fit.model.equation()), estimates.parameters_table(fit.params)])
+    return Banner(tone, f"Solution: {word}", sentence)
 
 
 def search_html(found: "Identification") -> str:
@@ -54,9 +66,9 @@ def parameters_html(found: "Parameters") -> str:
 def validation_html(checked: "Validation") -> str:
     """Show the outcome, the errors and the tests of a validation."""
     document = documents.validation_document(checked)
-    parts = [part for section in document.sections if section.id == "trust" and not callable(section.parts)
-             for part in section.parts]
-    return _html(document.title, [*_record(checked.findings), *parts, *validation_tables(checked)])
+    (trust,) = (section for section in document.sections if section.id == "trust")
+    return _html(document.title, [*_record(checked.findings), *trust.content(),
+                                  *attempt("Errors and tests", lambda: validation_tables(checked))])
 
 
 def comparison_html(found: "Comparison") -> str:
@@ -78,6 +90,8 @@ def _html(title: str, parts: list[Any]) -> str:
                                 "</div>").format(COLOURS[part.tone], part.word, part.sentence))
         elif isinstance(part, Table):
             shown.append(_table(part))
+        elif isinstance(part, Notes):
+            shown += [Markup("<div>{}</div>").format(sentence) for sentence in part.sentences]
         elif isinstance(part, tuple):
             shown.append(Markup('<pre style="white-space:pre-wrap;margin:4px 0">{}</pre>').format(part[1]))
         else:

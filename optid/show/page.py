@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 SCRIPTS = ("plot.js", "parts.js", "charts.js")
 
+SINGLE = 1e-30, 1e38
+"""Sizes of curves that a page carries in single precision."""
+
 MOST = 20_000
 """Samples of a curve that a page carries; of a longer one the extremes of half as many stretches."""
 
@@ -45,7 +48,7 @@ def render(document: Document) -> str:
         shown.append(coded(chart))
         return len(shown) - 1
 
-    sections = [(s, list(s.parts() if callable(s.parts) else s.parts)) for s in document.sections]
+    sections = [(s, s.content()) for s in document.sections]
     names = {"trust": "Verdict", "optimum": "Solution"}
     return template("document.html.j2").render(
         version=__version__, title=document.title, lead=document.lead, parts=sections, place=place,
@@ -60,8 +63,10 @@ def _breakable(equation: str) -> str:
 
 def coded(chart: Chart, most: int = MOST) -> dict[str, Any]:
     """Return a chart as JSON types for the script of the page, its curves of at most so many samples."""
-    axes = {name: {key: value for key, value in asdict(axis).items() if value is not None and value is not False
-                   and value != ""} for name, axis in (("x", chart.x), ("y", chart.y))}
+    axes = {name: {key: value for key, value in asdict(axis).items()
+                   if value is not None and value is not False and value != ""
+                    and (isinstance(value, str) or np.isfinite(value))}
+            for name, axis in (("x", chart.x), ("y", chart.y))}
     cursor = all(one.kind in ("curve", "area", "bars") for one in chart.series)
     return {"title": chart.title, "caption": chart.caption, "group": chart.group, "equal": chart.equal,
             "height": chart.height, "cursor": cursor, **axes, "series": [_series(one, most) for one in chart.series]}
@@ -80,12 +85,16 @@ def _series(one: Series, most: int) -> dict[str, Any]:
 
 def _numbers(values: np.ndarray, kind: str) -> Any:
     """Return numbers as the script reads them: an even grid, bytes, or a list with few digits."""
-    steps = np.diff(values)
-    # dates are large numbers, whose steps are rounded
-    if values.size > 40 and np.ptp(steps) <= 1e-9 * abs(steps).max() + 4 * np.spacing(abs(values).max()):
-        return {"start": float(values[0]), "step": float((values[-1] - values[0]) / (values.size - 1)),
-                "count": values.size}
     if values.size > 40:
+        with np.errstate(all="ignore"):
+            step = (values[-1] - values[0]) / (values.size - 1)
+            even = values[0] + step * np.arange(values.size)
+            # dates are large numbers, whose steps are rounded
+            if np.max(np.abs(values - even)) <= 1e-9 * abs(step) + 4 * np.spacing(np.max(np.abs(values))):
+                return {"start": float(values[0]), "step": float(step), "count": values.size}
+            size = float(np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values)))
+        if size and not SINGLE[0] < size < SINGLE[1]:
+            kind = "<f8"
         data = base64.b64encode(values.astype(kind).tobytes()).decode()
         return {"bytes" if kind == "<f4" else "wide": data}
     digits = 9 if kind == "<f4" else 16

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import wraps
+from textwrap import wrap
 from typing import Any, ParamSpec, TypeVar, cast
 
 import matplotlib
@@ -13,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from optid.arrays import Array
 from optid.data.timeline import Timeline
+from optid.show import sections
 from optid.show.sections import Axis, Chart, extremes
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
@@ -84,6 +86,20 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
             return draw(*args, **kwargs)
 
     return inside
+
+
+def attempt_panels(figure: Any, what: str, draw: Callable[[Any], None]) -> None:
+    """Draw a part of a figure, or write the reason why it could not be computed in its place."""
+    try:
+        draw(figure)
+    except sections.CAUGHT as error:
+        figure.clear()
+        write(figure, sections.failure(what, error))
+
+
+def write(figure: Any, sentence: str) -> None:
+    """Write a sentence in the middle of a figure."""
+    figure.text(0.5, 0.5, plain("\n".join(wrap(sentence, 90))), ha="center", va="center")
 
 
 def plain(text: str) -> str:

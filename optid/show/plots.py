@@ -15,7 +15,7 @@ from optid.identify.validation import Validation
 from optid.lazy import public_names
 from optid.models.functions import static_functions
 from optid.show import charts, panels
-from optid.show.panels import CLOSEUP, MUTED, liveliest, plain, shorten, styled
+from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, styled
 from optid.show.sections import Chart
 from optid.structures.least_squares import rank_one_of
 
@@ -49,11 +49,15 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     heights = [(4.2 if long else 2.9) * record.l, *rows_of_f, 3.0, 2.5]
     figure = Figure(figsize=(10.0, sum(heights)), layout="constrained")
     rows = cast(Any, figure.subfigures(len(heights), 1, height_ratios=heights))
-    _time_panels(rows[0], fit, record, "test record" if test is not None else "estimation record", closeup=long)
-    left, right = rows[1:3] if rows_of_f else rows[1].subfigures(1, 2, width_ratios=[1, 1.45])
-    _panels(left, charts.nonlinearity_charts(fit, linear=True))
-    _dynamics_panels(right, fit)
-    _residual_panels(rows[-1], charts.validated(fit.model, record), record, outputs=1, inputs=min(model.m, 2))
+    which = "test record" if test is not None else "estimation record"
+    attempt_panels(rows[0], "The fit over time", lambda part: _time_panels(part, fit, record, which, closeup=long))
+    left, right = rows[1:3] if rows_of_f else rows[1].subfigures(1, 2, width_ratios=[1, 1.45]) if functions else (
+        None, rows[1])
+    if left is not None:
+        attempt_panels(left, "Nonlinearities", lambda part: _panels(part, charts.nonlinearity_charts(fit, linear=True)))
+    attempt_panels(right, "The dynamics", lambda part: _dynamics_panels(part, fit))
+    attempt_panels(rows[-1], "The residual tests", lambda part: _residual_panels(
+        part, _validated(model, record), record, outputs=1, inputs=min(model.m, 2)))
     return figure
 
 
@@ -77,8 +81,14 @@ def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
 
 @styled
 def nonlinearity(fit: "Fit") -> Figure:
-    """Draw every static nonlinearity, of inputs and of outputs fed back, with its 95 % band and where samples lie."""
+    """Draw every static nonlinearity, of inputs and of outputs fed back, with its 95 % band and where samples lie.
+
+    Raises:
+        DataError: the model has no static functions.
+    """
     count = len(static_functions(fit.model))
+    if not count:
+        raise DataError(f"a model of {fit.formulation!r} has no static functions to draw")
     figure = Figure(figsize=(9.0 if count > 1 else 6.4, 3.4 * -(-count // 3)), layout="constrained")
     _panels(figure, charts.nonlinearity_charts(fit, linear=True))
     return figure
@@ -98,7 +108,7 @@ def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | N
     """
     record = _record(fit, data)
     figure = Figure(figsize=(9.0, 2.5 * record.l), layout="constrained")
-    _residual_panels(figure, checked or charts.validated(fit.model, record), record, outputs=record.l, inputs=record.m)
+    _residual_panels(figure, checked or _validated(fit.model, record), record, outputs=record.l, inputs=record.m)
     return figure
 
 
@@ -236,8 +246,19 @@ def _panels(figure: Any, shown: Sequence[Chart]) -> None:
         ax.set_axis_off()
 
 
-def _residual_panels(figure: Any, checked: Validation, record: Data, outputs: int, inputs: int) -> None:
-    """One row per output: autocorrelation, then the cross-correlation with every input."""
+def _validated(model: Any, record: Data) -> Validation | str:
+    """Return the validation, or the reason why there is none."""
+    try:
+        return charts.validated(model, record)
+    except DataError as error:
+        return f"No residual tests: {error}"
+
+
+def _residual_panels(figure: Any, checked: Validation | str, record: Data, outputs: int, inputs: int) -> None:
+    """One row per output: autocorrelation, then the cross-correlation with every input; or a reason for none."""
+    if isinstance(checked, str):
+        panels.write(figure, checked)
+        return
     axes = iter(figure.subplots(outputs, 1 + inputs, squeeze=False).ravel())
     for name in record.outputs[:outputs]:
         tests = [checked.autocorrelations[name]]

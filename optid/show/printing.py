@@ -4,7 +4,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from optid.show import checks, documents, estimates, summary
-from optid.show.terminal import WIDTH, facts_lines, findings_lines, set_table, text, wrapped
+from optid.show.sections import Notes, attempt
+from optid.show.terminal import WIDTH, facts_lines, findings_lines, part_lines, set_table, text, wrapped
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -32,11 +33,20 @@ def describe(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = Tr
                       *facts_lines(summary.certificate_facts(fit)), rule])
 
 
+def describe_advice(fit: "Fit") -> str:
+    """Return what would improve a model whose verdict is poor, a line each; "" for any other model."""
+    if fit.model is None:
+        return ""
+    found = attempt("The advice", lambda: [f"Advice: {one}" for one in fit.advice] if (
+        fit.verdict is not None and fit.verdict.word in documents.ADVISED) else [])
+    return "".join(f"\n{one.sentences[0] if isinstance(one, Notes) else one}" for one in found)
+
+
 def describe_checks(checked: "Validation") -> str:
     """Return what a validation found as text, at most 80 columns wide."""
     lines = [*findings_lines(checked.findings), f"Validation on {checked.data}" if checked.data else "Validation"]
-    for table in checks.validation_tables(checked):
-        lines += [*set_table(table), ""]
+    for part in attempt("Errors and tests", lambda: checks.validation_tables(checked)):
+        lines += [*part_lines(part), ""]
     return "\n".join([*lines[:-1], *(line for note in checked.notes for line in wrapped(f"Note: {note}"))])
 
 

@@ -1,6 +1,6 @@
 """Documents of results: sections of banners, facts, tables, charts and notes, for every renderer."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,9 +9,17 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.description import first_findings
+from optid.errors import OptidError
+from optid.progress import log
 from optid.show.wording import Table
 
 Facts = list[tuple[str, str]]
+
+CAUGHT: tuple[type[Exception], ...] = (Exception,)
+"""Errors in a part of a document after which the others are still shown; the tests set none, which hides no defect."""
+
+FAILED = "could not be computed"
+"""Words of every note in place of a part that failed."""
 
 TONES = {"good": "good", "fair": "plain", "poor": "fair", "useless": "bad"}
 """How a verdict on a model is coloured; green is left to models that are good."""
@@ -112,9 +120,9 @@ class Fold:
 
 @dataclass(frozen=True)
 class Pair:
-    """Tables side by side where there is room."""
+    """Tables side by side where there is room, or notes in place of those that failed."""
 
-    tables: Sequence[Table]
+    tables: Sequence[Table | Notes]
 
 
 @dataclass(frozen=True)
@@ -127,9 +135,9 @@ class Columns:
 
 @dataclass(frozen=True)
 class Charts:
-    """Charts side by side where there is room, or one below the other in the whole width."""
+    """Charts side by side where there is room, or one below the other in the whole width; notes for those failed."""
 
-    charts: Sequence[Chart]
+    charts: Sequence[Chart | Notes]
     wide: bool = False
 
 
@@ -150,6 +158,10 @@ class Section:
     parts: Sequence[Any] | Callable[[], Sequence[Any]]
     page_only: bool = False  # whether printed text and notebooks leave it out
 
+    def content(self) -> list[Any]:
+        """Return the parts, or a note with the reason why they could not be computed."""
+        return attempt(f"Section {(self.title or self.id)!r}", self.parts) if callable(self.parts) else [*self.parts]
+
 
 @dataclass(frozen=True)
 class Document:
@@ -158,6 +170,22 @@ class Document:
     title: str
     lead: str
     sections: Sequence[Section]
+
+
+def attempt(what: str, build: Callable[[], Iterable[Any]]) -> list[Any]:
+    """Return the parts that a function builds, or a note with the reason why they could not be computed."""
+    try:
+        return list(build())
+    except CAUGHT as error:
+        return [Notes([failure(what, error)])]
+
+
+def failure(what: str, error: Exception) -> str:
+    """Return the sentence in place of a part that failed; the log "optid" has the traceback."""
+    log.debug("%s %s", what, FAILED, exc_info=error)
+    reason = str(error).rstrip(".") if isinstance(error, OptidError) else (
+        f"{type(error).__name__}: {error}; this is a defect of optid")
+    return f"{what} {FAILED}: {reason}."
 
 
 def extremes(values: Array, bins: int) -> NDArray[np.intp]:

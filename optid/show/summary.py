@@ -1,11 +1,13 @@
 """Facts, tables and sentences about a fit, for the printed result and the HTML page."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optid.data.record import Data
+from optid.errors import DataError
 from optid.identify.equation_error import EquationError
 from optid.identify.validation.predictions import predictors
 from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
@@ -263,7 +265,10 @@ def noise_table(fit: "Fit") -> Table | None:
         return None
     from optid.identify.noise import colour, output_noise
 
-    tests = colour(model, fit.data) if isinstance(fit.data, Data) else {}
+    tests: dict[str, Any] = {}
+    if isinstance(fit.data, Data):
+        with suppress(DataError):  # a simulation that diverges has no colour
+            tests = colour(model, fit.data)
     spread = np.sqrt(np.diag(output_noise(model)))
     own = np.sqrt(np.diag(model.noise.innovation))
     rows = []

@@ -18,15 +18,13 @@ def text(document: Document) -> str:
     """Return a document without what only a page shows."""
     lines = [_rule("="), document.title.center(WIDTH).rstrip(), document.lead.center(WIDTH).rstrip(), _rule("=")]
     for section in document.sections:
-        if section.page_only or callable(section.parts):
-            continue
-        for part in section.parts:
-            if shown := _lines(part):
+        for part in () if section.page_only else section.content():
+            if shown := part_lines(part):
                 lines += [*shown, _rule("-")]
     return "\n".join([*lines[:-1], _rule("=")])
 
 
-def _lines(part: object) -> list[str]:
+def part_lines(part: object) -> list[str]:
     """Return the lines of a part; none for charts and folds."""
     if isinstance(part, Banner):
         return [*wrapped(part.word), *(wrapped(part.sentence) if part.sentence else [])]
@@ -37,7 +35,7 @@ def _lines(part: object) -> list[str]:
     if isinstance(part, Table):
         return set_table(part)
     if isinstance(part, Pair):
-        blocks = [set_table(table) for table in part.tables]
+        blocks = [part_lines(table) for table in part.tables]
         return [line for k, block in enumerate(blocks) for line in ([_rule("-")] * bool(k) + block)]
     if isinstance(part, Notes):
         return [line for sentence in part.sentences for line in wrapped(f"Note: {sentence}")]

@@ -15,6 +15,7 @@ from optid.certificate.convex import TANGENT, certify_convex
 from optid.certificate.infeasibility import satisfiable
 from optid.errors import SolverRefused, StructureError
 from optid.processes import run_forked
+from optid.program.expressions import is_crash
 from optid.program.judging import judge, measure_violation
 from optid.program.program import Program, Values
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
@@ -126,7 +127,9 @@ def _run(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
         return back_end.run(program, settings)
     except StructureError as refusal:  # its message has the remedy for the user
         raise SolverRefused(str(refusal)) from refusal
-    except Exception as error:  # a solver that crashes is an outcome, not a traceback
+    except BaseException as error:  # a solver that crashes is an outcome, not a traceback
+        if not is_crash(error):
+            raise
         return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
 
 
@@ -290,6 +293,8 @@ class Evidence:
     # returns the model completed by what only some uses need, such as a noise model, and further figures; it is called
     # when the model of the fit is first used
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
+    # of the variables of the last programme at the model, where the model is not that of its solution
+    values: Mapping[str, Any] | None = None
 
     def extended(self) -> tuple[Any, dict[str, Any]]:
         """Return the completed model and further figures."""
@@ -351,5 +356,8 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
             bound = None if callable(found.bound) else found.bound
             solution = replace(solution, objective=found.objective, bound=bound, status=found.status,
                                reason=found.reason)
+            if found.values is not None:
+                program.assign(found.values)
+                solution = replace(solution, values=program.values())
             figures = {**found.figures, **_substitutions(steps)}
             return Outcome(found.model, solution, program, tuple(steps), figures, constrained, found)

@@ -48,8 +48,8 @@ class Channels:
         `DataError` for an infinite sample, integers beyond the digits of float64, or a non-uniform clock.
         """
         done, last = 0, None
-        texts = set(self.clock.columns) if self.clock else set()
-        columns = [*self.inputs.values(), *self.outputs.values(), *sorted(texts)]
+        texts = dict.fromkeys(self.clock.columns if self.clock else (), "clock")
+        columns = [*self.inputs.values(), *self.outputs.values(), *texts]
         for block in part.blocks(columns, texts):
             u, y = (_gathered(block, pairs, part.label, done, self.how) for pairs in (self.inputs, self.outputs))
             done += len(u)

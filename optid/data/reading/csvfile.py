@@ -8,7 +8,7 @@ around cells and any spelling of a missing sample, and names the row and the col
 import csv
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, islice
@@ -29,6 +29,7 @@ NULLS = ["NA", "N/A", "null", "NULL", "None", "nan", "NaN", "NAN"]
 
 SMALL = 1 << 18  # bytes up to which the csv module reads a file in less time than polars needs to be imported
 ROWS = 65536  # rows that the csv module converts at a time
+LONG_LINE, LONG_CELL = 1 << 16, 64  # bytes of a line, and of each of its cells, beyond which polars is not asked
 SPARE = 1000  # cells beyond twice those of the header with which a row is not even cut
 
 Columns = dict[str, Any]
@@ -47,8 +48,10 @@ class CsvFile:
         """One name per column."""
         return self.layout.names
 
-    def columns(self, wanted: Sequence[str], texts: Set[str]) -> Columns:
-        """Return whole columns as float64, NaN for missing samples; columns in `texts` that are not numeric as text.
+    def columns(self, wanted: Sequence[str], texts: Mapping[str, str]) -> Columns:
+        """Return whole columns as float64, NaN for missing samples; those in `texts` may be texts.
+
+        `texts` says of a column whether it is a "clock", which is read as numbers where it is numeric, or a "text".
 
         Raises:
             DataError: no rows, a cell that is not a number, a row of another width, a blank row inside the table, or
@@ -59,7 +62,7 @@ class CsvFile:
             raise DataError(f"{self.path.name} has a header but no rows.")
         return _joined(whole, wanted)
 
-    def blocks(self, rows: int, wanted: Sequence[str], texts: Set[str]) -> Iterator[Columns]:
+    def blocks(self, rows: int, wanted: Sequence[str], texts: Mapping[str, str]) -> Iterator[Columns]:
         """Yield columns `rows` rows at a time; arguments and errors as of `columns`."""
         kept: list[Columns] = []
         count = 0
@@ -79,15 +82,17 @@ class CsvFile:
     def _how(self) -> Format:
         return self.layout.how
 
-    def _blocks(self, wanted: Sequence[str], texts: Set[str]) -> Iterator[Columns]:
+    def _blocks(self, wanted: Sequence[str], texts: Mapping[str, str]) -> Iterator[Columns]:
         done, mark, how = 0, self.layout.delimiter, self._how
         with opened(self.path, how.encoding) as file:
             blocks = file.blocks(self.layout.offset, 2 * len(self.names) + SPARE, mark.encode())
             cleaned = (clean(block, how.comment, how.delimiter == BLANKS) for block in blocks)
             if self.path.stat().st_size > SMALL and mark.isascii() and how.is_plain:
-                attempts = [(texts, []), (texts, NULLS)]
+                as_text = {name for name, kind in texts.items() if kind == "text" or name in self.layout.dates}
+                attempts: list[tuple[Set[str], list[str]]] = [
+                    (as_text, []), (as_text, NULLS), *([(set(texts), [])] if as_text != set(texts) else [])]
                 for block in cleaned:
-                    if not _is_plain(block) or not self._has_usual_size(block):
+                    if not _is_plain(block) or not self._has_short_lines(block):
                         cleaned = chain([block], cleaned)
                         break
                     found: Iterable[Columns] = []
@@ -101,12 +106,12 @@ class CsvFile:
                         if not self._has_even_rows(block):
                             cleaned = chain([block], cleaned)
                             break
-                        found = self._exact(io.StringIO(block.decode(), newline=""), wanted, texts, done)
+                        found = self._exact(io.StringIO(block.decode(), newline=""), wanted, set(texts), done)
                     for columns in found:
                         done += len(columns[wanted[0]])
                         yield columns
             lines = chain.from_iterable(io.StringIO(_text(block, self.path.name), newline="") for block in cleaned)
-            yield from self._exact(lines, wanted, texts, done)
+            yield from self._exact(lines, wanted, set(texts), done)
 
     def _parsed(self, block: bytes, wanted: Sequence[str], as_text: Set[str], nulls: list[str]) -> Columns | None:
         """Return the columns of a block without quotes, None if polars refuses a cell or a row has a wrong width.
@@ -130,10 +135,10 @@ class CsvFile:
         series = [table[str(place)] for place in places]
         return {name: column if name in as_text else column.to_numpy() for name, column in zip(wanted, series)}
 
-    def _has_usual_size(self, block: bytes) -> bool:
-        """Whether a block has as many cells as its rows should have: a single long row costs polars much memory."""
-        rows = block.rstrip(b"\r\n").count(b"\n") + 1
-        return block.count(self.layout.delimiter.encode()) == rows * (len(self.names) - 1)
+    def _has_short_lines(self, block: bytes) -> bool:
+        """Whether no line is far longer than the header makes likely: a single long row costs polars much memory."""
+        longest = LONG_LINE + LONG_CELL * len(self.names)
+        return all(block.find(b"\n", k, k + longest) >= 0 for k in range(0, len(block) - longest, longest))
 
     def _has_even_rows(self, block: bytes) -> bool:
         signs = np.frombuffer(block, np.uint8)
@@ -207,7 +212,7 @@ def _joined(blocks: list[Columns], wanted: Sequence[str]) -> Columns:
         else:
             import polars as pl
 
-            joined[name] = pl.concat([pl.Series("", part, dtype=pl.String) for part in parts])
+            joined[name] = pl.concat([pl.Series("", part, dtype=pl.String, strict=False) for part in parts])
     return joined
 
 

@@ -1,6 +1,6 @@
 """Columns of pandas, polars and arrow tables, through narwhals; a time index counts as a column."""
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -72,7 +72,7 @@ def dated_columns(frame: Any) -> tuple[str, ...]:
     return tuple(found)
 
 
-def load_frame(label: str, frame: Any, wanted: Sequence[str], texts: Set[str]) -> dict[str, np.ndarray]:
+def load_frame(label: str, frame: Any, wanted: Sequence[str], texts: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Return columns as (N,) arrays: numbers of a real type, texts as objects, and dates; only `texts` may be dates.
 
     Raises:
@@ -113,7 +113,7 @@ def _is_text(column: Any) -> bool:
 
 
 def partition_blocks(label: str, names: Sequence[str], chunk: int, content: Any, wanted: Sequence[str],
-                     texts: Set[str]) -> Iterator[dict[str, np.ndarray]]:
+                     texts: Mapping[str, str]) -> Iterator[dict[str, np.ndarray]]:
     """Yield columns of a computed partition of a Dask collection, `chunk` rows at a time; errors as of `load_frame`."""
     if isinstance(content, np.ndarray):
         if content.dtype.kind not in "iuf":

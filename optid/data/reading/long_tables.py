@@ -16,7 +16,7 @@ def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> Data
     """Return the error about a missing column, or the one that the table is long where its cells name the channels."""
     texts = [name for name in table.names if name and name not in table.dates and not is_time_name(name)]
     try:
-        loaded = table.load(texts, set(texts))
+        loaded = table.load(texts, dict.fromkeys(texts, "text"))
     except DataError:
         return error
     asked = [one for wanted in (inputs, outputs) for one in (

@@ -1,6 +1,6 @@
 """Parquet files by pyarrow, which verifies checksums and bounds its memory; whole ones also by polars."""
 
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ def parquet_head(path: Path) -> Any:
         return pl.read_parquet(path, n_rows=50, use_statistics=False)
 
 
-def load_parquet(path: Path, wanted: Sequence[str], texts: Set[str]) -> dict[str, Any]:
+def load_parquet(path: Path, wanted: Sequence[str], texts: Mapping[str, str]) -> dict[str, Any]:
     """Return some columns whole; errors as of `load_frame`, and `DataError` where they are damaged.
 
     Checksums of pages are verified where pyarrow is installed: polars ignores them.
@@ -51,7 +51,7 @@ def parquet_footer(path: Path) -> tuple[list[str], int, tuple[str, ...]]:
         return list(file.schema_arrow.names), file.metadata.num_rows, dates
 
 
-def parquet_blocks(path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], texts: Set[str]
+def parquet_blocks(path: Path, groups: Sequence[int] | None, chunk: int, wanted: Sequence[str], texts: Mapping[str, str]
                    ) -> Iterator[Block]:
     """Yield columns of some row groups, or of all for None, `chunk` rows at a time; errors as of `load_parquet`."""
     parquet = _pyarrow_parquet(path)

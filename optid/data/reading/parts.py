@@ -6,7 +6,7 @@ or computed there.
 
 import hashlib
 import platform
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ class Part:
     # task of Dask, or its result: a frame, or an array (n, channels); None for files
     content: Any = field(default=None, repr=False)
 
-    def blocks(self, wanted: Sequence[str], texts: Set[str]) -> Iterator[Block]:
+    def blocks(self, wanted: Sequence[str], texts: Mapping[str, str]) -> Iterator[Block]:
         """Start a pass over some columns; `DataError` if a file is missing on this machine or has other content."""
         for path, size, digest in self.files:
             _check_same(path, (size, digest))

@@ -56,9 +56,10 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
 def _paired(found: list[tuple[Clock, np.ndarray]], block: Mapping[str, Any], table: Table
             ) -> list[tuple[Clock, np.ndarray]]:
     """Join a column of dates without a time of day, and one of times of day."""
-    days = [one for one in found if one[1].dtype.kind == "M" and not (one[1] - one[1].astype("M8[D]")).any()]
     hours = [one for one in found if one[0].kind == "times of day"]
-    if not (days and hours):
+    days = [one for one in found if hours and one[1].dtype.kind == "M"
+            and not (one[1] - one[1].astype("M8[D]")).any()]
+    if not days:
         return [(clock, _unwrapped(stamps) if clock.kind == "times of day" else stamps) for clock, stamps in found]
     (day, dates), (hour, of_day) = days[0], hours[0]
     if day.kind == "ready":

@@ -1,7 +1,7 @@
 """Sources of records: named columns, loaded whole, or read in blocks and parts."""
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -31,7 +31,7 @@ class Table:
     names: list[str]  # names of its columns or variables
     # function of columns, and of those among them that may be texts or dates, returning {name: array}: numeric columns
     # are (N,) or (N, channels) of a real type, texts (N,) objects
-    load: Callable[[Sequence[str], Set[str]], dict[str, Any]]
+    load: Callable[[Sequence[str], Mapping[str, str]], dict[str, Any]]
     how: Format = Format()  # how it is written: what the user said, completed by what the source says
     index: str | None = None  # name of a time index besides the columns
     dates: tuple[str, ...] = ()  # columns of dates

@@ -53,18 +53,20 @@ def uniform_step(stamps: np.ndarray, tolerance: float, label: str, step: float |
     bad = np.abs(steps - median) > tolerance * median
     if bad.any():
         raise _not_uniform(stamps, steps, median, bad, tolerance, label, first)
-    return sampling_time(stamps, np.arange(stamps.size))
+    return sampling_time(stamps)
 
 
-def sampling_time(stamps: np.ndarray, positions: np.ndarray) -> float:
-    """Return the sampling time from stamps (N,) of samples at whole positions (N,): the line of least squares.
+def sampling_time(stamps: np.ndarray, positions: np.ndarray | None = None) -> float:
+    """Return the sampling time from stamps (N,) of samples at whole positions (N,), 0, 1, ... when not given.
+
+    It is the slope of the line of least squares.
 
     Of the numbers within three standard errors it is the one with the fewest digits: stamps that are rounded or
     jitter hide no digits of the sampling time.
     """
     every = max(1, stamps.size // LINE)
-    k, stamps = positions[::every] - positions[::every].mean(), stamps[::every]
-    t = seconds(stamps - stamps[0])
+    k = (np.arange(0, stamps.size, every) if positions is None else positions[::every]).astype(float)
+    k, t = k - k.mean(), seconds(stamps[::every] - stamps[0])
     square = float(k @ k)
     if not square:
         return float("nan")

@@ -173,16 +173,19 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
     left, values, right = np.linalg.svd(r22)
     covariance_e, covariance_z = lagged_covariances(statistics, rows, noise @ left, shocks @ right.T, z.size)
     tails = np.cumsum((values**2)[::-1])[::-1]
+    # in a power of two near the size of the errors, whose fourth powers would leave the range of numbers
+    unit = float(np.ldexp(1.0, np.frexp(np.trace(covariance_e[0]))[1]))
+    covariance_e = [e / unit for e in covariance_e]
     expected, thresholds, p_values = np.zeros((3, values.size))
     for n0 in range(values.size):
         mean, variance = moments_of_sum([e[n0:, n0:] for e in covariance_e], [s[n0:, n0:] for s in covariance_z])
-        expected[n0] = mean / j
+        expected[n0] = unit * mean / j
         if mean <= 0 or variance <= 0:
             p_values[n0] = 1.0 if values[n0] <= floor else 0.0
             continue
         g, h = variance / (2 * mean), 2 * mean**2 / variance
-        thresholds[n0] = g / j * chdtri(h, level)
-        p_values[n0] = chdtrc(h, tails[n0] * j / g)
+        thresholds[n0] = unit * g / j * chdtri(h, level)
+        p_values[n0] = chdtrc(h, tails[n0] / unit * j / g)
     return RankTest(values, tails, expected, thresholds, p_values, floor, level, j,
                     values.size if largest is None else largest)
 

@@ -215,8 +215,8 @@ class _Iterate:
 
     def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
         bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
-        model, value = self.fit.recover(self.fit.places.values(self.x)), self.fit.criterion.unit * self.at.value
-        return Evidence(model, value, bound, status, reason, figures)
+        values, value = self.fit.places.values(self.x), self.fit.criterion.unit * self.at.value
+        return Evidence(self.fit.recover(values), value, bound, status, reason, figures, values=values)
 
 
 def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:

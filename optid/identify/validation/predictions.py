@@ -50,6 +50,14 @@ def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Arr
         return [np.full(e.y.shape, np.nan) for e in data.experiments]
 
 
+def one_step_or_nan(model: Any, data: Data) -> list[Array]:
+    """Return what `one_step` does; NaN where nothing can be predicted or the prediction diverges."""
+    try:
+        return one_step(model, data)
+    except DataError:
+        return [np.full(e.y.shape, np.nan) for e in data.experiments]
+
+
 @dataclass(frozen=True)
 class Measures:
     """Errors of one output over the samples that are present and predicted.
@@ -111,7 +119,7 @@ def prediction_fit(model: Any, data: Data, word: str = ONE_STEP) -> Array:
     The word is "one step", "measured feedback" or "simulation"; the last two need every sample of the inputs.
     """
     raw = data.raw()
-    found = one_step(model, raw) if word == ONE_STEP else simulated_or_nan(model, raw, word)
+    found = one_step_or_nan(model, raw) if word == ONE_STEP else simulated_or_nan(model, raw, word)
     return common_fits(raw, [found])[0]
 
 

@@ -64,7 +64,7 @@ def wider(design: Design, functions: Sequence[tuple[Family, Array]]) -> list[Arr
             decays = np.asarray([pole ** np.arange(len(u) - reach) for pole in slow]).T
             blocks = [decays if i == len(found) else 0 * decays for i in range(len(design.u))]
             columns += list(np.hstack(blocks).T)
-        found.append(np.column_stack(columns))
+        found.append(np.reshape(columns, (len(columns), len(u) - reach)).T)  # none of a short record
     return found
 
 
