@@ -11,7 +11,7 @@ from scipy.io import savemat
 
 import optid
 from optid.data.reading import csvfile
-from optid.errors import OptidError
+from optid.errors import DataError, OptidError
 
 U, Y = np.arange(60.0)[:, None], np.sin(np.arange(60.0))[:, None]
 
@@ -122,3 +122,22 @@ def models():
         "ss": optid.fit(both, "hammerstein_ss.sid", nx=2, basis=optid.Polynomial(3), prove=False),
         "feedback": optid.fit(both, "hammerstein_ss.asivid", nx=2, basis=optid.Linear(),
                               feedback_basis=optid.Polynomial(2), prove=False)}
+
+
+def test_a_changed_page_of_a_parquet_file_with_checksums_is_never_read(tmp_path):
+    """Of random single bits in the pages every one is noticed; without a check most would change a sample."""
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    r = np.random.default_rng(4)
+    path = tmp_path / "r.parquet"
+    table = pa.table({"u": r.normal(size=400), "y": r.normal(size=400)})
+    pq.write_table(table, path, compression="none", use_dictionary=False, write_page_checksum=True)
+    whole = path.read_bytes()
+    for at in r.integers(80, 6000, 60):
+        changed = bytearray(whole)
+        changed[at] ^= 1 << int(r.integers(0, 8))
+        path.write_bytes(changed)
+        for read in (optid.read, lambda path: list(optid.open_stream(path))):
+            with pytest.raises(DataError, match="r.parquet is not a Parquet file, or it is damaged"):
+                read(path)

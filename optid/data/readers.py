@@ -329,7 +329,8 @@ def _sampled(runs: Sequence[_Run], how: Format, dt: float | None
                 raise DataError(f"{run.label} has no time column, which {word}= needs. Name it: time=.")
             experiments.append(Experiment(run.u, run.y, 0.0))
             continue
-        pieces, found, said = regular(run.stamps, run.u, run.y, dt, how, run.label)
+        where = run.label if run.clock is None else f"{run.label}, column {run.clock.columns[0]!r}"
+        pieces, found, said = regular(run.stamps, run.u, run.y, dt, how, where)
         findings += said
         step = agreed_step(found, step, how.time_tolerance, run.label)
         if dt is None and found and run.step and abs(found - run.step) > how.time_tolerance * run.step:
