@@ -184,7 +184,7 @@ def test_join_refuses_what_does_not_belong_together(record):
     other = Data(record.u, record.y, 0.1, ["valve", "fan"], "level", ["%", "V"], "m")
     refuses(DataError, r"data set 2 has inputs \('valve', 'fan'\)", Data.join, record, other)
     slow = Data(record.u, record.y, 0.2, ["valve", "pump"], "level", ["%", "V"], "m")
-    refuses(DataError, "dt 0.2, the first has 0.1", Data.join, record, slow)
+    refuses(DataError, "data set 2 is sampled every 0.2 s, the first every 0.1 s", Data.join, record, slow)
     refuses(DataError, r"raw\(\)", Data.join, record, record.detrend())
     refuses(DataError, "at least one", Data.join)
 

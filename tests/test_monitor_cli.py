@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -49,13 +50,36 @@ def test_one_line_per_event(folder):
     out, errors = known(folder)
     lines = out.splitlines()
     assert errors == ""
-    assert lines[0].startswith("t = 15") and ": alarm: " in lines[0]
+    assert lines[0].startswith("sample 15") and "(t = 15" in lines[0] and ": alarm: " in lines[0]
     assert any("isolated: sensor:y1" in line for line in lines)
     assert any("isolated: actuator:u2 loss" in line for line in lines)
     objects = [json.loads(line) for line in known(folder, "--json")[0].splitlines()]
     assert len(objects) == len(lines)
     assert [o["line"] for o in objects] == [o["sample"] + 2 for o in objects]
+    assert all(o["onset_time"] == str(o["onset"]) for o in objects if o["onset"] is not None)
     assert objects[0]["kind"] == "alarm" and objects[0]["time"] == str(objects[0]["sample"])
+
+
+def test_dates_stand_beside_samples_and_survive_a_restart(folder, tmp_path):
+    head, *rows = (folder / "stream.csv").read_text().splitlines()
+    dates = np.datetime_as_string(np.datetime64("2024-05-01T06:00:00") + np.arange(len(rows)), "s")
+    dated = [f"{date}," + row.partition(",")[2] for date, row in zip(dates, rows)]
+    out, _ = known(folder, text="\n".join([head, *dated]) + "\n")
+    for line in out.splitlines():
+        sample, when = re.match(r"sample (\d+) \((.*?)\): ", line).groups()
+        assert when == dates[int(sample)]
+        for onset, since in re.findall(r"since (\d+) \((.*?)\)", line):
+            assert since == dates[int(onset)]
+    assert "since" in out
+    grown, state = tmp_path / "grown.csv", tmp_path / "state.npz"
+    said = ""
+    grown.write_text(head + "\n")
+    for first, last in ((0, 152), (152, len(dated))):
+        with grown.open("a") as file:
+            file.write("".join(f"{row}\n" for row in dated[first:last]))
+        said += known(folder, "--follow", str(grown), "--until-end", "--state", str(state))[0]
+    assert said == out
+
 
 
 def test_a_state_is_resumed_as_if_nothing_had_happened(folder, tmp_path):
@@ -154,7 +178,7 @@ def test_a_file_is_followed_until_the_monitor_is_stopped(folder, tmp_path):
         assert ": alarm: " in lines[0] and lines[1]
         process.send_signal(signal.SIGTERM)
         _, errors = process.communicate(timeout=600)
-        assert process.returncode == 0 and errors == ""
+        assert errors == "" and process.returncode == 0
     finally:
         process.kill()
     assert state.exists()

@@ -1,5 +1,7 @@
 """Pages of results in a headless browser: nothing is cut off, nothing overlaps, everything can be read and operated."""
 
+import re
+
 import numpy as np
 import pytest
 from browser import CHROMIUM, NO_BROWSER, Browser
@@ -51,6 +53,14 @@ CONTRAST = """(() => {
 DRAWN = "[...document.querySelectorAll('[data-chart]')].every((host) => host.querySelector('svg'))"
 
 
+def dated_fit():
+    """A fit of a record of 60 hours, with something to say of it."""
+    data = example_fit("thruster").data
+    found = optid.Data(data.u, data.y, 360.0, "current", "thrust", start="2024-05-01T06:00")
+    return optid.fit(found.mapped(lambda u: u, lambda y: y, findings=("clock 't': in h, read as seconds",)),
+                     "hammerstein_arx.exact", na=2, nb=1, basis="triangular:4")
+
+
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory):
     """Every kind of page, the names of channels awkward."""
@@ -67,6 +77,7 @@ def pages(tmp_path_factory):
         "comparison": optid.compare_models({"exact": fit.model, "smaller": fit.refit(na=1).model}, record).report(
             folder / "comparison.html"),
         "order": optid.order(record).report(folder / "order.html"),
+        "dated": report.write(dated_fit(), folder / "dated.html"),
         "search": optid.identify(record, budget=3, workers=1).report(folder / "search.html"),
     }
 
@@ -91,7 +102,7 @@ def shown(browser, path, width, dark=False):
     return ready
 
 
-NAMES = ["fit", "several", "feedback", "useless", "validation", "comparison", "order", "search"]
+NAMES = ["fit", "several", "feedback", "useless", "validation", "comparison", "order", "dated", "search"]
 
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
@@ -128,6 +139,39 @@ def test_records_zoom_together_and_show_their_values(pages, browser):
     browser.press("0")
     again = browser.run(views)[:2]
     assert [view.split()[:2] for view in again] == [again[0].split()[:2]] * 2 and float(again[0].split()[1]) > 55
+
+
+def test_ticks_of_dates_follow_the_zoom(pages, browser):
+    chart = ".charts svg.chart"
+    labels = (f"[...document.querySelectorAll('{chart}')].slice(0, 2).map((s) => [...s.querySelectorAll('text')]"
+              ".filter((t) => t.getAttribute('text-anchor') === 'middle' && !t.getAttribute('transform'))"
+              ".map((t) => t.textContent))")
+    for width in (1300, 390):
+        shown(browser, pages["dated"], width)
+        first = browser.run("document.querySelector('main section').id")
+        assert first == "record"
+        ticks = browser.run(labels)
+        assert "2 May" in ticks[0] and ticks[0][-1].startswith("time, 2024")
+        browser.run(f"document.querySelector('{chart}').focus()")
+        found = []
+        for _ in range(24):
+            browser.press("+")
+            one, other = browser.run(labels)
+            assert one == other  # linked
+            assert all(a != b for a, b in zip(one, one[1:])) and browser.run(OVERLAPS) == []
+            found.append(one)
+        forms = {"".join("0" if sign.isdigit() else sign for sign in tick) for one in found for tick in one[:-1]}
+        assert {"00:00", "00:00:00", "00.0 s"} <= forms and not any("e" in form for form in forms - {"0 May"})
+        browser.press("0")
+        for _ in range(5):
+            browser.press("-")
+            assert browser.run(OVERLAPS) == []
+        assert browser.run(labels)[0][-1] in ("time, 2024", "time")
+        browser.press("0")
+        browser.press(".")
+        tip = browser.run("document.querySelector('.charts .tip:not([hidden])').textContent").splitlines()[0]
+        date, sample = re.fullmatch(r"(2024-05-0\d \d\d:\d\d:00), sample (\d+)", tip).groups()
+        assert np.datetime64(date) == np.datetime64("2024-05-01T06:00") + int(sample) * np.timedelta64(360, "s")
 
 
 def test_curves_are_switched_off_by_the_legend(pages, browser):

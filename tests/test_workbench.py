@@ -470,6 +470,26 @@ def test_experiment_and_output_are_chosen(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_dated_record_shows_dates_and_samples_of_the_whole(tmp_path):
+    if CHROMIUM is None:
+        pytest.skip(NO_BROWSER)
+    data = example("thruster").data
+    data = optid.Data(data.u, data.y, 60.0, "current", "thrust", start="2024-05-01T06:00").mapped(
+        lambda u: u, lambda y: y, findings=("clock 't': in min, read as seconds",))
+    start = suggested(data, {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:4"})
+    with served(Source(data, "data", {**start, "window": [100, 500]})) as server, Browser(tmp_path) as browser:
+        goto(browser, server)
+        assert browser.run("document.querySelector('main section').textContent").split("read")[0].endswith("in min, ")
+        assert browser.run(OVERLAPS) == []
+        browser.run("document.querySelector('#time svg.chart').focus()")
+        browser.press(".")
+        tip = browser.run("document.querySelector('#time .tip:not([hidden])').textContent").splitlines()[0]
+        date, sample = tip.split(", sample ")
+        assert int(sample) >= 100
+        assert np.datetime64(date) == np.datetime64("2024-05-01T06:00") + int(sample) * np.timedelta64(1, "m")
+
+
+@pytest.mark.slow
 def test_a_browser_follows_the_redirect(tmp_path):
     if CHROMIUM is None:
         pytest.skip(NO_BROWSER)

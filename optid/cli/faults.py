@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import command_line, working
+from optid.cli.results import command_line, reading_for, working
 
 ZERO = "INPUT=VALUE, the input at which the actuator has no effect"
 
@@ -83,7 +83,7 @@ def diagnose(model: Path, data: Paths = None, *, example: str | None = None, how
         from optid.faults.diagnosis.diagnosing import KINDS
 
         plant = words.state_space_model(model)
-        how = words.as_modelled(how, plant)
+        how = reading_for(plant, how)
         record: Any = words.record(data, how, example, seed)[0]
         if record.n_experiments > 1:
             raise DataError(f"the record has {record.n_experiments} experiments: give one file with one experiment."
@@ -168,7 +168,7 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
 
         plant = words.state_space_model(model)
         found = load_diagnosis(diagnosis)
-        record: Any = words.record(data, words.as_modelled(how, plant), example, seed)[0]
+        record: Any = words.record(data, reading_for(plant, how), example, seed)[0]
         given = words.listed(constraint)
         work.step("refitting")
         built = rebuild(

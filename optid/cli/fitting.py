@@ -1,12 +1,13 @@
 """The commands `optid fit`, `optid identify` and `optid validate`."""
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import Work, check_names, working
+from optid.cli.results import Work, check_names, reading_for, working
 from optid.errors import DataError
 from optid.lazy import import_cvxpy
 
@@ -67,7 +68,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         work.text = describe(found)
         work.step("searching for advice")
         work.text += describe_advice(found)
-        _check(work, found, held_out, "fit")
+        _check(work, found, record, held_out, "fit")
         work.page(found, report, held_out)
 
 
@@ -107,7 +108,7 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
         found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
         _save(work, found, held_out, saved, data, how)
         work.text = str(found)
-        _check(work, found, held_out, "search")
+        _check(work, found, record, held_out, "search")
         work.page(found, report, held_out)
 
 
@@ -122,13 +123,16 @@ def _save(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths
     work.write("model", saved, lambda path: found.model.save(path, record))
 
 
-def _check(work: Work, found: Any, held_out: Any, what: str) -> None:
-    """Validate on the held-out record, if there is one."""
+def _check(work: Work, found: Any, record: Any, held_out: Any, what: str) -> None:
+    """Validate on the held-out record, if there is one; findings that were printed before are not repeated."""
     if held_out is not None:
         from optid.identify.validation.checks import validate as check
 
         work.step("validating")
-        work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{check(found.model, held_out)}"
+        checked = check(found.model, held_out)
+        if checked.findings == record.findings:
+            checked = replace(checked, findings=())
+        work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{checked}"
 
 
 def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:
@@ -146,6 +150,7 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
         from optid.identify.validation import compare_models
         from optid.identify.validation import validate as check
         from optid.models.files import load
+        from optid.show.terminal import findings_lines
 
         paths = [path for i, path in enumerate(files) if i == 0 or path.suffix.lower() == ".json"]
         data = [path for path in files if path not in paths]
@@ -154,12 +159,14 @@ def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report
         distinct = len({path.stem for path in paths}) == len(paths)
         models = {path.stem if distinct else str(path): load(path) for path in paths}
         first = next(iter(models.values()))
-        record: Any = words.read_record(data, words.as_modelled(how, first))
+        record: Any = words.read_record(data, reading_for(first, how))
         work.step("validating")
         compared = len(models) > 1 or report is not None
         found: Any = compare_models(models, record, horizon) if compared else None
         if len(models) > 1:
             work.text = str(found)
         else:
-            work.text = f"{first}\n\n{found.validations[0] if compared else check(first, record, horizon=horizon)}"
+            checked = found.validations[0] if compared else check(first, record, horizon=horizon)
+            said = "\n".join([*findings_lines(checked.findings), ""]) if checked.findings else ""
+            work.text = f"{said}{first}\n\n{replace(checked, findings=())}"
         work.page(found, report)

@@ -16,6 +16,8 @@ LOUD = 20  # unreadable rows reported individually per block read; the others ar
 ARL0 = 10_000
 """Default mean number of samples between false alarms."""
 
+REMEMBERED = 1000  # samples whose time stamps are kept, for the time of an onset
+
 KEPT = 10_000  # samples after which the state is saved, events or not
 
 
@@ -27,8 +29,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     """Monitor a stream of samples: print one line per alarm, isolated fault and end of a fault.
 
     Unreadable rows are reported on the error stream and count as missing samples. A file that is rotated, truncated
-    or replaced is followed. With --json every line has the fields kind, sample, line, time, candidates, onset, size,
-    statistic and note.
+    or replaced is followed. With --json every line has the fields kind, sample, line, time, candidates, onset,
+    onset_time, size, statistic and note.
 
     Example: optid monitor model.json --arl0 10000 < stream.csv
 
@@ -161,6 +163,7 @@ class _Watch:
         self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
         self.plant = (watcher.source or {}).get("model") or watcher.dictionary.model.to_dict()
         self.bad, self.saved, kept = 0, watcher.samples, (watcher.source or {}).get("place")
+        self.stamps = {int(sample): stamp for sample, stamp in (watcher.source or {}).get("stamps", [])}
         if kept is not None and follow is not None:
             if kept["path"] != str(follow.resolve()):
                 raise DataError(f"{state} is the state of {kept['path']}, not of {follow}: name another file")
@@ -200,10 +203,10 @@ class _Watch:
         for _, text in rows.bad[:LOUD]:
             note(text)
         self.bad += len({number for number, _ in rows.bad})
+        self._remember(first, rows.stamps)
         events = self.watcher.run(rows.u, rows.y)
         for event in events:
-            place = event.sample - first
-            self._tell(event, int(rows.lines[place]), _clean(rows.stamps[place]) if rows.stamps else "")
+            self._tell(event, int(rows.lines[event.sample - first]))
         if self.file is not None:  # a line that ends the stream is the first to be read when it is resumed
             done = raw[: rows.stop - line - 1] if rows.error else raw
             self.file.advance(sum(map(len, done)) + len(done), done)
@@ -212,18 +215,36 @@ class _Watch:
         if events or self.watcher.samples - self.saved >= KEPT:
             self._keep()
 
+    def _remember(self, first: int, stamps: list[str]) -> None:
+        """Keep the time stamps of the last samples: an event names the onset, which lies before it."""
+        self.stamps |= {first + k: _clean(stamp) for k, stamp in enumerate(stamps) if stamp}
+        if len(self.stamps) > 2 * REMEMBERED + len(stamps):
+            self.stamps = dict([*self.stamps.items()][-REMEMBERED - len(stamps):])
+
     def _keep(self) -> None:
         if self.state is not None:
             place = None if self.file is None else self.file.place
-            self.watcher.source = {"model": self.plant, "place": place, **self.reader.memory}
+            self.watcher.source = {"model": self.plant, "place": place, "stamps": [*self.stamps.items()][-REMEMBERED:],
+                                   **self.reader.memory}
             self.watcher.save(self.state)
             self.saved = self.watcher.samples
 
-    def _tell(self, event: Any, line: int, stamp: str) -> None:
+    def _tell(self, event: Any, line: int) -> None:
+        stamp, onset = self.stamps.get(event.sample), self.stamps.get(event.onset)
         if self.as_json:
-            print(json.dumps({**event.to_dict(), "line": line, "time": stamp or None}), flush=True)
+            print(json.dumps({**event.to_dict(), "line": line, "time": stamp, "onset_time": onset}), flush=True)
         else:
-            print(f"t = {stamp}, sample {event}" if stamp else f"sample {event}", flush=True)
+            print(f"sample {event.in_words(_in_words(stamp), _in_words(onset))}", flush=True)
+
+
+def _in_words(stamp: str | None) -> str:
+    """Return a time stamp as text that can stand alone; "" without one."""
+    if stamp is None:
+        return ""
+    try:
+        return f"t = {float(stamp):.12g}"
+    except ValueError:
+        return stamp
 
 
 def _clean(stamp: str) -> str:

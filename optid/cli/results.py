@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,17 @@ def check_names(constraints: Iterable[str] | None, solver: str = "auto", formula
         from optid.backends.choice import find
 
         find(solver)
+
+
+def reading_for(model: Any, how: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the reading options with the channels of a model, and its sampling time where it has a unit.
+
+    A model of a record without a clock counts samples: another record of its plant is read as that one was.
+    """
+    from optid.cli.arguments import as_modelled
+
+    counts_samples = not model.time_unit and model.dt == 1
+    return as_modelled(how, model) | ({"dt": how["dt"]} if counts_samples else {})
 
 
 def check_folders(*paths: Path | None) -> None:
@@ -76,7 +87,7 @@ class Work(Waiting):
     def print(self) -> None:
         """Print the result, the warnings that it does not contain, and the files written."""
         if self.text:
-            say(coloured(self.text))
+            say(coloured(self.text.replace("pass dt= ", "pass --dt ")))  # a finding names the argument of Python
         said = " ".join(self.text.split())
         for sentence in self.heard:
             if " ".join(sentence.split()) not in said:

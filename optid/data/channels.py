@@ -175,8 +175,13 @@ def sampling_time(dt: Any) -> float:
     return float(dt)
 
 
+def interval_text(dt: float, time_unit: str) -> str:
+    """Write a sampling time with its unit."""
+    return f"{dt:g} {time_unit}".rstrip()
+
+
 def model_meta(data: Any) -> dict[str, Any]:
     """Return the names, units and sampling time of a record or stream that a model carries."""
-    return {"dt": data.dt, "inputs": tuple(data.inputs), "outputs": tuple(data.outputs),
+    return {"dt": data.dt, "time_unit": data.time_unit, "inputs": tuple(data.inputs), "outputs": tuple(data.outputs),
             "input_units": tuple(getattr(data, "input_units", None) or ("",) * len(data.inputs)),
             "output_units": tuple(getattr(data, "output_units", None) or ("",) * len(data.outputs))}

@@ -1,5 +1,6 @@
 """A record at a glance: its experiments, its sampling, and each channel's range, levels and missing samples."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +9,8 @@ import numpy as np
 from optid.data.channels import MOST_LEVELS, Channel
 
 MOST_EXPERIMENTS = 10  # that are listed
+MOST_FINDINGS = 6  # that stand before a verdict
+RECORD = "The record"  # their heading
 
 
 @dataclass(frozen=True, repr=False)
@@ -51,6 +54,17 @@ class Description:
         return "\n".join(lines)
 
     __repr__ = __str__
+
+
+def first_findings(findings: Sequence[str]) -> list[str]:
+    """Return the first findings of a record, and a line that counts the others."""
+    more = len(findings) - MOST_FINDINGS
+    return [*findings[:MOST_FINDINGS], *([f"and {more} more, listed by print(data)"] if more > 0 else [])]
+
+
+def listed_findings(findings: Sequence[str]) -> list[str]:
+    """Return the first findings of a record as lines under their heading; none without findings."""
+    return [RECORD, *(f"- {finding}" for finding in first_findings(findings))] if findings else []
 
 
 def instant(time: Any) -> str:

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import as_records, frozen, one_or_all
+from optid.arrays import as_list, as_records, frozen, one_or_all
 from optid.data import preprocessing
-from optid.data.channels import Channel, Ports, Transform, channel_fields, listed, sampling_time
-from optid.data.description import Description
+from optid.data.channels import Channel, Ports, Transform, channel_fields, interval_text, listed, sampling_time
+from optid.data.description import Description, instant
+from optid.data.timeline import Timeline
 from optid.errors import DataError, nearest
 from optid.registry import render
 
@@ -155,18 +156,17 @@ class Data(Ports):
     @property
     def start(self) -> Any:
         """Time of the first sample, a date (datetime64) where the record is dated; a tuple for several experiments."""
-        return one_or_all([self._instants(e, np.zeros(1))[0] for e in self.experiments])
+        return one_or_all([timeline.instants([0])[0] for timeline in self.timelines])
 
     @property
     def time(self) -> Any:
         """Sampling instants (N,), dates where the record is dated; a tuple of such arrays for several experiments."""
-        return one_or_all([self._instants(e, np.arange(e.n_samples)) for e in self.experiments])
+        return one_or_all([line.instants(np.arange(e.n_samples)) for line, e in zip(self.timelines, self.experiments)])
 
-    def _instants(self, e: Experiment, samples: np.ndarray) -> np.ndarray:
-        if not self.dated:
-            return e.start + self.dt * samples
-        start = np.datetime64(round(e.start * 1e6), "us").astype("M8[ns]")  # seconds since 1970 hold microseconds
-        return start + np.round(self.dt * samples * 1e9).astype("m8[ns]")
+    @property
+    def timelines(self) -> tuple[Timeline, ...]:
+        """When the samples of each experiment were taken."""
+        return tuple(Timeline(e.start, self.dt, self.time_unit, self.dated) for e in self.experiments)
 
     # -- what the data look like ---------------------------------------------------------------------------------
 
@@ -208,7 +208,7 @@ class Data(Ports):
     @property
     def interval(self) -> str:
         """The sampling time with its unit, as text."""
-        return f"{self.dt:g} {self.time_unit}".rstrip()
+        return interval_text(self.dt, self.time_unit)
 
     def __str__(self) -> str:
         units = "" if self.transform.is_identity else "\n  detrended or scaled; reports are in raw units"
@@ -216,7 +216,7 @@ class Data(Ports):
 
     def describe(self) -> Description:
         """Return range, mean, distinct levels and missing samples of each channel, and how it is sampled."""
-        ends = [self._instants(e, np.array([0, e.n_samples - 1])) for e in self.experiments]
+        ends = [line.instants([0, e.n_samples - 1]) for line, e in zip(self.timelines, self.experiments)]
         return Description(self.name, self.interval, tuple(e.n_samples for e in self.experiments),
                            tuple((a, b) for a, b in ends), self.channels, self.findings)
 
@@ -234,7 +234,7 @@ class Data(Ports):
             import pandas as pd
         except ImportError:
             raise DataError('to_pandas needs pandas: pip install "optid[tables]"') from None
-        times = [pd.Index(self._instants(e, np.arange(e.n_samples)), name="time") for e in self.experiments]
+        times = [pd.Index(time, name="time") for time in as_list(self.time)]
         frames = [pd.DataFrame(record, index, [*self.inputs, *self.outputs])
                   for record, index in zip(self.records, times)]
         return frames[0] if len(frames) == 1 else pd.concat(
@@ -291,13 +291,13 @@ class Data(Ports):
         if not isinstance(part, slice) or part.step is not None:
             raise DataError("data[first:last] takes samples (data[100:200]) or times (data[1.0:2.0]), and no step; "
                             "use decimate for every k-th sample, .u and .y for arrays.")
-        ends = [end for end in (part.start, part.stop) if end is not None]
+        asked, ends = part, [end for end in (part.start, part.stop) if end is not None]
         if self.dated:
             ends = [_seconds_of(end) for end in ends]
             part = slice(*(None if end is None else _seconds_of(end) for end in (part.start, part.stop)))
         whole = all(isinstance(end, int | np.integer) and not isinstance(end, bool) for end in ends)
         if not whole and not all(isinstance(end, float | np.floating) and end == end for end in ends):
-            raise DataError(f"data[{part.start!r}:{part.stop!r}]: two integers are samples, two floats are times.")
+            raise DataError(f"data[{asked.start!r}:{asked.stop!r}]: two integers are samples, two floats are times.")
 
         def sample(end: Any, e: Experiment) -> int | None:
             """The first sample not before a time, with 1e-6 of a step for the rounding of the times."""
@@ -308,9 +308,9 @@ class Data(Ports):
         spans = [slice(sample(part.start, e), sample(part.stop, e)).indices(e.n_samples) for e in self.experiments]
         kept = [self._cut(e, first, last) for e, (first, last, _) in zip(self.experiments, spans) if first < last]
         if not kept:
-            raise DataError(f"data[{part.start}:{part.stop}] holds no samples; there are "
+            raise DataError(f"data[{asked.start}:{asked.stop}] holds no samples; there are "
                             f"{', '.join(str(e.n_samples) for e in self.experiments)} "
-                            f"from time {', '.join(f'{e.start:g}' for e in self.experiments)}.")
+                            f"from time {', '.join(instant(line.instants([0])[0]) for line in self.timelines)}.")
         return self._with(experiments=tuple(kept))
 
     def select(self, inputs: str | Sequence[str] | None = None, outputs: str | Sequence[str] | None = None,
@@ -347,7 +347,7 @@ class Data(Ports):
         """Return the experiments of several data sets as one data set.
 
         Raises:
-            DataError: names, units, sampling times or transforms differ.
+            DataError: names, units, sampling times or transforms differ, or the times are dates in some of them only.
         """
         if not parts:
             raise DataError("join needs at least one data set.")
@@ -358,10 +358,17 @@ class Data(Ports):
                     raise DataError(f"data set {k} has {what} {getattr(part, what)}, the first has "
                                     f"{getattr(head, what)}; give them the same names and units, or use select.")
             if abs(part.dt - head.dt) > 1e-9 * head.dt:
-                raise DataError(f"data set {k} has dt {part.dt:g}, the first has {head.dt:g}; decimate the faster one.")
+                raise DataError(f"data set {k} is sampled every {part.interval}, the first every {head.interval}; "
+                                "decimate the faster one.")
             if part.transform != head.transform:
                 raise DataError(f"data set {k} was detrended or scaled differently; join first, or call raw() on both.")
-        return head._with(experiments=tuple(e for part in parts for e in part.experiments))
+            if part.dated != head.dated:
+                raise DataError(f"the times of data set {k} are {'dates' if part.dated else 'numbers'}, those of the "
+                                f"first are {'dates' if head.dated else 'numbers'}; give both dates (start=).")
+        units = {part.time_unit for part in parts}
+        return head._with(experiments=tuple(e for part in parts for e in part.experiments),
+                          time_unit=head.time_unit if len(units) == 1 else "",
+                          findings=tuple(dict.fromkeys(finding for part in parts for finding in part.findings)))
 
     # -- changes of the samples --------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from optid.arrays import check_integer
-from optid.data.channels import Ports, Transform, channel_fields, sampling_time
+from optid.data.channels import Ports, Transform, channel_fields, interval_text, sampling_time
 from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surveyed
 from optid.data.reading.clock import Clock, clock_columns, recognise
 from optid.data.reading.columns import Wanted, choose
@@ -87,6 +87,11 @@ class Stream(Ports):
     def n_experiments(self) -> int:
         """Number of experiments."""
         return self.parts[-1].experiment + 1 if self.parts else 1
+
+    @property
+    def interval(self) -> str:
+        """The sampling time with its unit, as text."""
+        return interval_text(self.dt, self.time_unit)
 
     @property
     def transform(self) -> Transform:

@@ -10,7 +10,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.backends.casadi import function_of
-from optid.data.channels import Transform
+from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.stretches import interpolated, with_whole_inputs
 from optid.errors import RankError, StructureError
@@ -149,8 +149,7 @@ class PhysicalErrors(Criterion):
         mean = np.mean(np.vstack([e.u for e in data.experiments]), axis=0)
         return PhysicalModel(
             self.code, self.in_words(), tuple(equations.states), dict(zip(equations.parameters, p)), states[0],
-            mean, self.bounds, self.steps, equations.hold, dt=data.dt,
-            inputs=data.inputs, outputs=data.outputs, input_units=data.input_units, output_units=data.output_units)
+            mean, self.bounds, self.steps, equations.hold, **model_meta(data))
 
     # -- errors and their sensitivities --------------------------------------------------------------------------
 

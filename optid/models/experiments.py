@@ -20,7 +20,8 @@ def in_units_of(model: Any, data: Data) -> Data:
             raise DataError(f"The data have the {kind} {', '.join(given)}; the model has {', '.join(wanted)}. "
                             f"Use data.select({kind}={list(wanted)}).")
     if abs(data.dt - model.dt) > 1e-6 * model.dt:
-        raise DataError(f"The data are sampled every {data.dt:g}, the model every {model.dt:g}: resample the data.")
+        raise DataError(f"The data are sampled every {data.interval}, the model every {model.interval}: resample the "
+                        "data.")
     return data if data.transform.is_identity else data.raw()
 
 

@@ -125,7 +125,7 @@ def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
     channels = [f"{kind} {k}: {channel}{f' ({unit})' if unit else ''}" for kind, names, units in (
         ("u", model.inputs, model.input_units), ("y", model.outputs, model.output_units))
         for k, (channel, unit) in enumerate(zip(names, units))]
-    lines = [model.title, *channels, *model.equation().splitlines()]
+    lines = [model.title, *channels, *model.equation().splitlines(), model.sampling]
     notes = "\n".join(f" * {line.replace('*/', '* /')}" for line in lines)
     up = name.upper()
     path = Path(path)

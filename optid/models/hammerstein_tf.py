@@ -43,7 +43,7 @@ class HammersteinTF(Model):
         nonlinearities: one per input, their offsets None: the constants together are `offset`. See `f`.
         nk: delay in samples, one per input.
         offset: (l,) constant of the equation.
-        dt, inputs, outputs, input_units, output_units: see `Model`.
+        dt, time_unit, inputs, outputs, input_units, output_units: see `Model`.
         c: (nc,) coefficients of C = 1 + c_1 q^-1 + ...; one output.
         d: (nd,) coefficients of D = 1 + d_1 q^-1 + ...; one output. None where D is A.
         gauge: how the scale between f and B is fixed: "norm", "gain", "b0" or "none"; see `regauge`.
@@ -67,6 +67,7 @@ class HammersteinTF(Model):
     c: Any = field(default=(), kw_only=True)
     d: Any = field(default=None, kw_only=True)
     gauge: str = field(default="none", kw_only=True)
+    time_unit: str = field(default="", kw_only=True)
     GAUGES = GAUGES
     SIMULATORS = ("predict", "free")
     equation, coefficients, noise = text.equations, text.coefficients, property(text.noise)

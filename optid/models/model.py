@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array, as_list, check_integer, one_of, one_or_all
-from optid.data.channels import Ports, Transform, numbered_names
+from optid.data.channels import Ports, Transform, interval_text, numbered_names
 from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError
@@ -28,6 +28,7 @@ class Model(Ports):
     Attributes:
         nonlinearities: functions of the inputs.
         dt: sampling time.
+        time_unit: unit of dt: "s" where the record had a clock or dt was given, "" where it is unknown.
         inputs: names of the m inputs; u or u1, u2, ... by default.
         outputs: names of the l outputs; y or y1, y2, ... by default.
         input_units: one per input, "" where unknown.
@@ -43,6 +44,7 @@ class Model(Ports):
 
     nonlinearities: tuple[Nonlinearity, ...]
     dt: float
+    time_unit: str
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
     gauge: str
@@ -79,6 +81,8 @@ class Model(Ports):
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
             raise StructureError(f"dt = {self.dt!r}: it must be a positive number.")
+        if not isinstance(self.time_unit, str):
+            raise StructureError(f"time_unit = {self.time_unit!r}: it must be text, such as 's'.")
         one_of("gauge", self.gauge, self.GAUGES)
 
     @property
@@ -93,6 +97,16 @@ class Model(Ports):
         more = [word for word, functions in (("nonlinear feedback", "feedback"), ("latent functions", "latent"))
                 if getattr(self, functions, ())]
         return f"{family} {TITLES[self.structure]} model{' with ' * bool(more)}{' and '.join(more)}"
+
+    @property
+    def interval(self) -> str:
+        """The sampling time with its unit, as text."""
+        return interval_text(self.dt, self.time_unit)
+
+    @property
+    def sampling(self) -> str:
+        """The sampling time in words, for reports and exported code."""
+        return f"sampling time: {self.interval}{'' if self.time_unit else ' (unit unknown)'}"
 
     @property
     def radius(self) -> float:
@@ -134,14 +148,15 @@ class Model(Ports):
 
     def __repr__(self) -> str:
         orders = ", ".join(f"{name}={value}" for name, value in self.orders.items())
-        return f"{type(self).__name__}({self.title} of {', '.join(self.outputs)}; {orders}, dt={self.dt:g})"
+        return f"{type(self).__name__}({self.title} of {', '.join(self.outputs)}; {orders}, dt={self.interval})"
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(str(self))}</pre>"
 
     def __str__(self) -> str:
-        """Return the equations and the poles."""
-        return self.equation() + (f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else "")
+        """Return the equations, the poles and the sampling time."""
+        poles = f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else ""
+        return f"{self.equation()}{poles}\n{self.sampling}"
 
     # -- running over records ------------------------------------------------------------------------------------
 
@@ -311,6 +326,7 @@ class Model(Ports):
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build what `to_dict` described, with the functions of UserFunctions by name; errors as of the parts."""
+        content = {"time_unit": "", **content}  # an older file has none
         given = {one.name: content[one.name] for one in fields(cls)}
         for name in given.keys() & {"nonlinearities", "feedback", "latent"}:
             given[name] = tuple(Nonlinearity.from_dict(f, functions) for f in given[name])

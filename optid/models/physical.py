@@ -32,7 +32,7 @@ class PhysicalModel(Model):
     Continuous equations are integrated by the trapezoidal rule, as they were in the fit.
 
     Attributes:
-        dt, inputs, outputs, input_units, output_units, gauge: see `Model`.
+        dt, time_unit, inputs, outputs, input_units, output_units, gauge: see `Model`.
     """
 
     # the equations as a serialised `casadi.Function` (x, u, p) -> (right, y) of the states x, inputs u and parameters p
@@ -54,6 +54,7 @@ class PhysicalModel(Model):
     input_units: tuple[str, ...] = ()
     output_units: tuple[str, ...] = ()
     gauge: str = "none"
+    time_unit: str = ""
     GAUGES = ("none",)
     SIMULATORS = ("free", "predict")
     nonlinearities: ClassVar[tuple[Nonlinearity, ...]] = ()

@@ -55,7 +55,7 @@ class StateSpace(Model):
         offset_x: (n,) constant of the state equation.
         offset_y: (l,) constant of the output equation.
         noise: covariances of the noises, or None.
-        dt, inputs, outputs, input_units, output_units: see `Model`.
+        dt, time_unit, inputs, outputs, input_units, output_units: see `Model`.
         gauge: how the scale between f and B is fixed: "norm", "gain" or "none"; see `regauge`.
         latent: k nonlinearities h of the latent signals.
         Ez: (n, k), one column per latent signal; zero by default, like the four below.
@@ -89,6 +89,7 @@ class StateSpace(Model):
     input_units: tuple[str, ...] = ()
     output_units: tuple[str, ...] = ()
     gauge: str = field(default="none", kw_only=True)
+    time_unit: str = field(default="", kw_only=True)
     latent: tuple[Nonlinearity, ...] = field(default=(), kw_only=True)
     Ez: Any = field(default=None, kw_only=True)
     Fz: Any = field(default=None, kw_only=True)

@@ -16,6 +16,7 @@ from optid.models.functions import StaticFunction, has_feedback, response_pairs,
 from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
+from optid.show.wording import frequency_title, time_title
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -32,6 +33,17 @@ Lines = tuple[str, list[Array] | None, dict[str, Any]]
 def channel_axis(name: str, unit: str) -> Axis:
     """Return the axis of a channel, with its unit where it has one."""
     return Axis(f"{name} ({unit})" if unit else name, unit=unit)
+
+
+def time_axis(record: Data, k: int = 0) -> Axis:
+    """Return the axis of time of experiment k, which counts samples too."""
+    title = "time" if record.dated else time_title(record.time_unit)
+    return Axis(title, unit=record.time_unit, dates=record.dated, start=record.experiments[k].start, step=record.dt)
+
+
+def response_axis(model: Any) -> Axis:
+    """Return the axis of the time after a step."""
+    return Axis(time_title(model.time_unit, model.dt == 1))
 
 
 def validated(model: Any, record: Data) -> "Validation":
@@ -88,16 +100,16 @@ def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", ca
     A run has a name, outputs (N, l) of every experiment or None for none, and the options of its series.
     """
     e = record.experiments[k]
-    t = (e.start + record.dt * np.arange(e.n_samples, dtype=float))[part]
+    t, x = (e.start + record.dt * np.arange(e.n_samples, dtype=float))[part], time_axis(record, k)
     several = f", experiment {k + 1} of {record.n_experiments}" if record.n_experiments > 1 else ""
     charts = []
     for o, name in enumerate(record.outputs):
         series = [Series("measured", t, e.y[part, o], colour="ink", width=1.2)]
         series += [Series(label, t, run[k][part, o], **how) for label, run, how in runs if run is not None]
         y = channel_axis(name, record.output_units[o])
-        charts.append(Chart(f"Output {name}{several}", caption, Axis("time"), y, series, group, height=heights[0]))
+        charts.append(Chart(f"Output {name}{several}", caption, x, y, series, group, height=heights[0]))
     for c, name in enumerate(record.inputs):
-        charts.append(Chart(f"Input {name}{several}", "", Axis("time"), channel_axis(name, record.input_units[c]),
+        charts.append(Chart(f"Input {name}{several}", "", x, channel_axis(name, record.input_units[c]),
                             [Series(name, t, e.u[part, c], colour="muted", width=1.2)], group, height=heights[1]))
     return charts
 
@@ -160,12 +172,12 @@ def dynamics_charts(models: dict[str, Any], fit: "Fit | None" = None) -> list[Ch
             magnitude.append(Series(name, w, decibels(np.abs(curves[:, k])), colour=colour, width=2.0))
             phase.append(Series(name, w, np.degrees(np.unwrap(np.angle(curves[:, k]))), colour=colour, width=2.0))
             steps.append(Series(name, t, response[:, k], colour=colour, width=2.0))
-    frequency = Axis("frequency (rad per unit of time)", log=True, low=float(w[0]), high=float(w[-1]))
+    frequency = Axis(frequency_title(first), log=True, low=float(w[0]), high=float(w[-1]))
     caption = "The linear part, up to the Nyquist frequency" + ("; shaded: 95 % bands." if known is not None else ".")
     return [Chart("Bode diagram: magnitude", caption, frequency, Axis("magnitude (dB)", unit="dB"), magnitude, "bode"),
             Chart("Bode diagram: phase", caption, frequency, Axis("phase (degrees)", unit="degrees"), phase, "bode"),
             Chart("Step response", "Response of the linear part to a unit step of the function of the input.",
-                  Axis("time"), Axis("response"), steps),
+                  response_axis(first), Axis("response"), steps),
             pole_chart({label: model.poles for label, model in models.items()})]
 
 
@@ -259,7 +271,7 @@ def noise_chart(model: Any) -> Chart:
     series = [Series(name, w, 10 * np.log10(np.maximum(power[:, o], 1e-24)), colour=COLOURS[o % 10], width=2.0)
               for o, name in enumerate(model.outputs)]
     return Chart("Spectrum of the noise", "Process and measurement noise at the outputs; white noise is a flat line.",
-                 Axis("frequency (rad per unit of time)", log=True),
+                 Axis(frequency_title(model), log=True),
                  Axis("power per unit of bandwidth (dB)", unit="dB"), series)
 
 

@@ -1,11 +1,12 @@
 """Documents of every result, most important facts first, which terminal, notebook and page render."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.data.description import RECORD
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.validation import Validation
@@ -19,6 +20,7 @@ from optid.show.sections import (
     Code,
     Columns,
     Document,
+    Findings,
     Fold,
     Heading,
     Notes,
@@ -26,7 +28,7 @@ from optid.show.sections import (
     Section,
     attempt,
 )
-from optid.show.terminal import set_table, wrapped
+from optid.show.terminal import findings_lines, set_table, wrapped
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -55,6 +57,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
     """
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
     sections = [
+        *_record(fit.data.findings),
         Section("trust", "", lambda: _trust(fit, fit.verdict if judged is None else judged, test, advise)),
         Section("optimum", "", lambda: _optimum(fit)),
         Section("model", "Model", lambda: _model(fit)),
@@ -91,6 +94,11 @@ def _model(fit: "Fit") -> list[Any]:
         *([Fold("Coefficients of the basis", coefficients)] if coefficients else [])]
 
 
+def _record(findings: Sequence[str]) -> list[Section]:
+    """Return the section of what reading the record derived, assumed or repaired; none where there is nothing."""
+    return [Section("record", RECORD, [Findings(findings)])] if findings else []
+
+
 def record_document(data: Data, *, command: str = "") -> Document:
     """Return the document of a record: what reading it found, its channels, and their course."""
     raw = data.raw()
@@ -102,7 +110,7 @@ def record_document(data: Data, *, command: str = "") -> Document:
     channels = f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"
     lead = " · ".join([_length(data), f"every {data.interval}", channels])
     return Document(data.name or "Record", lead, [
-        *([Section("findings", "Findings", [Notes(data.findings)])] if data.findings else []),
+        *_record(data.findings),
         Section("channels", "Channels", lambda: [summary.channel_table(data)]),
         Section("figures", "Figures", drawn, page_only=True),
         *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
@@ -196,7 +204,8 @@ def search_document(found: "Identification", test: Data | None = None, *, comman
     """Return the document of a search: verdict, structures on trial, score by block, then the fit it ended with."""
     document = fit_document(found.fit, test, judged=found.verdict, command=command)
     section = Section("search", "Search for the structure", lambda: _search(found))
-    return Document(document.title, document.lead, [*document.sections[:2], section, *document.sections[2:]])
+    first = next(k for k, one in enumerate(document.sections) if one.id == "model")
+    return Document(document.title, document.lead, [*document.sections[:first], section, *document.sections[first:]])
 
 
 def _search(found: "Identification") -> list[Any]:
@@ -226,6 +235,7 @@ def validation_document(checked: Validation) -> Document:
     tone = "bad" if not worst >= USELESS_FIT else "fair" if worst < POOR_FIT or not checked.passed else "good"
     banner = Banner(tone, f"Residual tests: {'PASS' if checked.passed else 'FAIL'}", sentence + ".", fits)
     return Document(f"Validation on {checked.data}" if checked.data else "Validation", "", [
+        *_record(checked.findings),
         Section("trust", "", [banner]), Section("tests", "Errors and tests", lambda: validation_parts(checked))])
 
 
@@ -250,6 +260,7 @@ def comparison_document(found: "Comparison", *, command: str = "") -> Document:
 
     call = command or f"optid.compare_models(models, data, horizon={found.horizon})"
     return Document(title, lead, [
+        *_record(found.data.findings),
         Section("fits", "Fits", lambda: [checks.comparison_table(found), checks.facts_table(found)]),
         Section("figures", "Figures", figures, page_only=True),
         Section("validation", "Each model by itself", each, page_only=True),
@@ -260,7 +271,7 @@ def order_document(study: "OrderStudy") -> Document:
     """Return the document of a study of the order."""
     notes = [Notes([*study.reasons, *study.notes])]
     return Document(f"Order of {study.data}" if study.data else "Order", f"recommended: nx = {study.nx}", [
-        Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
+        *_record(study.findings), Section("order", "Recommendation", [Banner("plain", f"nx = {study.nx}"), *notes,
                                             Charts(charts.order_charts(study)),
                                             Fold("Tables", [Code(order_text(study))])])])
 
@@ -292,7 +303,8 @@ def order_text(study: "OrderStudy") -> str:
         tables.append(wording.Table("", ("lags by", "orders", "BIC", "hold-out %"), [
             (word, str(one), f"{one.bic:.1f}", f"{one.fit:.2f}" if np.isfinite(one.fit) else "")
             for word, one in best.items()]))
-    lines = [f"Order of {study.data}" if study.data else "Order", *(line for one in tables for line in set_table(one))]
+    lines = [*findings_lines(study.findings), f"Order of {study.data}" if study.data else "Order",
+             *(line for one in tables for line in set_table(one))]
     lines.append(f"Recommended: nx = {study.nx}{'' if scan is None else '; ' + str(scan.best('bic'))}")
     for reason in (*study.reasons, *(f"note: {note}" for note in study.notes)):
         lines += wrapped(f"- {reason}")

@@ -19,12 +19,15 @@ def channels(data: Data) -> Figure:
     units = dict(zip(data.inputs + data.outputs, data.input_units + data.output_units))
     figure = Figure(figsize=(8, 1 + 1.4 * len(units)), layout="constrained")
     axes = figure.subplots(len(units), 1, sharex=True, squeeze=False)[:, 0]
+    x = charts.time_axis(data)
     for c, (panel, (name, unit)) in enumerate(zip(axes, units.items())):
         for e, samples in zip(data.experiments, data.records):
-            t = e.start + data.dt * np.arange(e.n_samples)
+            t = panels.instants(e.start + data.dt * np.arange(e.n_samples), x)
             panel.plot(*panels.thinned(t, samples[:, c]), lw=0.9, drawstyle="steps-post" if c < data.m else "default")
         panel.set_ylabel(plain(f"{name} [{unit}]" if unit else name))
-    axes[-1].set_xlabel("time")
+    axes[-1].set_xlabel(x.title)
+    if x.dates:
+        panels.show_dates(axes[-1])
     if data.name:
         figure.suptitle(plain(data.name))
     return figure

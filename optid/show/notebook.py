@@ -1,9 +1,11 @@
 """What a notebook shows of a result: the verdict, the model and one table, at most one screen."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup, escape
 
+from optid.data.description import RECORD, first_findings
 from optid.show import documents, estimates, summary
 from optid.show.checks import comparison_table, search_table, validation_tables
 from optid.show.printing import describe
@@ -23,11 +25,12 @@ MOST_ROWS = 12
 COLOURS = {"good": "#00843f", "plain": "#1f72c9", "fair": "#b85600", "bad": "#c83350"}
 
 
-def fit_html(fit: "Fit", judged: "Verdict | None" = None) -> str:
-    """Show the verdict, the status of the solution, the equation and the parameters of a fit."""
+def fit_html(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = True) -> str:
+    """Show the verdict, the status of the solution, the equation and the parameters of a fit, below its findings."""
     if fit.model is None:
         return f"<pre>{escape(describe(fit))}</pre>"
     return _html(summary.title(fit), [
+        *(_record(fit.data.findings) if findings else []),
         *attempt("The verdict on the model", lambda: _verdict(fit.verdict if judged is None else judged)),
         *attempt("The verdict on the solution", lambda: [_solution(fit)]),
         *attempt("The fit", lambda: [", ".join(f"{name} {percent(values)}" for name, values in (
@@ -51,7 +54,8 @@ def _solution(fit: "Fit") -> Banner:
 
 def search_html(found: "Identification") -> str:
     """Show the best structures by class above the fit."""
-    return _html("", [search_table(found)]) + fit_html(found.fit, found.verdict)
+    fit = found.fit
+    return _html("", [*_record(fit.data.findings), search_table(found)]) + fit_html(fit, found.verdict, findings=False)
 
 
 def parameters_html(found: "Parameters") -> str:
@@ -62,13 +66,20 @@ def parameters_html(found: "Parameters") -> str:
 def validation_html(checked: "Validation") -> str:
     """Show the outcome, the errors and the tests of a validation."""
     document = documents.validation_document(checked)
-    return _html(document.title, [*document.sections[0].content(),
+    (trust,) = (section for section in document.sections if section.id == "trust")
+    return _html(document.title, [*_record(checked.findings), *trust.content(),
                                   *attempt("Errors and tests", lambda: validation_tables(checked))])
 
 
 def comparison_html(found: "Comparison") -> str:
     """Show the fits of several models."""
-    return _html("", [comparison_table(found)])
+    return _html("", [*_record(found.data.findings), comparison_table(found)])
+
+
+def _record(findings: Sequence[str]) -> list[Any]:
+    """What reading the record derived, assumed or repaired."""
+    return [Markup("<b>{}</b><ul>{}</ul>").format(RECORD, Markup("").join(
+        Markup("<li>{}</li>").format(finding) for finding in first_findings(findings)))] if findings else []
 
 
 def _html(title: str, parts: list[Any]) -> str:

@@ -64,7 +64,8 @@ def _breakable(equation: str) -> str:
 def coded(chart: Chart, most: int = MOST) -> dict[str, Any]:
     """Return a chart as JSON types for the script of the page, its curves of at most so many samples."""
     axes = {name: {key: value for key, value in asdict(axis).items()
-                   if value not in (None, False, "") and (isinstance(value, str) or np.isfinite(value))}
+                   if value is not None and value is not False and value != ""
+                    and (isinstance(value, str) or np.isfinite(value))}
             for name, axis in (("x", chart.x), ("y", chart.y))}
     cursor = all(one.kind in ("curve", "area", "bars") for one in chart.series)
     return {"title": chart.title, "caption": chart.caption, "group": chart.group, "equal": chart.equal,
@@ -86,16 +87,18 @@ def _numbers(values: np.ndarray, kind: str) -> Any:
     """Return numbers as the script reads them: an even grid, bytes, or a list with few digits."""
     if values.size > 40:
         with np.errstate(all="ignore"):
-            steps = np.diff(values)
-            if np.ptp(steps) <= 1e-9 * abs(steps).max() and np.isfinite(steps).all():
-                return {"start": float(values[0]), "step": float((values[-1] - values[0]) / (values.size - 1)),
-                        "count": values.size}
+            step = (values[-1] - values[0]) / (values.size - 1)
+            even = values[0] + step * np.arange(values.size)
+            # dates are large numbers, whose steps are rounded
+            if np.max(np.abs(values - even)) <= 1e-9 * abs(step) + 4 * np.spacing(np.max(np.abs(values))):
+                return {"start": float(values[0]), "step": float(step), "count": values.size}
             size = float(np.nanmax(np.abs(values), initial=0.0, where=np.isfinite(values)))
         if size and not SINGLE[0] < size < SINGLE[1]:
             kind = "<f8"
         data = base64.b64encode(values.astype(kind).tobytes()).decode()
         return {"bytes" if kind == "<f4" else "wide": data}
-    return [float(f"{v:.9g}") if np.isfinite(v) else None for v in values]
+    digits = 9 if kind == "<f4" else 16
+    return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in values]
 
 
 def scripts(*names: str) -> dict[str, Any]:

@@ -8,12 +8,14 @@ from typing import Any, ParamSpec, TypeVar, cast
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.patches import FancyBboxPatch
 from matplotlib.ticker import MaxNLocator
 
 from optid.arrays import Array
+from optid.data.timeline import Timeline
 from optid.show import sections
-from optid.show.sections import Chart, extremes
+from optid.show.sections import Axis, Chart, extremes
 
 INK, MUTED, GRID, PANEL = "#1d2530", "#5d6875", "#dfe4ea", "#ffffff"
 BLUE, ORANGE, GREEN, RED = "#1063b5", "#a84e00", "#007a3e", "#b82e47"
@@ -123,6 +125,29 @@ def thinned(t: Array, y: Array) -> tuple[Array, Array]:
     return t[picked], y[picked]
 
 
+def instants(values: Any, axis: Axis) -> Any:
+    """Return places on an axis as matplotlib draws them: those on an axis of dates as dates."""
+    values = np.asarray(values)
+    return (values * 1e6).round().astype("M8[us]") if axis.dates else values
+
+
+def show_dates(ax: Axes) -> None:
+    """Set the ticks of an x axis of dates; what the ticks leave out stands at their end."""
+    figure: Any = ax.get_figure()
+    width = ax.get_position().width * figure.bbox.width / figure.dpi  # in inches, before the layout
+    most = int(np.clip(width / 0.75, 2, 7))
+    locator = AutoDateLocator(minticks=min(most - 1, 3), maxticks=most)
+    ax.xaxis.label.set(x=0, horizontalalignment="left")
+    ax.xaxis.set_major_locator(locator)
+    ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+
+
+def show_times(ax: Axes, timeline: Timeline) -> None:
+    """Set the ticks of an x axis of samples, with their times below where the unit of time is known."""
+    ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    ax.xaxis.set_major_formatter(lambda k, _: f"{k:.0f}\n{timeline.text(round(k))}".rstrip())
+
+
 def liveliest(y: Array) -> slice:
     """Return the stretch of `CLOSEUP` samples in which the signals (N, s) move most, each in units of its spread."""
     spread = np.nanstd(y, axis=0)
@@ -138,7 +163,7 @@ def draw_chart(ax: Axes, chart: Chart, legend: bool = True, title: str = "") -> 
     """Draw a chart of a page on axes, under its own title or another; a legend where there are several names."""
     for one in chart.series:
         name, (colour, dash) = plain(one.name) or None, COLOURS[one.colour]
-        xs, ys = np.asarray(one.xs), np.asarray(one.ys)
+        xs, ys = instants(one.xs, chart.x), np.asarray(one.ys)
         if one.kind == "area":
             ax.fill_between(xs, one.lows, ys, color=colour, alpha=0.2, linewidth=0, label=name)
         elif one.kind == "bars":
@@ -157,7 +182,9 @@ def draw_chart(ax: Axes, chart: Chart, legend: bool = True, title: str = "") -> 
     if any(one.kind == "bars" for one in chart.series):  # below the curves
         low, high = ax.get_ylim()
         ax.set_ylim(low - 0.25 * (high - low), high)
-    if not chart.x.log and all(np.all(np.asarray(one.xs) % 1 == 0) for one in chart.series):
+    if chart.x.dates:
+        show_dates(ax)
+    elif not chart.x.log and all(np.all(np.asarray(one.xs) % 1 == 0) for one in chart.series):
         ax.xaxis.set_major_locator(MaxNLocator(6, integer=True))
     if chart.equal:
         ax.set_aspect("equal")

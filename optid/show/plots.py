@@ -231,7 +231,7 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
 def _closeup(ax: Any, below: Any, chart: Chart) -> None:
     """Draw the stretch in which the output moves most, and mark it in the panel above."""
     panels.draw_chart(below, chart, legend=False)
-    t = chart.series[0].xs
+    t = panels.instants(chart.series[0].xs, chart.x)
     ax.axvspan(t[0], t[-1], color=MUTED, alpha=0.15, linewidth=0)
     below.set_ylabel("close-up")
 

@@ -1,10 +1,11 @@
 """The printed results: text of at most 80 columns."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from optid.show import checks, documents, estimates, summary
 from optid.show.sections import Notes, attempt
-from optid.show.terminal import WIDTH, facts_lines, part_lines, set_table, text, wrapped
+from optid.show.terminal import WIDTH, facts_lines, findings_lines, part_lines, set_table, text, wrapped
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -14,18 +15,21 @@ if TYPE_CHECKING:
     from optid.identify.verdict import Verdict
 
 
-def describe(fit: "Fit", judged: "Verdict | None" = None) -> str:
+def describe(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = True) -> str:
     """Return the result of a fit as text.
 
     Args:
         fit: the fit; one without a model (``raises=False``) gives the facts about the solve.
         judged: the verdict on the model; that of the fit when not given.
+        findings: whether to begin with the findings of reading the record.
     """
     if fit.model is not None:
-        return text(documents.fit_document(fit, judged=judged, advise=False))
+        document = documents.fit_document(fit, judged=judged, advise=False)
+        shown = [one for one in document.sections if findings or one.id != "record"]
+        return text(replace(document, sections=shown))
     tone, word, sentence = summary.verdict(fit)
     rule = "=" * WIDTH
-    return "\n".join([rule, f"No model: {word}", rule, *wrapped(sentence), "",
+    return "\n".join([*findings_lines(fit.data.findings), rule, f"No model: {word}", rule, *wrapped(sentence), "",
                       *facts_lines(summary.certificate_facts(fit)), rule])
 
 
@@ -40,7 +44,7 @@ def describe_advice(fit: "Fit") -> str:
 
 def describe_checks(checked: "Validation") -> str:
     """Return what a validation found as text, at most 80 columns wide."""
-    lines = [f"Validation on {checked.data}" if checked.data else "Validation"]
+    lines = [*findings_lines(checked.findings), f"Validation on {checked.data}" if checked.data else "Validation"]
     for part in attempt("Errors and tests", lambda: checks.validation_tables(checked)):
         lines += [*part_lines(part), ""]
     return "\n".join([*lines[:-1], *(line for note in checked.notes for line in wrapped(f"Note: {note}"))])
@@ -53,7 +57,7 @@ def describe_horizons(curve: "HorizonCurve") -> str:
 
 def describe_comparison(found: "Comparison") -> str:
     """Return the comparison of several models as text, at most 80 columns wide."""
-    return "\n".join(set_table(checks.comparison_table(found)))
+    return "\n".join([*findings_lines(found.data.findings), *set_table(checks.comparison_table(found))])
 
 
 def describe_parameters(found: "Parameters") -> str:
@@ -63,7 +67,8 @@ def describe_parameters(found: "Parameters") -> str:
 
 def describe_search(found: "Identification") -> str:
     """Return the search and the fit it ended with as text, at most 80 columns wide."""
-    return "\n".join([*search_lines(found), "", describe(found.fit, found.verdict)])
+    return "\n".join([*findings_lines(found.fit.data.findings), *search_lines(found), "",
+                      describe(found.fit, found.verdict, findings=False)])
 
 
 def search_lines(found: "Identification") -> list[str]:

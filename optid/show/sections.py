@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.data.description import first_findings
 from optid.errors import OptidError
 from optid.progress import log
 from optid.show.wording import Table
@@ -36,13 +37,20 @@ class Banner:
 
 @dataclass(frozen=True)
 class Axis:
-    """An axis: its title with the unit, whether it is logarithmic, its ends where they are fixed, the bare unit."""
+    """An axis: its title with the unit, whether it is logarithmic, its ends where they are fixed, the bare unit.
+
+    The axis of a record counts samples too: `start` is the place of sample 0, `step` the sampling time. Places are
+    seconds since 1970 where they are `dates`.
+    """
 
     title: str
     log: bool = False
     low: float | None = None
     high: float | None = None
     unit: str = ""
+    dates: bool = False
+    start: float | None = None
+    step: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,18 @@ class Notes:
     """Remarks, each with a mark beside it."""
 
     sentences: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What reading a record derived, assumed or repaired."""
+
+    sentences: Sequence[str]
+
+    @property
+    def shown(self) -> list[str]:
+        """The first of them, and how many there are beside."""
+        return first_findings(self.sentences)
 
 
 @dataclass(frozen=True)

@@ -131,10 +131,13 @@ def record_facts(fit: "Fit") -> Facts:
     count = data.n_samples
     facts = [
         ("Record", data.name or "unnamed"),
-        ("Samples", (f"{count} every {data.dt:g}" if count else f"every {data.dt:g}")),
+        ("Samples", (f"{count} every {data.interval}" if count else f"every {data.interval}")),
     ]
     if isinstance(data, Data):
         facts.append(("Experiments", str(data.n_experiments)))
+        if data.dated:
+            first, last = data.timelines[0], data.timelines[-1]
+            facts.append(("Time", f"{first.text(0)} to {last.text(data.experiments[-1].n_samples - 1)}"))
         missing = [f"{name} {share:.2%}" for name, share in data.missing.items() if share]
         facts.append(("Missing", ", ".join(missing) or "none"))
         if not data.transform.is_identity:

@@ -1,9 +1,11 @@
 """Documents as text of 80 columns, which can be pasted into a paper."""
 
+from collections.abc import Sequence
 from itertools import zip_longest
 from textwrap import wrap
 
-from optid.show.sections import Banner, Code, Columns, Document, Facts, Notes, Pair
+from optid.data.description import listed_findings
+from optid.show.sections import Banner, Code, Columns, Document, Facts, Findings, Notes, Pair
 from optid.show.wording import Table
 
 WIDTH, LEFT = 80, 36
@@ -37,6 +39,8 @@ def part_lines(part: object) -> list[str]:
         return [line for k, block in enumerate(blocks) for line in ([_rule("-")] * bool(k) + block)]
     if isinstance(part, Notes):
         return [line for sentence in part.sentences for line in wrapped(f"Note: {sentence}")]
+    if isinstance(part, Findings):
+        return findings_lines(part.sentences)
     if isinstance(part, Code):
         return _equation(part.text) if part.equation else part.text.splitlines()
     return []
@@ -65,6 +69,11 @@ def _equation(text: str) -> list[str]:
             line += term + " "
         lines.append(line.rstrip())
     return lines
+
+
+def findings_lines(findings: Sequence[str]) -> list[str]:
+    """Set the findings of a record under their heading; none without findings."""
+    return [line for sentence in listed_findings(findings) for line in wrapped(sentence)]
 
 
 def facts_lines(facts: Facts) -> list[str]:

@@ -21,6 +21,17 @@ def number(value: float, digits: int = 5) -> str:
     return "-" if value is None or np.isnan(value) else f"{value:.{digits}g}"
 
 
+def time_title(time_unit: str, counts_samples: bool = True) -> str:
+    """Return the title of an axis of time; where the unit is unknown, time counts samples or has no unit."""
+    return f"time ({time_unit})" if time_unit else "sample" if counts_samples else "time"
+
+
+def frequency_title(model: Any) -> str:
+    """Return the title of an axis of frequencies of a model, with their unit."""
+    unit = model.time_unit or ("sample" if model.dt == 1 else "unit of time")
+    return f"frequency (rad{'/' if model.time_unit or model.dt == 1 else ' per '}{unit})"
+
+
 def percent(values: Any) -> str:
     """Write one or several percentages with two decimals."""
     return ", ".join("-" if np.isnan(v) else f"{v:.2f} %" for v in np.atleast_1d(values))

@@ -8,6 +8,7 @@ import numpy as np
 
 from optid.data.record import Data
 from optid.errors import StructureError
+from optid.show.charts import time_axis
 from optid.show.page import coded
 from optid.show.sections import Axis, Chart, Series
 from optid.workbench.views import SHOWN
@@ -43,32 +44,34 @@ def diagnosed(source: Any, data: Data, asked: Mapping[str, Any]) -> dict[str, An
     faults = replace(whole, candidates=tuple(whole.candidates[i] for i in kept), sines=whole.sines[np.ix_(kept, kept)])
     whole_record = data.select(list(model.inputs), list(model.outputs), int(asked.get("experiment", 0)))
     first, last = map(int, asked.get("window") or (0, whole_record.n_samples))
-    record = whole_record.window(first, last)
-    found = diagnose(source, record, faults)
+    found = diagnose(source, whole_record.window(first, last), faults)
+    counted = [f"Onsets are counted from sample {first} of the record."] if first and found.candidates else []
     answers = [[answer.label, f"{answer.posterior:.3f}",
                 "; ".join(words.onset_words(f).removeprefix("onset ") for f in answer.faults),
                 "; ".join(line for f in answer.faults for line in words.size_words(f))] for answer in found.candidates]
     return {"word": f"{found.verdict}: {words.headline(found)}", "tone": TONES.get(found.verdict, "fair"),
-            "sentences": list(words.explained(found, notes=False)), "labels": list(whole.labels), "answers": answers,
-            "charts": _charts(found, first)}
+            "sentences": [*words.explained(found, notes=False), *counted],
+            "labels": list(whole.labels), "answers": answers,
+            "charts": _charts(found, whole_record, first)}
 
 
-def _charts(found: Any, first: int) -> list[dict[str, Any]]:
-    seen = found.evidence
-    k = first + np.arange(len(seen.r), dtype=float)
+def _charts(found: Any, record: Data, first: int) -> list[dict[str, Any]]:
+    seen, x = found.evidence, time_axis(record)
+    k = record.experiments[0].start + record.dt * (first + np.arange(len(seen.r), dtype=float))
     charts = []
     for o, name in enumerate(found.outputs or [f"y{o + 1}" for o in range(seen.r.shape[1])]):
         r = np.where(seen.present[:, o], seen.r[:, o], np.nan)
         series = [Series("innovation", k, r, colour="muted", width=1.0)]
         if seen.fitted[:, o].any():
             series.append(Series("best explanation", k, seen.fitted[:, o], colour="c1", width=2.0))
-        charts.append(Chart(f"Whitened innovations of {name}", "Mostly between -2 and 2 when healthy.", Axis("sample"),
+        charts.append(Chart(f"Whitened innovations of {name}", "Mostly between -2 and 2 when healthy.", x,
                             Axis("standard deviations"), series, "fault", height=220))
     if seen.labels:
         peaks = np.nanmax(np.where(np.isnan(seen.gains), -np.inf, seen.gains), axis=1)
         order = [int(i) for i in np.argsort(-peaks)[:MOST] if np.isfinite(peaks[i])]
         series = [Series(seen.labels[i], k, seen.gains[i], colour=f"c{j}", width=1.8) for j, i in enumerate(order)]
         charts.append(Chart("Likelihood of each fault by its onset", "Energy that a fault explains beyond the "
-                            "alarm threshold; rarely above zero without a fault.", Axis("onset (sample)"),
+                            "alarm threshold; rarely above zero without a fault.",
+                            replace(x, title=x.title.replace("time", "onset").replace("sample", "onset (sample)")),
                             Axis("energy beyond the threshold"), series, "fault", height=320))
     return [coded(one, SHOWN) for one in charts]

@@ -20,6 +20,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from optid import __version__
+from optid.data.description import RECORD, first_findings
 from optid.errors import DataError, OptidError
 from optid.registry import FORMULATIONS, registered
 from optid.workbench.bench import Bench, Source
@@ -89,9 +90,10 @@ class Server(ThreadingHTTPServer):
             "samples": shortest(data), "origins": [e.start for e in data.experiments],
             "inputs": list(data.inputs), "outputs": list(data.outputs),
             "formulations": [name for name in SHOWN if name in registered(FORMULATIONS)]}
-        lead = f"{data.n_samples} samples every {data.dt:g}"
+        lead = f"{data.n_samples} samples every {data.interval}"
         body = template("workbench.html.j2").render(
-            version=__version__, title=data.name or "Record", lead=lead, sections=[], begin=embedded(begin),
+            version=__version__, title=data.name or "Record", lead=lead, sections=[], record=RECORD,
+            findings=first_findings(data.findings), begin=embedded(begin),
             script=script["script"])
         return body, (f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{script['digest']}'; "
                       "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'")

@@ -13,7 +13,7 @@ from optid.identify.uncertainty import uncertainty
 from optid.models.functions import step_length
 from optid.show import charts, summary
 from optid.show.page import coded
-from optid.show.sections import TONES, Axis, Chart, Series
+from optid.show.sections import TONES, Chart, Series
 
 SHOWN = 1400
 """Samples of a curve that are drawn; of a longer one the extremes of half as many stretches."""
@@ -80,7 +80,7 @@ def characteristics(fit: Any, record: Data, output: str | None = None) -> list[d
         bars = charts.density(samples[np.isfinite(samples)], low, high)
         for what, at, x, extra in (
                 ("static", points, charts.channel_axis(channel, record.input_units[c]), [bars]),
-                ("step", model.dt * np.arange(count), Axis("time"), [])):
+                ("step", model.dt * np.arange(count), charts.response_axis(model), [])):
             part = slice(0, points.size) if what == "static" else slice(points.size, None)
             if np.isnan(value[part]).all():
                 continue

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin
 import numpy as np
 
 from optid.arrays import Array
+from optid.data.timeline import Timeline
 from optid.errors import StructureError
 from optid.faults.signatures import Candidate
 
@@ -50,6 +51,8 @@ class Estimate:
         covariance: (d, d) of the size, with the spread over the onsets.
         deflection: norm of the whitened signature.
         effect: {output: steady-state change} of a lasting disturbance whose direction was estimated.
+        onset_time: date or time of the onset; "" where the record has no known unit of time.
+        onset_interval_time: dates or times of the ends of its interval.
     """
 
     label: str
@@ -64,6 +67,8 @@ class Estimate:
     covariance: Array
     deflection: float
     effect: Mapping[str, float] = field(default_factory=dict)
+    onset_time: str = ""
+    onset_interval_time: tuple[str, str] = ("", "")
 
     def __str__(self) -> str:
         """State label, onset and size, with the intervals."""
@@ -192,6 +197,8 @@ class Diagnosis:
         dt: sampling time.
         remaining: residual; None where there was no alarm.
         evidence: innovations and statistics; not saved.
+        timeline: when the samples were taken.
+        findings: what reading the record derived, assumed or repaired.
     """
 
     verdict: str
@@ -211,6 +218,8 @@ class Diagnosis:
     dt: float = 1.0
     remaining: Remaining | None = None
     evidence: Evidence | None = field(default=None, repr=False)
+    timeline: Timeline = Timeline()
+    findings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:

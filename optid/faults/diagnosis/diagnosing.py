@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.data.record import Data
+from optid.data.timeline import Timeline
 from optid.errors import StructureError
 from optid.faults.diagnosis.alternatives import final_effect
 from optid.faults.diagnosis.answers import Answer, Certificate, Diagnosis, Estimate, Evidence
@@ -124,7 +125,8 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         check_channels(model, record)
     if alarm and fits and model.l == 1:
         notes.append("With one output only faults with a known course are isolable.")
-    answers = _answers(seen, fits, stuck)
+    timeline = record.timelines[number]
+    answers = _answers(seen, fits, stuck, timeline)
     certificate = ranking.certificate if fits or ranking.certificate.kind == "infeasible healthy" else NOTHING
     if stuck and not fits:
         certificate = Certificate("flat line", float(max(line.count for line in lines)))
@@ -142,9 +144,11 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
         best=answers[0] if answers and certificate.kind != "none" else None, candidates=answers,
         p_value=0.0 if stuck else first.p_value, certificate=certificate,
         untestable=dict(seen.lost) | _not_searched(seen), window=len(white.r), false_alarm=asked.false_alarm,
-        coverage=asked.coverage, method=asked.method, status=" ".join(note for note in notes if note),
+        coverage=asked.coverage, method=asked.method,
+        status=timeline.with_times(" ".join(note for note in notes if note)),
         model=model.title, outputs=model.outputs, dt=model.dt, remaining=remaining,
         evidence=Evidence(white.r, white.present, fitted, seen.gains, () if search is None else search.labels, search),
+        timeline=timeline, findings=record.findings,
     )
 
 
@@ -162,17 +166,24 @@ def _not_searched(seen: RecordSearch) -> dict[str, str]:
     return lost | {c.label: why for c in found.candidates if c.kind == "frozen" and model.l == 1}
 
 
-def _answers(seen: RecordSearch, fits: tuple[Fit, ...], stuck: tuple[Estimate, ...]) -> tuple[Answer, ...]:
+def _answers(seen: RecordSearch, fits: tuple[Fit, ...], stuck: tuple[Estimate, ...], timeline: Timeline
+             ) -> tuple[Answer, ...]:
     """Return the set of answers, each with the sensors that repeat one reading."""
     model, result = seen.dictionary.model, []
     if not fits and stuck:
-        return (Answer(stuck, 1.0, float("inf")),)
+        return (Answer(tuple(_timed(fault, timeline) for fault in stuck), 1.0, float("inf")),)
     for fit in fits:
         faults = estimates(fit.explanation, seen.asked.coverage, len(fit.fitted), 2 * model.nx)
         faults = tuple(replace(one, effect=final_effect(model, one.name, one.size)) for one in faults)
-        merged = tuple(sorted((*stuck, *faults), key=lambda fault: fault.onset))
-        result.append(Answer(merged, fit.probability, fit.gain))
+        merged = sorted((*stuck, *faults), key=lambda fault: fault.onset)
+        result.append(Answer(tuple(_timed(fault, timeline) for fault in merged), fit.probability, fit.gain))
     return tuple(result)
+
+
+def _timed(fault: Estimate, timeline: Timeline) -> Estimate:
+    low, high = fault.onset_interval
+    return replace(fault, onset_time=timeline.text(fault.onset),
+                   onset_interval_time=(timeline.text(low), timeline.text(high)))
 
 
 def _outliers(seen: RecordSearch) -> str:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from optid.data.description import first_findings
 from optid.faults.diagnosis import words
 from optid.faults.diagnosis.answers import Diagnosis
 from optid.faults.page import write_page
@@ -49,15 +50,15 @@ def write(found: Diagnosis, path: str | Path, *, record: str = "", command: str 
             rows += [("", "", "", "", magnitude) for magnitude in more]
     table = Table(
         "Answers", ("fault", "probability", "onset", "deflection", "magnitude"), rows,
-        f"The smallest set with {percent} of the probability. Intervals in brackets have a coverage of {percent}, the "
+        f"The smallest set with {percent} of the probability. Intervals have a coverage of {percent}, the "
         "search for the onset included.",
     )
     return write_page(
-        path, f"Diagnosis: {found.verdict}", (record, found.model, f"{found.window} samples"),
+        path, f"Diagnosis: {found.verdict}", (record, found.model, words.window_words(found)),
         headings=("Answers", "Innovations and statistics", "Evidence"), draw=found.plot, caption=caption,
         cards=cards, tables=[table] * bool(found.candidates), facts=facts,
         tone=TONES.get(found.verdict, "fair"), word=words.headline(found),
-        sentences=words.explained(found, notes=False),
+        findings=first_findings(found.findings), sentences=words.explained(found, notes=False),
         notes=[*[found.status] * bool(found.status), *(f"{a}: {why}" for a, why in found.untestable.items())],
         call=command or "optid.faults.diagnose(model, data)", text=str(found),
     )

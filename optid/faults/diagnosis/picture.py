@@ -10,7 +10,7 @@ from optid.arrays import Array
 from optid.errors import StructureError
 from optid.faults.diagnosis.answers import Diagnosis, Evidence
 from optid.faults.diagnosis.words import headline
-from optid.show.panels import BLUE, GREEN, GRID, INK, MUTED, ORANGE, plain, shorten, styled, thinned
+from optid.show.panels import BLUE, GREEN, GRID, INK, MUTED, ORANGE, plain, shorten, show_times, styled, thinned
 
 WIDE = 26
 """Characters of a label beside a panel."""
@@ -40,6 +40,8 @@ def draw(found: Diagnosis) -> Figure:
     for o, ax in enumerate(axes[:outputs]):
         _innovations(ax, found, seen, o, names[o])
     _heat(figure, axes[outputs], found, seen)
+    for ax in axes[outputs - 1 : outputs + 1]:
+        show_times(ax, found.timeline)
     if len(answers) > 1:
         _probabilities(axes[outputs + 1], found, answers)
     figure.suptitle(plain(shorten(f"{found.verdict}: {headline(found)}", 90)), color=INK, fontsize=11, weight="bold")

@@ -50,7 +50,9 @@ def record_of(model: "HammersteinSS", data: Any) -> Data:
     elif isinstance(data, tuple | list) and len(data) == 2:
         if data[1] is None:
             raise DataError("The outputs are missing: give data, or the pair (u, y).")
-        record = Data(data[0], data[1], model.dt, list(model.inputs), list(model.outputs))
+        samples = Data(data[0], data[1], model.dt, list(model.inputs), list(model.outputs))
+        record = Data.of_experiments(samples.experiments, model.dt, model.inputs, model.outputs,
+                                     time_unit=model.time_unit)
     else:
         from optid.data.readers import read
 

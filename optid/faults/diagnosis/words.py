@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from optid.data.description import listed_findings
+
 if TYPE_CHECKING:
     from optid.faults.diagnosis.answers import Diagnosis, Estimate
 
@@ -36,10 +38,13 @@ def estimate_line(fault: "Estimate") -> str:
 
 def onset_words(fault: "Estimate") -> str:
     """State the onset."""
-    low, high = fault.onset_interval
+    (low, high), times = fault.onset_interval, [f" ({time})" if time else "" for time in fault.onset_interval_time]
     if fault.onset_censored:
-        return f"onset at or before sample {high}" if low == 0 else f"onset at or after sample {low}"
-    return f"onset at sample {fault.onset}" + (f" ({low} to {high})" if low < high else "")
+        before = low == 0
+        return f"onset at or {'before' if before else 'after'} sample {high if before else low}{times[before]}"
+    if not fault.onset_time:
+        return f"onset at sample {fault.onset}" + (f" ({low} to {high})" if low < high else "")
+    return f"onset at sample {fault.onset} ({fault.onset_time})" + (f", interval {low} to {high}" if low < high else "")
 
 
 def size_words(fault: "Estimate") -> list[str]:
@@ -77,8 +82,9 @@ def magnitude_names(fault: "Estimate") -> list[str]:
 def printed(found: "Diagnosis") -> str:
     """Print a diagnosis in 80 columns."""
     lines = [
+        *listed_findings(found.findings),
         f"{found.verdict}: {headline(found)}",
-        f"{found.window} samples, false alarm {found.false_alarm:g}, p-value {probability_words(found.p_value)}, "
+        f"{window_words(found)}, false alarm {found.false_alarm:g}, p-value {probability_words(found.p_value)}, "
         f"method {found.method}",
     ]
     for answer in found.candidates:
@@ -96,6 +102,13 @@ def printed(found: "Diagnosis") -> str:
         indent = " " * (len(line) - len(line.lstrip()) + 2)
         result += textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_on_hyphens=False) or [""]
     return "\n".join(result)
+
+
+def window_words(found: "Diagnosis") -> str:
+    """State the length of the record, and when it was taken where that is known."""
+    time = found.timeline
+    ends = f" from {time.text(0)} to {time.text(found.window - 1)}" if time.dated else ""
+    return f"{found.window} samples{ends}"
 
 
 def headline(found: "Diagnosis") -> str:

@@ -30,13 +30,18 @@ class Event:
 
     def __str__(self) -> str:
         """Return the event in one line."""
-        text = f"{self.sample}: {self.kind}"
+        return self.in_words()
+
+    def in_words(self, time: str = "", onset_time: str = "") -> str:
+        """Return the event in one line, with the times of its sample and of its onset where they are given."""
+        text = f"{self.sample}{f' ({time})' if time else ''}: {self.kind}"
         if self.candidates:
             names = [label if p >= 0.995 else f"{label} ({p:.0%})" for label, p in self.candidates[:3]]
             more = len(self.candidates) - len(names)
             text += ": " + ", ".join(names) + (f" and {more} more" if more else "")
         if self.onset is not None:
-            text += f"{'' if self.kind == 'untestable' else ','} since {self.onset}"
+            at = f" ({onset_time})" if onset_time else ""
+            text += f"{'' if self.kind == 'untestable' else ','} since {self.onset}{at}"
         if self.size:
             text += ", size " + " ".join(f"{value:.4g}" for value in self.size)
         return text + (f" ({self.note})" if self.note else "")

@@ -11,7 +11,7 @@ import numpy as np
 from optid import signals
 from optid.arrays import Array, check_integer
 from optid.bases import Bases, FeedbackBases
-from optid.data.channels import count_levels
+from optid.data.channels import count_levels, interval_text
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError, nearest
 from optid.identify.design import rules
@@ -42,6 +42,7 @@ class Excitation:
         outputs: expected standard deviation of each output.
         checks: results of the rules of design.
         how: computation of the condition number.
+        time_unit: unit of dt, "" where it is unknown.
     """
 
     u: Array
@@ -55,25 +56,28 @@ class Excitation:
     outputs: tuple[float, ...]
     checks: tuple[rules.Check, ...]
     how: str
+    time_unit: str = ""
 
     def __str__(self) -> str:
+        unit = "Hz" if self.time_unit == "s" else "cycles per sample"
         facts = {
             "expected condition number": f"{self.condition:.3g}  of {self.functions} functions at {self.rows} lags",
             "levels": ", ".join(str(count_levels(x)) for x in self.u.T),
-            "band": f"{self.band[0]:.4g} to {self.band[1]:.4g}",
+            "band": f"{self.band[0]:.4g} to {self.band[1]:.4g} {unit}",
             "amplitude": ", ".join(f"{x.min():.4g} to {x.max():.4g}" for x in self.u.T),
             "crest factor": ", ".join(f"{signals.crest_factor(x):.3g}" for x in self.u.T),
             "standard deviation of y": ", ".join(f"{s:.3g}" for s in self.outputs) + " (expected)"}
         lines = [*facts.items(), *((check.rule, check) for check in self.checks), ("how", self.how)]
-        return "\n".join([f"{self.kind}, {len(self.u)} samples every {self.dt:g}",
+        return "\n".join([f"{self.kind}, {len(self.u)} samples every {interval_text(self.dt, self.time_unit)}",
                           *(f"{name:<26} {value}" for name, value in lines)])
 
     def save(self, path: Path | str) -> Path:
-        """Write time and inputs as CSV with a header; `optid.read` reads it, and so does a signal generator."""
+        """Write time (samples where its unit is unknown) and inputs as CSV with a header, as `optid.read` reads it."""
         path = Path(path)
         columns = np.column_stack([self.dt * np.arange(len(self.u)), self.u])
+        names = ["time" if self.time_unit else "sample", *self.inputs]
         # 15 digits: the values read back are those written, to rounding.
-        np.savetxt(path, columns, fmt="%.15g", delimiter=",", header=",".join(["time", *self.inputs]), comments="")
+        np.savetxt(path, columns, fmt="%.15g", delimiter=",", header=",".join(names), comments="")
         return path
 
 
@@ -235,7 +239,7 @@ def _expected(u: Array, kind: str, like: Data, measured: FrequencyResponse, band
                f"{like.name or 'the record'} ({measured.segments} segments) with its disturbance; a plant that is far "
                "from linear will differ")
     return Excitation(u, like.dt, like.inputs, kind, condition, rows, expansion.p + expansion.q, band,
-                      tuple(float(s) for s in y.std(axis=0)), checks, how)
+                      tuple(float(s) for s in y.std(axis=0)), checks, how, like.time_unit)
 
 
 def _predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> Array:

@@ -32,6 +32,7 @@ class OrderStudy(Rendered):
         lags: scan of na, nb, nk, the best of which is recommended; None for a reason in `notes`.
         nx: recommended number of states, for these reasons.
         notes: limitations of the result; each is also a DataWarning.
+        findings: what reading the record derived, assumed or repaired.
     """
 
     data: str
@@ -42,6 +43,7 @@ class OrderStudy(Rendered):
     nx: int
     reasons: tuple[str, ...]
     notes: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()
 
 
 def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBases = None,
@@ -97,7 +99,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=2)
     return OrderStudy(data.name, alpha, ranks, states, lags, ranks.choice[0], _reasons(ranks, states, lags),
-                      tuple(notes))
+                      tuple(notes), data.findings)
 
 
 def block_rows_for(records: Sequence[Array], expansion: Expansion, given: int | None, nx: int | None = None) -> int:

@@ -92,13 +92,14 @@ class RecursiveARX(SavedState):
     """
 
     kind, arrays = "recursion", ("root", "past_u", "past_y")
-    settings = ("input_units", "output_units", "dt", "forgetting")
+    settings = ("input_units", "output_units", "dt", "time_unit", "forgetting")
 
     def __init__(
         self, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
         nk: int | Sequence[int] = 0, inputs: str | Sequence[str] = "u", outputs: str | Sequence[str] = "y",
         dt: float = 1.0, forgetting: float = 1.0, theta0: ArrayLike = 0.0, P0: ArrayLike = np.inf,
         input_units: str | Sequence[str] | None = None, output_units: str | Sequence[str] | None = None,
+        time_unit: str = "",
     ) -> None:
         """Start from a prior estimate.
 
@@ -116,6 +117,7 @@ class RecursiveARX(SavedState):
                 the batch least squares.
             input_units: units of the inputs.
             output_units: units of the outputs.
+            time_unit: unit of dt, "" where it is unknown.
 
         Raises:
             StructureError: invalid orders, a basis without interval, a forgetting factor outside (0, 1], a P0 that is
@@ -132,7 +134,7 @@ class RecursiveARX(SavedState):
                     f"The basis of input {channel!r} has no interval, which a recursion needs: give it, as in "
                     f"{type(one).__name__}(..., interval=(lower, upper)).")
         self.forgetting = forgetting_factor(forgetting)
-        self.dt = sampling_time(dt)
+        self.dt, self.time_unit = sampling_time(dt), time_unit
         self.input_units, self.output_units = names["input_units"], names["output_units"]
         self.samples = self.candidates = self.rows = 0
         self.root = _prior_factor(theta0, P0, self.layout)
@@ -147,7 +149,8 @@ class RecursiveARX(SavedState):
         """
         _check_raw(data)
         return cls(basis=fitted_bases(data, basis), inputs=data.inputs, outputs=data.outputs,
-                   dt=data.dt, input_units=data.input_units, output_units=data.output_units, **settings)
+                   dt=data.dt, time_unit=data.time_unit, input_units=data.input_units,
+                   output_units=data.output_units, **settings)
 
     def update(self, u: ArrayLike, y: ArrayLike, weights: ArrayLike = 1.0) -> Array:
         """Process the next sample or block, and return the innovations y(t) - theta(t-1)^T phi(t).
@@ -279,8 +282,8 @@ class RecursiveARX(SavedState):
             a=_past_coefficients(theta, layout),
             b=tuple(b if layout.l == 1 else b.reshape(-1, layout.l, order="F") for _, b in pairs),
             nonlinearities=tuple(Nonlinearity(basis, mu) for basis, (mu, _) in zip(layout.bases, pairs)),
-            nk=layout.nk, offset=theta[layout.offset], dt=self.dt, inputs=layout.inputs, outputs=layout.outputs,
-            input_units=self.input_units, output_units=self.output_units,
+            nk=layout.nk, offset=theta[layout.offset], dt=self.dt, time_unit=self.time_unit, inputs=layout.inputs,
+            outputs=layout.outputs, input_units=self.input_units, output_units=self.output_units,
         ).regauge(gauge)
 
     def __repr__(self) -> str:

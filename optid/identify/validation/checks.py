@@ -52,6 +52,7 @@ class Validation(Rendered):
         notes: limitations of the result; each is also a DataWarning.
         predicted: predicted outputs (N, l) per experiment of every predictor, NaN where there is none.
         residuals: one-step residuals (N, l) per experiment, NaN = missing.
+        findings: what reading the record derived, assumed or repaired.
     """
 
     data: str
@@ -66,6 +67,7 @@ class Validation(Rendered):
     notes: tuple[str, ...]
     predicted: dict[str, tuple[Array, ...]]
     residuals: tuple[Array, ...]
+    findings: tuple[str, ...] = ()
 
     @property
     def one_step(self) -> dict[str, Measures]:
@@ -150,7 +152,8 @@ def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon:
         experiments={word: {name: tuple(found[1:]) for name, found in table.items()}
                      for word, table in errors.items() if raw.n_experiments > 1},
         **_residual_tests(raw, tested, max(1, min(lags, int(present.min()) // 4))),
-        structure=structure, outside=outside, notes=tuple(notes), predicted=predicted, residuals=residuals)
+        structure=structure, outside=outside, notes=tuple(notes), predicted=predicted, residuals=residuals,
+        findings=raw.findings)
 
 
 def _residual_tests(data: Data, residuals: Sequence[Array], lags: int) -> dict[str, dict[Any, Correlation]]:

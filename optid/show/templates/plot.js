@@ -34,12 +34,64 @@ function niceStep(span, most) {
   return power * [1, 2, 5, 10].find((m) => m * power >= rough * 0.999);
 }
 
+// Dates are seconds since 1970.
+const DAY = 86400, MONTHS = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"];
+const DATE_STEPS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, DAY, 2 * DAY, 7 * DAY, 14 * DAY];
+
+function dateText(seconds, digits = 6) {
+  const whole = Math.floor(Number(seconds.toFixed(digits))), part = (seconds - whole).toFixed(digits).replace(/^-?0|\.?0+$/g, "");
+  return new Date(whole * 1000).toISOString().replace("T", " ").slice(0, -5) + part;
+}
+
+// Step of date ticks in seconds: below a second, of seconds to days, of months (negative).
+function dateStep(span, most) {
+  if (span / most < 0.5) return niceStep(span, most);
+  const found = DATE_STEPS.find((step) => step * most >= span);
+  return found || -([1, 2, 3, 6, 12].find((n) => n * 30 * DAY * most >= span) || 12 * niceStep(span / (365 * DAY), most));
+}
+
+function dateTicks(low, high, most) {
+  const step = dateStep(high - low, most), found = [];
+  if (step < 0) {
+    const from = new Date(low * 1000), months = -step;
+    for (let m = Math.floor((from.getUTCFullYear() * 12 + from.getUTCMonth()) / months) * months; ; m += months) {
+      const at = new Date(0).setUTCFullYear(Math.floor(m / 12), ((m % 12) + 12) % 12, 1) / 1000;
+      if (at > high || !Number.isFinite(at)) return found;
+      if (at >= low) found.push([at, months % 12 ? `${MONTHS[((m % 12) + 12) % 12]} ${Math.floor(m / 12)}` : String(Math.floor(m / 12))]);
+    }
+  }
+  const origin = step >= 7 * DAY ? 4 * DAY : 0, digits = Math.max(0, -Math.floor(Math.log10(step) + 1e-9)); // weeks begin on Mondays
+  for (let k = Math.ceil((low - origin) / step - 1e-9); origin + k * step <= high; k++) {
+    const at = origin + k * step, text = dateText(at, digits), day = Number(text.slice(8, 10)), clock = text.slice(11);
+    const midnight = clock === "00:00:00";
+    found.push([at, step >= DAY || midnight ? `${day} ${MONTHS[Number(text.slice(5, 7)) - 1]}` : step >= 60 ? clock.slice(0, 5) : step >= 1 ? clock : clock.slice(6) + " s"]);
+  }
+  return found;
+}
+
+// The title of an axis of dates adds what its ticks leave out.
+function dateTitle(title, low, high, most) {
+  const step = dateStep(high - low, most), size = step < 0 ? 0 : step >= DAY ? 4 : step >= 1 ? 10 : 16;
+  const [from, to] = [low, high].map((v) => dateText(v).slice(0, size));
+  return size ? `${title}, ${from === to ? from : `${from} to ${to}`}` : title;
+}
+
+// Where a value lies on an axis, in words; of a record with the number of the sample.
+function placeText(axis, value) {
+  const sample = axis.step ? Math.round((value - axis.start) / axis.step) : null;
+  if (axis.dates) return `${dateText(value)}, sample ${sample}`;
+  const text = `${axis.title}: ${axis.step ? Number(value.toPrecision(10)) : significant(value, 5)}`;
+  return sample === null || axis.title.includes("sample") ? text : `${text}, sample ${sample}`;
+}
+
 // Ticks of an axis between two transformed ends: [transformed place, label].
 function ticksOf(axis, low, high, most) {
+  if (axis.dates) return dateTicks(low, high, most);
   if (axis.categories) return axis.categories.map((name, k) => [k, name]).filter(([k]) => k >= low && k <= high);
   const fixed = (axis.ticks || []).filter((v) => v >= low && v <= high);
   if (fixed.length > 1 && fixed.length <= 2.5 * most) return fixed.map((v) => [v, String(v)]);
-  const write = axis.format || ((v) => significant(v));
+  const digits = Math.max(3, 2 + Math.floor(Math.log10(Math.max(Math.abs(low), Math.abs(high)) / (niceStep(high - low, most) || 1))));
+  const write = axis.format || ((v) => significant(v, axis.log ? 3 : Math.min(digits, 12)));
   if (axis.log && high - low >= 0.7) {
     const factors = high - low < 2.2 && most > 4 ? [1, 2, 5] : [1], step = Math.max(1, Math.ceil((high - low) / most)), found = [];
     for (let d = Math.floor(low); d <= high; d++) {
@@ -136,7 +188,7 @@ function makePlot(host, spec, hidden) {
     if (spec.equal) return { width, height: width - 32, left: 72, right: 14, top: 10, bottom: 44 };
     const rows = spec.y.categories ? 70 + 30 * spec.y.categories.length : spec.height || Math.min(380, Math.max(260, 0.56 * width));
     const longest = spec.y.categories ? Math.max(...spec.y.categories.map((n) => n.length)) : 0;
-    return { width, height: Math.round(rows), left: spec.y.categories ? Math.min(0.4 * width, 16 + 7 * longest) : 72, right: 14, top: 10, bottom: 44 };
+    return { width, height: Math.round(rows), left: spec.y.categories ? Math.min(0.4 * width, 16 + 7 * longest) : 72, right: spec.x.dates ? 30 : 14, top: 10, bottom: 44 };
   }
 
   function draw() {
@@ -148,7 +200,8 @@ function makePlot(host, spec, hidden) {
     f.uny = (p) => view[2] + (1 - (p - f.top) / inner.h) * (view[3] - view[2]);
     svg.setAttribute("viewBox", `0 0 ${f.width} ${f.height}`);
     const parts = [], bottom = f.top + inner.h, right = f.left + inner.w;
-    for (const [at, label] of ticksOf(spec.x, view[0], view[1], Math.max(3, Math.floor(inner.w / 75)))) {
+    const most = Math.max(3, Math.floor(inner.w / 75));
+    for (const [at, label] of ticksOf(spec.x, view[0], view[1], most)) {
       const x = f.x(at);
       parts.push(element("svg:line", { class: "line", x1: x, x2: x, y1: f.top, y2: bottom }),
         element("svg:text", { x, y: bottom + 16, "text-anchor": "middle" }, label));
@@ -159,7 +212,7 @@ function makePlot(host, spec, hidden) {
       parts.push(element("svg:line", { class: "line", x1: f.left, x2: right, y1: y, y2: y }),
         element("svg:text", { x: f.left - 7, y: y + 4, "text-anchor": "end", class: spec.y.categories ? "name" : null }, cut));
     }
-    parts.push(element("svg:text", { x: f.left + inner.w / 2, y: f.height - 8, "text-anchor": "middle" }, spec.x.title));
+    parts.push(element("svg:text", { x: f.left + inner.w / 2, y: f.height - 8, "text-anchor": "middle" }, spec.x.dates ? dateTitle(spec.x.title, view[0], view[1], most) : spec.x.title));
     if (spec.y.title) parts.push(element("svg:text", { transform: `translate(13 ${f.top + inner.h / 2}) rotate(-90)`, "text-anchor": "middle" }, spec.y.title));
     const clip = element("svg:clipPath", { id: id + "-clip" }, element("svg:rect", { x: f.left, y: f.top - 4, width: inner.w + 4, height: inner.h + 8 }));
     const body = element("svg:g", { "clip-path": `url(#${id}-clip)` });
@@ -238,7 +291,7 @@ function makePlot(host, spec, hidden) {
     const huge = axes.some((_, a) => next[2 * a + 1] - next[2 * a] > 20 * (whole[2 * a + 1] - whole[2 * a]));
     if (tiny || huge) return;
     view = next;
-    svg.dataset.view = view.map((v) => v.toPrecision(6)).join(" ");
+    svg.dataset.view = view.map((v) => v.toPrecision(spec.x.dates ? 13 : 6)).join(" ");
     hideTip();
     draw();
     if (spec.moved && !quiet) spec.moved(view[0], view[1]);
@@ -288,7 +341,7 @@ function makePlot(host, spec, hidden) {
     at = frame.x(here);
     svg.querySelector(".cursor")?.remove();
     svg.append(element("svg:line", { class: "cursor", x1: at, x2: at, y1: frame.top, y2: frame.height - frame.bottom }));
-    tip.textContent = [`${spec.x.title}: ${significant(spec.x.log ? 10 ** here : here, 5)}`, ...lines].join("\n");
+    tip.textContent = [placeText(spec.x, spec.x.log ? 10 ** here : here), ...lines].join("\n");
     tip.hidden = false;
     const place = (at * box.clientWidth) / frame.width, room = box.clientWidth - tip.offsetWidth;
     tip.style.left = Math.max(0, Math.min(room, place + 12 > room ? place - tip.offsetWidth - 12 : place + 12)) + "px";

@@ -131,7 +131,9 @@ function drawChart(figure, chart, key) {
     waiting = setTimeout(async () => { const sent = request(), found = await ask("time"); if (!found.error && sent === request()) drawAll(at("time"), found); }, 120);
   };
   addLegend(modes, chart.title, series, hidden, () => kept.plot.draw());
-  kept.plot = makePlot(host, { ...chart, label: `${chart.title}. ${chart.caption}`, series, moved: chart.group ? moved : null,
+  // of a record in a window the samples are counted from the beginning of the whole record
+  const x = tool === "time" ? { ...chart.x, start: BEGIN.origins[look.experiment] } : chart.x;
+  kept.plot = makePlot(host, { ...chart, x, label: `${chart.title}. ${chart.caption}`, series, moved: chart.group ? moved : null,
     places: (axis) => (tool ? mine(kept.chart).map((c) => boxOf(c, kept.chart)).flatMap((b) => (axis ? [b.y0, b.y1] : [b.x0, b.x1])) : []),
     below: (f) => (tool ? hands(kept.chart, f) : []), grab: (event, x, y, f) => tool && grab(event, x, y, f, kept) }, hidden);
   kept.update = (next) => { kept.chart = next; heading.textContent = next.title; kept.plot.setSeries(withPins(next), dragged || (tool === "time" && view)); };
