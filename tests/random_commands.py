@@ -62,7 +62,7 @@ ALWAYS = {"identify": ["--budget", "1", "--workers", "1"], "study run": ["--work
           "compare": ["--workers", "1", "--repetitions", "1", "--time-limit", "5", "--solvers", "clarabel"],
           "isolability": ["--draws", "30"], "monitor": ["--arl0", "300", "--window", "20"],
           "design": ["--candidates", "1"]}
-OFTEN = {"fit": 8, "validate": 4, "identify": 1, "compare": 1, "design": 3, "diagnose": 5, "isolability": 3,
+OFTEN = {"look": 2, "fit": 8, "validate": 4, "identify": 1, "compare": 1, "design": 3, "diagnose": 5, "isolability": 3,
          "monitor": 4, "reformulate": 3, "order": 4, "study run": 2, "study report": 2, "study export": 2,
          "study problems": 1,
          "solvers": 0.2, "formulations": 0.2, "constraints": 0.2, "examples": 0.2, "study systems": 0.2,

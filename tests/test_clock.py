@@ -1,6 +1,6 @@
 """The clock of a record is found alike in every source, or its absence is said."""
 
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pandas as pd
@@ -224,3 +224,86 @@ def test_a_live_stream_reads_the_clock_as_a_file_does():
     assert not both.read(lines).error
     refuses(DataError, "gaps= needs the whole record.*--fill-gaps", RowReader, ["u"], ["y"], dt=1.0,
             how=optid.Format(gaps="missing"))
+
+
+def lines(clocks, head="time,u,y"):
+    """Return a table whose rows begin with some stamps."""
+    return "\n".join([head, *(f"{stamp},{k % 3},{k}" for k, stamp in enumerate(clocks))]) + "\n"
+
+
+SECONDS = [f"06:07:{k:02d}" for k in range(9)]
+
+
+@pytest.mark.parametrize(("text", "words", "dt", "said"), [
+    (lines(["00:00", "00:01", "00:02"], "Time (mm:ss),u,y"), {}, 1.0, "minutes:seconds"),
+    (lines(["00:00", "00:01", "00:02"]), {}, 60.0, "hours:minutes"),
+    (lines(["00:00", "00:01", "00:02"]), {"date_format": "%M:%S"}, 1.0, ""),
+    (lines(["20240305", "20240306", "20240307"]), {"date_format": "%Y%m%d"}, 86400.0, ""),
+    (lines([one.replace(":", "") for one in SECONDS]), {"date_format": "%H%M%S"}, 1.0, ""),
+    (lines(["45356.25", "45357.25", "45358.25"]), {}, 1.0, "pass date_format='excel'"),
+    (lines(["45356.25", "45357.25", "45358.25"]), {"date_format": "excel"}, 86400.0, "as of Excel"),
+    (lines(["2460374.75", "2460374.76", "2460374.77"]), {}, 0.01, "pass date_format='julian'"),
+    (lines([f"{133540924280000000 + 10**7 * k}" for k in range(5)]), {}, 1.0, "as of Windows"),
+    (lines([f"{3792463628 + k}" for k in range(5)]), {}, 1.0, "as of LabVIEW"),
+    (lines(range(0, 9000, 1000), "Time (ticks),u,y"), {}, 1000.0, "'ticks' is not known"),
+    (lines(["2024-03-05 23:00:00", "2024-03-06", "2024-03-06 01:00:00"]), {}, 3600.0, ""),
+    (lines(["2024-03-05 00:00:02", "2024-03-05 00:00:01", "2024-03-05 00:00:00"]), {}, 1.0, "turned round"),
+    (lines([f'"Mar 05, 2024 {one} AM"' for one in SECONDS]), {}, 1.0, ""),
+    (lines([f"{0.05 * k:.2f}" for k in range(9)], "x-axis,u,y"), {}, 1.0, "pass time='x-axis' if it is the clock"),
+    ("t,u,y\n(ms),(V),(mV)\n\n0,1,2\n1,2,3\n2,3,4\n", {}, 0.001, "read as units: t ms, u V, y mV"),
+    ('t,u,y\n0,"57,5",1\n1,"57,5",2\n', {"decimal": ","}, 1.0, ""),
+    ("t,u,y,Status\n0,1,2,192\n1,2,3,216\n2,3,4,0\n", {}, 1.0, "Pass quality='Status:192|216'"),
+])
+def test_other_clocks_and_tables_are_read_and_said(tmp_path, text, words, dt, said):
+    (tmp_path / "r.csv").write_text(text)
+    data = optid.read(tmp_path / "r.csv", **words)
+    assert data.dt == pytest.approx(dt, rel=1e-9) and (said in " ".join(data.findings) if said else True)
+
+
+@pytest.mark.parametrize(("text", "words", "said"), [
+    ("Timestamp,u,Timestamp.1,y\n00:00:00,1,00:00:03,2\n00:00:01,1,00:00:04,2\n00:00:02,1,00:00:05,2\n", {},
+     "two clocks disagree"),
+    ("Time u,u,Time y,y\n0,1,3,2\n1,1,4,2\n2,1,5,2\n", {}, "two clocks disagree"),
+    (lines(["20240305", "20240306"]), {}, "Pass date_format='%Y%m%d'"),
+    (lines(["2024030506", "2024030507"]), {}, "Pass date_format='%Y%m%d%H'"),
+    (lines(["2567-03-05", "2567-03-06"]), {}, "outside the years"),
+    (lines(["1990", "1991", "1992"], "Date,u,y"), {}, "look like years"),
+    (lines([f"{1709618828000 + 1000 * k}" for k in range(4)], "Time (s),u,y"), {},
+     "by its size in milliseconds since 1970"),
+    ("Time (s),u,y\nms,V,V\n0,1,2\n50,1,2\n", {}, "its name says s, its unit ms"),
+    ("0,1,2\n0,57.5,100\n1,57.5,101\n", {"inputs": "1", "outputs": "2"}, "a header of numbers, or samples"),
+    ("0.0,BAD,100\n0.1,57.5,101\n0.2,58,102\n", {"inputs": 1, "outputs": 2}, "would be the header, but holds '0.0'"),
+    ("t,u,y\n0,1,2\n", {"columns": ["t", "u", "y"]}, "has a header"),
+    ("t,u,y\n0,1,2\n1,2,3\n", {"units_row": 1}, "row 1 after the header holds numbers"),
+    ("t,u,y\n0,On,2\n1,Off,2\n", {}, "Write 0 and 1"),
+    ("t,u,y\n0,12.5 V,1\n1,13 V,2\n", {}, "a number with its unit"),
+    (lines(["24-03-05 06:07:08", "24-03-05 06:07:09"]), {}, "'%y-%m-%d %H:%M:%S'"),
+    ("t;u;y\n0,0;57;1\n0,5;57;1\n1,0;57;1\n", {}, "Pass delimiter=';', decimal=','"),
+])
+def test_what_could_be_meant_otherwise_is_refused(tmp_path, text, words, said):
+    (tmp_path / "r.csv").write_text(text)
+    with pytest.raises(DataError) as error:
+        optid.read(tmp_path / "r.csv", **words)
+    assert said in str(error.value)
+
+
+def test_data_sets_keep_their_units_and_dimensions():
+    def of(t, **attributes):
+        return xr.Dataset({"u": ("time", U, {"units": "V"}), "y": ("time", Y)},
+                          coords={"time": ("time", t, attributes)})
+
+    data = optid.read(of(250.0 * np.arange(N), units="ms"))
+    assert data.dt == 0.25 and data.input_units == ("V",)
+    since = optid.read(of(np.arange(N), units="minutes since 2024-03-05"))
+    assert since.dt == 60.0 and since.start == np.datetime64("2024-03-05")
+    apart = xr.Dataset({"u": ("a", U), "y": ("b", Y)}, coords={"a": np.arange(N), "b": 3.0 + np.arange(N)})
+    refuses(DataError, r"different dimensions: u \(a\), y \(b\)", optid.read, apart)
+
+
+@pytest.mark.parametrize("values", [
+    lambda t: t, lambda t: np.array(t), lambda t: [one.replace(tzinfo=UTC) for one in t],
+    lambda t: [str(one) for one in t], lambda t: pd.Series(t).dt.time.to_list(), lambda t: pd.Series(t, dtype=object)])
+def test_dates_of_python_are_read(values):
+    stamps = values([datetime(2024, 5, 1, 6) + timedelta(seconds=2 * k) for k in range(N)])
+    for source in ({"time": stamps, "u": U, "y": Y}, pd.DataFrame({"time": stamps, "u": U, "y": Y})):
+        assert optid.read(source).dt == 2.0

@@ -479,7 +479,7 @@ def test_an_index_without_time_is_ignored():
                           "u": np.arange(5.0), "y": np.arange(5.0)})
     assert read(dates).dt == 3.0
     assert read(dates.with_columns(until=pl.col("when"))).dt == 3.0  # two columns of dates that agree
-    refuses(DataError, "two clocks disagree: 'when' steps by 3 s from .*, 'until' steps by 6 s .*time='when' or time='until'",
+    refuses(DataError, "two clocks disagree: 'when' steps by 3 s from .*, 'until' steps by 6 s .*time='when'",
             read, dates.with_columns(until=pl.Series([datetime(2024, 1, 1, 0, 0, 6 * k) for k in range(5)])))
 
 

@@ -22,11 +22,18 @@ def read_record(files: Sequence[Path | str], how: Mapping[str, Any], *, stream: 
 
     options = reading(how)
     if not stream and scheduler is None:
-        return read([Path(name) for name in files], **options)
+        return _in_options(read([Path(name) for name in files], **options))
     if options.pop("experiment") is not None:
         raise DataError("--stream and --scheduler read a file or folder as one experiment; leave --experiment out")
     paths = [Path(name) for name in files]
-    return open_stream(paths if len(paths) > 1 else paths[0], scheduler=scheduler, **options)
+    return _in_options(open_stream(paths if len(paths) > 1 else paths[0], scheduler=scheduler, **options))
+
+
+def _in_options(record: Any) -> Any:
+    """Return a record whose findings name the options of the command."""
+    from optid.cli.options import in_options
+
+    return record.with_findings(in_options(finding, reading=True) for finding in record.findings)
 
 
 def reading(how: Mapping[str, Any]) -> dict[str, Any]:

@@ -161,9 +161,10 @@ def descriptions() -> Iterator[tuple[str, Description]]:
             yield name, describe(point)
 
 
-def in_options(text: str) -> str:
-    """Write a message about arguments of Python with the options of the command."""
-    known = {"solver", "accuracy", "time_limit", *READING}.union(*(found.options for _, found in descriptions()))
+def in_options(text: str, reading: bool = False) -> str:
+    """Write a message about arguments of Python, or only those of `optid.read`, with the options of the command."""
+    known = {*READING} if reading else {"solver", "accuracy", "time_limit", *READING}.union(
+        *(found.options for _, found in descriptions()))
     word = "|".join(sorted(known, key=len, reverse=True))
 
     def several(match: re.Match[str]) -> str:
@@ -171,6 +172,7 @@ def in_options(text: str) -> str:
 
     text = re.sub(rf"(takes no )argument '({word})'(?=\.)", lambda m: m[1] + option_of(m[2]), text)
     text = re.sub(rf"( needs |Known: )((?:{word})(?:, (?:{word}))*)(?=$|\.)", several, text)
+    text = text.replace("missing='-", "--missing='-")  # else an option would seem to follow
     text = text.replace("pass time=False and dt=", "pass --time none and --dt").replace("time=False", "--time none")
     text = re.sub(rf"(?<=['\w\]]), (?=(?:{word})=)", " ", text)
     text = re.sub(rf"(?<![\w.-])({word})=(?=['\"\w\[(.-])", lambda m: option_of(m[1]) + " ", text)

@@ -87,7 +87,7 @@ class Work(Waiting):
     def print(self) -> None:
         """Print the result, the warnings that it does not contain, and the files written."""
         if self.text:
-            say(coloured(self.text.replace("pass dt= ", "pass --dt ")))  # a finding names the argument of Python
+            say(coloured(self.text))
         said = " ".join(self.text.split())
         for sentence in self.heard:
             if " ".join(sentence.split()) not in said:

@@ -165,6 +165,9 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
                if isinstance(loaded[name], np.ndarray | list)}
     clock, stamps, said = _clock(table, loaded, clocks, time)
     findings += said
+    if clock is None and time is None and table.step is None:
+        findings += [f"column {name!r} {hint}: pass time={name!r} if it is the clock"
+                     for name, hint in table.hints.items() if name not in signals][:2]
     groups = None if group is None else np.ravel(loaded[group])
     good = {name: known.is_good(loaded[name], goods[name], f"{label}, column {name!r}") for name in quality}
     findings += [known.unused_quality(unused, loaded)] if unused else []

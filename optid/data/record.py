@@ -1,6 +1,6 @@
 """Records of inputs and outputs: one or several experiments with names, units and a sampling time."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
@@ -378,6 +378,10 @@ class Data(Ports):
     def raw(self) -> "Data":
         """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""
         return self.mapped(self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l))
+
+    def with_findings(self, findings: Iterable[str]) -> "Data":
+        """Return the same record with other findings."""
+        return self._with(findings=tuple(findings))
 
     def without_transform(self) -> "Data":
         """Return the same samples without the way back to raw units."""

@@ -98,6 +98,10 @@ class Stream(Ports):
         """Identity: a stream is in raw units."""
         return Transform.identity(self.m, self.l)
 
+    def with_findings(self, findings: Iterable[str]) -> "Stream":
+        """Return the same record with other findings."""
+        return replace(self, findings=tuple(findings))
+
     def in_units(self, units: Transform) -> "Stream":
         """Return the same record in other units: ``raw = value * scale + offset`` with the raw values of this one."""
         found = replace(self, _channels=replace(self._channels, units=units))

@@ -11,7 +11,7 @@ import numpy as np
 from optid.data.reading import dates
 from optid.data.reading.columns import column_name, listing, to_numbers
 from optid.data.reading.counts import COUNTS, meaning
-from optid.data.reading.format import UNITS, Format
+from optid.data.reading.format import UNITS, Format, is_number
 from optid.errors import DataError
 
 NAMES = frozenset({
@@ -38,6 +38,9 @@ _UNIT_WORDS = {word: unit for unit, words in {
 _ZONE_WORDS = ("utc", "gmt", "local", "lokal", "cet", "cest", "est", "edt", "pst", "pdt", "relative", "abs", "absolute")
 _SINCE = re.compile(r"([a-zµ]+) since (.+)")
 _OF_SIGNAL = re.compile(r"(.*?)[ ._]*\d+")
+
+_DATED = re.compile(r"\d[-/:. ]\d|\d\D+\d")
+FEWEST_HINTS = 5  # cells from which a column may be a clock
 
 _BRACKETS = re.compile(r"(.*?)[ _]*[\[({<]([^\])}>]*)[\])}>]\s*")
 _SUFFIX = re.compile(r"(.*?)(?:[ _.]*/[ _]*| in |[ _.,-]+)([a-zµμ]+)")
@@ -116,6 +119,23 @@ class Clock:
 
     def _in_utc(self, stamps: np.ndarray, where: str) -> np.ndarray:
         return stamps if self.how.time_zone is None else dates.to_utc(stamps, self.how.time_zone, where)
+
+
+def clock_hints(columns: Mapping[str, Sequence[Any]]) -> dict[str, str]:
+    """Return why some columns may be a clock although they are not named as one, by their first cells."""
+    found = {}
+    for name, cells in columns.items():
+        texts = [str(cell).strip() for cell in list(cells)[:50]]
+        if len(texts) < FEWEST_HINTS or not name:
+            continue
+        if all(map(is_number, texts)):
+            steps = np.diff([float(text) for text in texts])
+            counter = steps[0] == 1 and float(texts[0]) in (0, 1)
+            if steps[0] > 0 and not counter and np.ptp(steps) <= 0.01 * steps[0]:
+                found[name] = f"increases evenly by {steps[0]:.6g}"
+        elif _DATED.search(texts[0]) and len(set(texts)) > 1:
+            found[name] = f"holds texts such as {texts[0]!r}"
+    return found
 
 
 def clock_values(values: Any, label: str) -> np.ndarray:
@@ -240,7 +260,8 @@ def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
         full = [cell for cell in cells.tolist() if not how.is_missing(cell) and cell.strip().lower() != "nat"]
         first = full[0] if full else ""
         given = how.date_format
-        if given and dates.has_day(given) == dates.is_time_of_day(first):
+        if given and (dates.is_time_of_day(first) if dates.has_day(given) else any(
+                map(dates.has_day, dates.formats(first)))):
             given = None  # it is the format of the other column
         if given is None and "mm:ss" in name.lower().replace(" ", "") and re.fullmatch(r"\d+:\d\d", first):
             given = "%M:%S"
@@ -280,8 +301,10 @@ def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str, where: st
         start = dates.instant(since[2])
         if start is not None:
             return Clock((name,), "numbers", how, scale, -start / scale, finding=f"clock {name!r}: {unit}")
-    found = meaning(finite, name, _plain(base), word or stated, how.date_format, where)
-    finding, unknown = found.finding, _unknown_unit(name)
+    unknown = _unknown_unit(name)
+    base = "mjd" if unknown.lower() == "mjd" else _plain(base)
+    found = meaning(finite, name, base, word or stated, how.date_format, where)
+    finding = found.finding
     if not finding and unknown and not stated:
         finding = f"clock {name!r}: the unit {unknown!r} is not known; read as seconds"
     return Clock((name,), "numbers", how, found.scale, found.origin, finding=finding)

@@ -53,7 +53,8 @@ def choose(known: Sequence[str], wanted: Wanted, letter: str, label: str) -> dic
     if isinstance(wanted, Mapping):
         pairs = {str(name): column_name(known, column, label) for name, column in wanted.items()}
     else:
-        if not isinstance(wanted, str | int | np.integer | list | tuple | np.ndarray):
+        if not isinstance(wanted, str | int | np.integer | list | tuple) and np.ndim(
+                wanted if isinstance(wanted, np.ndarray) else 0) != 1:
             raise DataError(f"{what}={wanted!r}: must be the name or position of a column, a list of these, or a "
                             "mapping {channel name: column}.")
         several = [wanted] if isinstance(wanted, str | int | np.integer) else list(wanted)

@@ -87,7 +87,7 @@ class CsvFile:
         with opened(self.path, how.encoding) as file:
             blocks = file.blocks(self.layout.offset, 2 * len(self.names) + SPARE, mark.encode())
             cleaned = (clean(block, how.comment, how.delimiter == BLANKS) for block in blocks)
-            if self.path.stat().st_size > SMALL and mark.isascii() and how.is_plain:
+            if self.path.stat().st_size > SMALL and mark.isascii() and how.thousands is None:
                 as_text = {name for name, kind in texts.items() if kind == "text" or name in self.layout.dates}
                 attempts: list[tuple[Set[str], list[str]]] = [
                     (as_text, []), (as_text, NULLS), *([(set(texts), [])] if as_text != set(texts) else [])]
@@ -121,7 +121,8 @@ class CsvFile:
         import polars as pl
 
         places = [self._places[name] for name in wanted]
-        schema = dict.fromkeys(map(str, range(len(self.names))), pl.Float64)
+        comma = self._how.decimal == ","
+        schema: dict[str, Any] = dict.fromkeys(map(str, range(len(self.names))), pl.String if comma else pl.Float64)
         schema |= {str(self._places[name]): pl.String for name in as_text}
         nulls = [*nulls, *self._how.missing]
         try:
@@ -133,6 +134,11 @@ class CsvFile:
         if (table.width < len(self.names) or table[:, -1].null_count()) and not self._has_even_rows(block):
             return None
         series = [table[str(place)] for place in places]
+        try:
+            series = [column if name in as_text or not comma else _with_points(column)
+                      for name, column in zip(wanted, series)]
+        except pl.exceptions.PolarsError:
+            return None
         return {name: column if name in as_text else column.to_numpy() for name, column in zip(wanted, series)}
 
     def _has_short_lines(self, block: bytes) -> bool:
@@ -200,6 +206,14 @@ class CsvFile:
 def open_csv(path: Path, how: Format) -> CsvFile:
     """Find the layout of a text table; errors as of `find_layout`."""
     return CsvFile(path, find_layout(path, how))
+
+
+def _with_points(column: Any) -> Any:
+    """Return the numbers of texts with decimal commas; a point is no decimal mark there, and polars refuses it."""
+    import polars as pl
+
+    pointed = column.str.replace_all(".", "x", literal=True).str.replace(",", ".", literal=True)
+    return pl.select(pl.when(pointed == "").then(None).otherwise(pointed).cast(pl.Float64)).to_series()
 
 
 def _joined(blocks: list[Columns], wanted: Sequence[str]) -> Columns:

@@ -11,7 +11,8 @@ from optid.errors import DataError
 
 _DAY = re.compile(
     r"(?P<iso>\d{4}([-/.])\d{1,2}\2\d{1,2})|(?P<compact>\d{8})(?=[T ]\d)"
-    r"|(?P<name>\d{1,2}([- ])[A-Za-z]{3,9}\5(\d{4}|\d\d))|(?P<numbers>\d{1,2}([-/.])\d{1,2}\8(\d{4}|\d\d))")
+    r"|(?P<month>[A-Za-z]{3,9} \d{1,2}, ?\d{4})|(?P<name>\d{1,2}([- ])[A-Za-z]{3,9}\6(\d{4}|\d\d))"
+    r"|(?P<numbers>\d{1,2}([-/.])\d{1,2}\9(\d{4}|\d\d))")
 _HOUR = re.compile(r"(?P<gap>T| +|^)(?P<hour>\d{1,2}:\d\d|\d{4}(?=\d\d|\b))(?P<second>:?\d\d)?(?P<part>[.,:]\d+)?"
                    r"(?P<half> ?[AaPp][Mm])?")
 _ZONE = re.compile(r" ?(?P<zone>Z|UTC|GMT|[+-]\d\d(?::?\d\d)?)")
@@ -146,6 +147,8 @@ def _formats_of_day(day: re.Match[str]) -> list[str]:
         return [f"%Y{mark}%m{mark}%d"]
     if day["compact"]:
         return ["%Y%m%d"]
+    if day["month"]:
+        return ["%b %d, %Y" if ", " in text else "%b %d,%Y"]
     first, second, year = text.split(mark)
     year = "%Y" if len(year) == 4 else "%y"
     if day["name"]:

@@ -80,6 +80,8 @@ class Format:
             value = getattr(self, name)
             if not isinstance(value, str) and (value is not None or name == "decimal"):
                 raise DataError(f"{name}={value!r}: must be a text.")
+            if any("\ud800" <= sign <= "\udfff" for sign in value or ""):
+                raise DataError(f"{name}={value!r}: holds half a character.")
         for name in ("columns", "input_units", "output_units"):
             object.__setattr__(self, name, _texts(getattr(self, name), name))
         _check_marks(self)

@@ -101,7 +101,8 @@ def load_frame(label: str, frame: Any, wanted: Sequence[str], texts: Mapping[str
         elif name in texts:
             dates = isinstance(column.dtype, nw.Datetime) and column.null_count() == 0
             # Through integers, because a time zone would make objects of the dates.
-            loaded[name] = column.dt.timestamp("ns").to_numpy().astype("M8[ns]") if dates else column.to_numpy()
+            unit: Any = "ns" if getattr(column.dtype, "time_unit", "") == "ns" else "us"  # which hold more years
+            loaded[name] = column.dt.timestamp(unit).to_numpy().astype(f"M8[{unit}]") if dates else column.to_numpy()
         elif not column.dtype.is_numeric():
             raise DataError(f"{label}: column {name!r} is of type {column.dtype}; it must be numeric. Convert it first "
                             "(pandas.to_numeric, polars cast).")

@@ -9,12 +9,13 @@ import csv
 import io
 import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from optid.data.reading import dates
+from optid.data.reading.clock import clock_hints
 from optid.data.reading.format import Format, call, is_number
 from optid.data.reading.textfile import opened
 from optid.errors import DataError
@@ -45,6 +46,7 @@ class Layout:
     text_rows: int = 0  # rows of units and descriptions after the header
     dates: tuple[str, ...] = ()  # columns of dates or times of day
     advice: str = ""  # what a refusal proposes to type; empty where the file needs no words
+    hints: Mapping[str, str] = field(default_factory=dict)  # why other columns may be the clock
     findings: tuple[str, ...] = ()  # what was derived and is worth saying
 
     @property
@@ -226,7 +228,7 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
     dated = tuple(name for name, column in columns.items() if (one := _first(column, how)) and dates.is_date(one))
     _propose(columns, dated, how, needed)
     return Layout(names, how, rows[len(texts)].end, {name: unit.strip() for name, unit in units.items()},
-                  len(texts), dated, findings=tuple(findings))
+                  len(texts), dated, hints=clock_hints(columns), findings=tuple(findings))
 
 
 def _refuse_preamble(rows: list[_Row], width: int, where: str, needed: dict[str, Any]) -> None:

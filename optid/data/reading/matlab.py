@@ -47,7 +47,6 @@ class MatExperiment:
     load: Callable[..., dict[str, Any]]  # function of names, returning {name: array}
     index: str | None  # name of the time vector
     step: float | None  # sampling time in seconds that a scalar beside the signals says
-    findings: tuple[str, ...]
 
 
 def split_experiments(path: Path, listing: MatContents, signals: Sequence[str], time: Any) -> list[MatExperiment]:
@@ -100,10 +99,9 @@ def split_experiments(path: Path, listing: MatContents, signals: Sequence[str], 
         return {name: arrays[name] for name in wanted}
 
     names = [name for name in listing.experiments[0] if not by_default or name in signals or not is_time_name(name)]
-    findings = tuple(f"clock {name!r}: {step:g} s" for name, step in steps.items() if not vectors)
     return [MatExperiment(path.name if count == 1 else f"{path.name}, experiment {number + 1}", names,
-                          partial(load, number), vectors[0] if vectors else None, next(iter(steps.values()), None),
-                          findings) for number in range(count)]
+                          partial(load, number), vectors[0] if vectors else None, next(iter(steps.values()), None)
+                          ) for number in range(count)]
 
 
 def _is_same(one: np.ndarray, other: np.ndarray) -> bool:

@@ -18,7 +18,7 @@ LIBRARIES = {".xlsx": "fastexcel", ".tdms": "npTDMS", ".mf4": "asammdf"}
 def plant_tables(path: Path, kind: str) -> list[tuple[str, Any, Mapping[str, str] | None]]:
     """Return the label, a frame and the units of the channels of each table of a file.
 
-    An Excel file has one table, its first sheet; a TDMS file one for each group; an MDF file one for each group of
+    An Excel file has one table for each sheet; a TDMS file one for each group; an MDF file one for each group of
     channels with a clock of its own.
 
     Raises:
@@ -44,8 +44,10 @@ def _of_excel(path: Path) -> list[tuple[str, Any, None]]:
     import fastexcel  # noqa: F401 - the reader that polars uses
     import polars as pl
 
-    frame: Any = pl.read_excel(path, raise_if_empty=False)
-    return [(path.name, frame, None)] if frame.width else []
+    sheets: dict[str, Any] = pl.read_excel(path, sheet_id=0, raise_if_empty=False)
+    full = {name: frame for name, frame in sheets.items() if frame.width}
+    return [(path.name if len(full) == 1 else f"{path.name}, sheet {name!r}", frame, None)
+            for name, frame in full.items()]
 
 
 def _of_tdms(path: Path) -> list[tuple[str, Any, Mapping[str, str]]]:

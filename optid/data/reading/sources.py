@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.data.reading.clock import is_rate_name, is_step_name
+from optid.arrays import check_shape
+from optid.data.reading.clock import clock_hints, is_rate_name, is_step_name
 from optid.data.reading.columns import position_names
 from optid.data.reading.csvfile import open_csv
 from optid.data.reading.format import Format
@@ -37,6 +38,7 @@ class Table:
     dates: tuple[str, ...] = ()  # columns of dates
     units: Mapping[str, str] = field(default_factory=dict)  # units by column, where the source has them
     step: float | None = None  # sampling time that stands beside the samples
+    hints: Mapping[str, str] = field(default_factory=dict)  # why columns not named as a clock may be it
     advice: str = ""  # what a refusal proposes to type
     findings: tuple[str, ...] = ()
     # function of the columns of inputs and outputs, and of `time` as of `optid.data.readers.read`, where they decide
@@ -93,8 +95,8 @@ def open_tables(source: Any, how: Format) -> list[Table]:
             return _file_tables(existing(path), kind, how)
         except OSError as error:
             raise DataError(f"{path.name} cannot be read: {error.strerror}.") from error
-    if hasattr(source, "data_vars") and hasattr(source, "coords"):  # an xarray data set
-        return [_of_arrays("the data set", {name: variable.values for name, variable in source.variables.items()}, how)]
+    if hasattr(source, "data_vars") and hasattr(source, "coords"):
+        return [_of_data_set("the data set", source, how)]
     if isinstance(source, Mapping):
         return [_of_arrays("the dictionary", source, how)]
     if isinstance(source, np.ndarray):
@@ -106,7 +108,7 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[Table]:
     if kind in TEXT:
         file = open_csv(path, replace(how, delimiter="\t") if kind == ".tsv" and not how.delimiter else how)
         return [Table(path.name, file.names, file.columns, file.layout.how, None, file.layout.dates, file.layout.units,
-                      None, file.layout.advice, file.layout.findings)]
+                      advice=file.layout.advice, hints=file.layout.hints, findings=file.layout.findings)]
     if kind == ".parquet":
         from optid.data.reading.parquet import load_parquet, parquet_head
 
@@ -139,8 +141,8 @@ def _of_mat(path: Path, how: Format) -> Table:
         raise DataError(f"{path.name} holds no arrays of numbers. {reasons}".rstrip())
 
     def split(signals: Sequence[str], time: Any) -> list[Table]:
-        return [Table(one.label, one.names, one.load, how, one.index, units=contents.units, step=one.step,
-                      findings=one.findings) for one in split_experiments(path, contents, signals, time)]
+        return [Table(one.label, one.names, one.load, how, one.index, units=contents.units, step=one.step)
+                for one in split_experiments(path, contents, signals, time)]
 
     return Table(path.name, names, lambda wanted, _: mat_contents(path, wanted).experiments[0], how, split=split,
                  inputs=contents.inputs or None, outputs=contents.outputs or None)
@@ -150,7 +152,29 @@ def _of_frame(label: str, frame: Any, how: Format) -> Table:
     names, table = frame_names(label, frame)
     if len(table) == 0:
         raise DataError(f"{label} has no rows.")
-    return Table(label, names, partial(load_frame, label, table), how, index_name(frame, names), dated_columns(table))
+    head = table.head(50)
+    hints = clock_hints({str(name): head[name].to_list() for name in head.columns})
+    return Table(label, names, partial(load_frame, label, table), how, index_name(frame, names), dated_columns(table),
+                 hints=hints)
+
+
+def _of_data_set(label: str, source: Any, how: Format) -> Table:
+    """Return the table of an xarray data set: its variables of one dimension, with their units."""
+    variables = {str(name): variable for name, variable in source.variables.items()}
+    found = _of_arrays(label, {name: variable.values for name, variable in variables.items()}, how)
+
+    def load(wanted: Sequence[str], texts: Mapping[str, str]) -> dict[str, Any]:
+        along = {name: variables[name].dims[0] for name in wanted if variables[name].dims}
+        if len(set(along.values())) > 1:
+            several = ", ".join(f"{name} ({dimension})" for name, dimension in along.items())
+            raise DataError(f"{label}: the variables have different dimensions: {several}. Interpolate them onto one "
+                            "first (xarray.Dataset.interp).")
+        return found.load(wanted, texts)
+
+    units = {name: str(variable.attrs.get("units", "")) for name, variable in variables.items()}
+    index = next((str(name) for name in source.dims if str(name) in source.coords
+                  and source.coords[name].dtype.kind in "iufMm"), None) if len(source.dims) == 1 else None
+    return replace(found, load=load, units=units, index=index)
 
 
 def _of_arrays(label: str, variables: Mapping[Any, Any], how: Format) -> Table:
@@ -184,6 +208,7 @@ def _of_array(label: str, array: np.ndarray, how: Format) -> Table:
     if array.ndim not in (1, 2):
         raise DataError(f"{label} has shape {array.shape}; it must be (samples, channels).")
     table = array[:, None] if array.ndim == 1 else array
+    check_shape(table, label)
     names = position_names(how.columns, table.shape[1], label)
     return Table(label, names, _of_arrays(label, dict(zip(names, table.T)), how).load, how)
 
