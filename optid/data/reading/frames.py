@@ -49,7 +49,7 @@ def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
 
 def index_name(frame: Any, names: Sequence[str]) -> str | None:
     """Return the name by which the time index of a pandas frame is read; None where its index is no time."""
-    index = getattr(frame, "index", None)
+    index: Any = getattr(frame, "index", None)
     if hasattr(index, "to_timestamp") and str(index.dtype).startswith("period"):
         return None if index.name in names else str(index.name or "index")
     kind = getattr(getattr(index, "dtype", None), "kind", "")
