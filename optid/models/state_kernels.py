@@ -141,8 +141,11 @@ def march(parts, stretch, x, outputs, states):
 
 @cached_njit
 def combine(weights, rows, into):
-    """Write sum_j weights[j] rows[j] of as many rows as there are weights; four at a time saves memory traffic."""
-    count, q = weights.size, into.size
+    """Write sum_j weights[j] rows[j] of as many rows as there are weights; four at a time saves memory traffic.
+
+    ``into`` may have further columns, which are left as they are.
+    """
+    count, q = weights.size, rows.shape[1]
     left = count % 4
     if left == 0:
         for p in range(q):
@@ -175,7 +178,7 @@ def sensitivities(parts, direct, signals, turn, jacobian):
         S(k+1) = A S + Ez H + (what theta changes in x(k+1) directly) + R J   where R is what comes back of the output.
 
     The direct changes are a `Direct`; the initial state has the first n columns. Written are ``turn`` S (n, q) and the
-    ``jacobian`` J (T, l, q).
+    ``jacobian`` J, the first q columns of (T, l, q or more).
     """
     n, l, q, latent = parts.A.shape[0], parts.C.shape[0], turn.shape[1], parts.Ez.shape[1]  # noqa: E741
     returned, bent, values = signals
