@@ -320,6 +320,11 @@ def test_inputs_of_few_levels_allow_linear_models_only(short):
 @pytest.mark.parametrize("changes, error, words", [
     ({"budget": 0}, StructureError, "budget is a number of seconds"), ({"blocks": 1}, StructureError, "blocks"),
     ({"classes": ["wiener"]}, StructureError, "wiener"), ({"horizon": 0}, StructureError, "horizon"),
+    ({"workers": 10**5000}, StructureError, "workers"), ({"horizon": 10**5000}, StructureError, "horizon"),
+    ({"budget": "x"}, StructureError, "budget"), ({"budget": np.nan}, StructureError, "budget"),
+    ({"budget": 10**400}, StructureError, "budget"), ({"budget": np.array([1, 2])}, StructureError, "budget"),
+    ({"accuracy": 0}, StructureError, "^accuracy=0"), ({"accuracy": np.nan}, StructureError, "^accuracy=nan"),
+    ({"blocks": np.inf}, StructureError, "blocks"), ({"blocks": 10**5000}, StructureError, "blocks"),
     ({"workers": 0}, StructureError, "workers"), ({"solver": "nothing"}, OptidError, "nothing"),
     ({"constraints": ["monotonous"]}, OptidError, "monotonous"),
 ])

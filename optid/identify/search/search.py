@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import check_integer, one_of
+from optid.arrays import LARGEST, check_integer, is_number, one_of, shown
+from optid.backends.back_end import Settings
 from optid.data.record import Data, not_a_record
 from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
@@ -98,8 +99,9 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     clock = time.monotonic()
     if not isinstance(data, Data):
         raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
-    if not budget > 0:
-        raise StructureError(f"budget is a number of seconds above 0; got {budget!r}")
+    if not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf:
+        raise StructureError(f"budget is a number of seconds above 0; got {shown(budget)}")
+    Settings(accuracy)  # every trial would refuse it
     for word in classes:
         one_of("classes", word, KINDS)
     possible = [kind for kind in KINDS if kind in classes and (kind == LINEAR or not few_levels(data))]
