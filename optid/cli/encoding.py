@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 NAME = "optid-readable"  # of the error handler
 SUBSTITUTES = {"‖": "|", "ᵀ": "^T", "²": "^2", "³": "^3", "⁻": "^-", "·": "*", "×": "x", "÷": "/", "−": "-",
-               "±": "+/-",
+               "±": "+/-", "µ": "u",
                "≤": "<=", "≥": ">=", "≈": "~", "≠": "!=", "→": "->", "←": "<-", "∞": "inf", "√": "sqrt", "°": "deg ",
                "–": "-", "—": "-", "…": "...", "•": "*", "‘": "'", "’": "'", "“": '"', "”": '"', "⁄": "/", "═": "=",
                "│": "|", "┃": "|", "║": "|", "ß": "ss", "æ": "ae"}
@@ -25,8 +25,8 @@ def substitute(character: str) -> str:
         return "-" if "HORIZONTAL" in rest and "VERTICAL" not in rest else "+"
     if unicodedata.combining(character):
         return ""
-    plain = "".join(SUBSTITUTES.get(c, c) for c in unicodedata.normalize("NFKD", character) if c != character)
-    return plain.encode("ascii", "ignore").decode() or "?"
+    parts = unicodedata.normalize("NFKD", character)
+    return "?" if parts == character else "".join(c if c.isascii() else substitute(c) for c in parts)
 
 
 @contextmanager
