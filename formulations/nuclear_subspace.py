@@ -82,7 +82,7 @@ def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None
 def _weights(weight: float | str | Sequence[float], noise: float | None) -> tuple[float, ...]:
     if noise is not None:
         if not 1 / LARGEST <= noise <= LARGEST or weight != "auto":
-            raise StructureError(f"noise={shown(noise)}: it must be a positive standard deviation, in the place of "
+            raise StructureError(f"noise={shown(noise)} is a positive standard deviation that takes the place of "
                                  "weight=")
         return (1.0,)
     if isinstance(weight, str):

@@ -40,6 +40,12 @@ def die(number):
     os.kill(os.getpid(), number)
 
 
+def killed_by_options(program, settings):
+    from optid.backends.conic import solve_with
+
+    return die(signal.SIGKILL) if settings.options else solve_with("clarabel", program, settings)
+
+
 def held(count):
     return np.ones(count, dtype=np.uint8).size
 
