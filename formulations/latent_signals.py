@@ -17,7 +17,7 @@ The errors are minimised over all parts, z included, by the programmes of `formu
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -127,8 +127,9 @@ def _fit(name: str, data: Data, nx: int | str, output_basis: Any, feedthrough: b
 
 def _on_latent(given: Basis | str) -> Basis:
     """Return the basis of a latent function, on [-1, 1]."""
-    basis: Any = parse(given) if isinstance(given, str) else given
+    basis = parse(given) if isinstance(given, str) else given
     if not isinstance(basis, Basis):
         raise StructureError(f"the basis of a latent signal is {shown(given)}: give one such as Polynomial(3) or its "
                              "name, 'polynomial:3'")
-    return replace(basis, interval=(-1.0, 1.0), outside="extrapolate" if isinstance(basis, Polynomial) else "linear")
+    outside = "extrapolate" if isinstance(basis, Polynomial) else "linear"
+    return replace(cast(Any, basis), interval=(-1.0, 1.0), outside=outside)

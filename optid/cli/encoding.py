@@ -5,6 +5,7 @@ import sys
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import TextIOWrapper
 
 NAME = "optid-readable"  # of the error handler
 SUBSTITUTES = {"‖": "|", "ᵀ": "^T", "²": "^2", "³": "^3", "⁻": "^-", "·": "*", "×": "x", "÷": "/", "−": "-",
@@ -32,7 +33,7 @@ def substitute(character: str) -> str:
 @contextmanager
 def readable_output() -> Iterator[None]:
     """Write substitutes for what the encodings of standard output and error lack, instead of failing."""
-    streams = [stream for stream in (sys.stdout, sys.stderr) if hasattr(stream, "reconfigure")]
+    streams = [stream for stream in (sys.stdout, sys.stderr) if isinstance(stream, TextIOWrapper)]
     before = [stream.errors for stream in streams]
     for stream in streams:
         stream.reconfigure(errors=NAME)
