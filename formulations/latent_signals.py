@@ -17,14 +17,15 @@ The errors are minimised over all parts, z included, by the programmes of `formu
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from formulations.state_space import state_space_fit
-from optid.arrays import check_integer, one_of
+from optid.arrays import LARGEST_INTEGER, check_integer, one_of, shown
 from optid.bases import Bases, Basis, Polynomial, parse
 from optid.data.record import Data
+from optid.errors import StructureError
 from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
 from optid.models import HammersteinSS
@@ -69,6 +70,7 @@ def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool,
                     tries: int) -> Callable[..., Any]:
     """Return what adds the latent signals of `lfr` to an optimum without them; arguments and errors as there."""
     check_integer(channels, "channels")
+    check_integer(seed, "seed", 0, LARGEST_INTEGER)
     one_of("latent", latent, ("states+inputs", "states"))
     inner = _on_latent(latent_basis)
     one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
@@ -125,5 +127,9 @@ def _fit(name: str, data: Data, nx: int | str, output_basis: Any, feedthrough: b
 
 def _on_latent(given: Basis | str) -> Basis:
     """Return the basis of a latent function, on [-1, 1]."""
-    basis: Any = parse(given) if isinstance(given, str) else given
-    return replace(basis, interval=(-1.0, 1.0), outside="extrapolate" if isinstance(basis, Polynomial) else "linear")
+    basis = parse(given) if isinstance(given, str) else given
+    if not isinstance(basis, Basis):
+        raise StructureError(f"the basis of a latent signal is {shown(given)}: give one such as Polynomial(3) or its "
+                             "name, 'polynomial:3'")
+    outside = "extrapolate" if isinstance(basis, Polynomial) else "linear"
+    return replace(cast(Any, basis), interval=(-1.0, 1.0), outside=outside)

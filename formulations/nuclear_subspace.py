@@ -24,7 +24,7 @@ import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import identified
-from optid.arrays import one_of
+from optid.arrays import LARGEST, one_of, shown
 from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import StructureError
@@ -81,8 +81,9 @@ def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None
 
 def _weights(weight: float | str | Sequence[float], noise: float | None) -> tuple[float, ...]:
     if noise is not None:
-        if not noise > 0 or weight != "auto":
-            raise StructureError(f"noise={noise!r} is a positive standard deviation that takes the place of weight=")
+        if not 1 / LARGEST <= noise <= LARGEST or weight != "auto":
+            raise StructureError(f"noise={shown(noise)} is a positive standard deviation that takes the place of "
+                                 "weight=")
         return (1.0,)
     if isinstance(weight, str):
         one_of("weight", weight, ("auto",))

@@ -19,7 +19,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.arrays import check_integer
+from optid.arrays import LARGEST_INTEGER, check_integer
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.physical import CompressedPhysical, PhysicalErrors
@@ -64,7 +64,8 @@ def physical(data: Data, *, equations: Equations | str, starts: int = 6, seed: i
     if count > LIMIT:
         raise StructureError(f"{count} states at all steps of integration: this formulation takes up to {LIMIT}. Use "
                              "fewer samples, or a longer step")
-    return _procedure(errors, check_integer(starts, "starts"), seed, tuple(constraints))
+    return _procedure(errors, check_integer(starts, "starts"),
+                      check_integer(seed, "seed", 0, LARGEST_INTEGER), tuple(constraints))
 
 
 def _procedure(errors: PhysicalErrors, starts: int, seed: int, constraints: tuple[Any, ...]) -> Procedure:

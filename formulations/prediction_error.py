@@ -30,7 +30,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.arrays import check_integer, one_of
+from optid.arrays import LARGEST_INTEGER, check_integer, one_of
 from optid.bases import Bases
 from optid.data.channels import model_meta
 from optid.data.record import Data
@@ -146,6 +146,7 @@ def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc:
                constraints: Sequence[Any], gauge: str | None, offset: bool, starts: Any, seed: int) -> Procedure:
     """Search for the best optimum in a gauge that is always reached, and continue from there in the requested one."""
     count = check_integer(starts, "starts")
+    check_integer(seed, "seed", 0, LARGEST_INTEGER)
     criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
     free = replace(criterion, gauge="none" if gauge is None else "norm")
     best, others, figures = search(free, lambda part: starts_of(part, count, seed))

@@ -12,6 +12,7 @@ from optid.errors import DataError, DataWarning, OptidError, StructureError
 Array = NDArray[np.floating]
 
 EXACT_INTEGER = 2**53  # largest magnitude up to which every integer is a float64 (IEEE 754, 53-bit significand)
+LARGEST_INTEGER = 2**63 - 1
 LARGEST = 1e150
 """Largest magnitude accepted: beyond it squares overflow, and no sensor reads it (it is a marker of lost samples)."""
 
@@ -106,6 +107,20 @@ def check_finite(samples: np.ndarray, labels: Sequence[str], first: int = 0) -> 
                     "remove the fault that produced it.")
 
 
+def shown(value: Any) -> str:
+    """Return the value of an argument for a message, shortened; Python writes no integers of thousands of digits."""
+    try:
+        text = repr(value)
+    except ValueError:
+        return "an integer of thousands of digits"
+    return text if len(text) <= 200 else f"{text[:200]}..."
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number; NaN and infinity are."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
 def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
                   error: type[OptidError] = StructureError) -> int:
     """Return an integer argument as an int; raise `error` for anything else and outside low to high (None: 2^31)."""
@@ -114,26 +129,26 @@ def check_integer(value: Any, name: str, low: int = 1, high: int | None = None,
         kind = {0: "a nonnegative integer", 1: "a positive integer"}.get(low, f"an integer of at least {low}")
         if high is not None or (isinstance(value, int) and value > top):
             kind = f"an integer from {low} to {top}"
-        raise error(f"{name} must be {kind}; got {value!r}.")
+        raise error(f"{name} must be {kind}; got {shown(value)}.")
     return int(value)
 
 
 def check_probability(value: Any, name: str) -> None:
     """Refuse an argument that is no probability strictly between 0 and 1 (`StructureError`)."""
-    if not 0 < value < 1:
-        raise StructureError(f"{name}={value!r}: it must be a probability between 0 and 1.")
+    if not is_number(value) or not 0 < value < 1:
+        raise StructureError(f"{name}={shown(value)}: it must be a probability between 0 and 1.")
 
 
 def check_weight(value: Any, name: str) -> None:
     """Refuse the weight of a penalty that is not a nonnegative number (`StructureError`)."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not 0 <= value <= LARGEST:
-        raise StructureError(f"{name}={value!r}: it must be a nonnegative number.")
+    if not is_number(value) or not 0 <= value <= LARGEST or value == np.inf:  # in float32 LARGEST is infinite
+        raise StructureError(f"{name}={shown(value)}: it must be a nonnegative number.")
 
 
 def one_of(name: str, value: Any, known: Sequence[str]) -> None:
     """Refuse a word that is not known (`StructureError`)."""
-    if value not in known:
-        raise StructureError(f"{name}={value!r}: use one of {', '.join(known)}.")
+    if not isinstance(value, str) or value not in known:
+        raise StructureError(f"{name}={shown(value)}: use one of {', '.join(known)}.")
 
 
 def finite(values: Any, name: str, largest: float = LARGEST) -> np.ndarray:

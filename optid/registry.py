@@ -173,6 +173,12 @@ def defaults(function: Callable[..., Any]) -> dict[str, Any]:
     return {p.name: p.default for p in keywords if p.default is not p.empty}
 
 
+def annotations(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the annotations of the arguments of a formulation but its record and constraints."""
+    return {name: p.annotation for name, p in _parameters(function).items()
+            if p.kind is p.KEYWORD_ONLY and p.annotation is not p.empty and name != "constraints"}
+
+
 @cache
 def _parameters(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
     return inspect.signature(function).parameters

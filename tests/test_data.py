@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -325,3 +327,18 @@ def test_a_record_is_drawn():
     long[500:90_00] = np.nan
     x, y = Data(u=long, y=long + 1).plot().axes[0].lines[0].get_data()
     assert len(x) < 8200 and y[list(x).index(40_000)] == 7.0 and x[-1] == 100_002
+
+
+@pytest.mark.parametrize("odd", ["a\nb", "a\r", "\t", "a\0b", "\x1b[31mred", "a\x85", "a\u2028b", "a\u202eb",
+                                 "\u2066a\u2069", "a\ud800"])
+def test_names_and_units_with_control_characters_are_refused(odd):
+    u, shown = np.ones(9), re.escape(repr(odd))
+    refuses(DataError, f"name of an input is {shown}.*control character U", Data, u, u, inputs=odd)
+    refuses(DataError, f"name of an output is {shown}", Data, u, u, outputs=[odd])
+    refuses(DataError, f"unit of an output is {shown}", Data, u, u, output_units=[odd])
+
+
+@pytest.mark.parametrize("odd", ["a*/ b", "a\\", "°C", "Ω", "温度", "درجة", "a\u200db", "??/"])
+def test_other_names_are_kept_as_they_are(odd):
+    u = np.ones(9)
+    assert Data(u, u, inputs=odd, input_units=[odd]).inputs == (odd,)

@@ -130,7 +130,7 @@ def test_compiled_c_equals_the_simulation(name, tmp_path):
              "feedback": lambda: feedback_fit().model}[name]()
     source = model.to_c(tmp_path / "plant.c", "plant")
     library = tmp_path / "plant.so"
-    warned = ["-Wall", "-Wextra", "-Wno-unused-parameter", "-Werror"]
+    warned = ["-Wall", "-Wextra", "-Werror"]
     subprocess.run(["gcc", "-std=c99", "-O2", *warned, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"],
                    check=True)
     step = ctypes.CDLL(str(library)).plant_step
@@ -144,5 +144,35 @@ def test_compiled_c_equals_the_simulation(name, tmp_path):
     assert np.array(found) == pytest.approx(expected, abs=1e-12 * max(1.0, np.max(np.abs(expected))))
 
 
-def test_c_refuses_a_name_that_is_none(tmp_path):
-    refuses(StructureError, "C function", siso().to_c, tmp_path / "a.c", "my-plant")
+ODD = ["a*/ int evil; /*", "a*??/", "?????/", "a\\", "a\\ ", "*", "/", "**/", "/*/", "*/*/", "//", "\\u000a", "°C",
+       "#if", "a\u200b", "\ufeffa", "%d", "a*\\", "*" * 9 + "/" * 9, "??/*"]
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on PATH")
+@pytest.mark.parametrize("standard", ["c99", "gnu17"])
+def test_names_and_units_change_nothing_but_comments_in_c(standard, tmp_path):
+    def code(*names):
+        """What the compiler sees; warnings are errors."""
+        fields = {field: (name,) for field, name in zip(("inputs", "outputs", "input_units", "output_units"), names)}
+        source = siso(**fields).to_c(tmp_path / "plant.c", "plant")
+        strict = ["gcc", f"-std={standard}", "-Wall", "-Wextra", "-Werror", str(source)]
+        subprocess.run([*strict, "-fsyntax-only"], check=True)
+        return subprocess.run([*strict, "-E", "-P"], check=True, capture_output=True).stdout
+
+    plain = code("u", "y", "", "")
+    for k in range(0, len(ODD), 4):
+        assert code(*ODD[k : k + 4]) == plain, ODD[k : k + 4]
+
+
+def test_control_characters_in_equations_are_shown_in_c(tmp_path):
+    model = siso()
+    model.__dict__["inputs"] = ("a\u202e\0",)  # as nothing but a program can do
+    note = model.to_c(tmp_path / "a.c").read_text(encoding="utf-8").partition("*/")[0]
+    assert "a(U+202E)(U+0000)" in note and all(c.isprintable() or c == "\n" for c in note)
+
+
+@pytest.mark.parametrize("name", ["my-plant", "", "1st", "int", "While", "_plant", "plant_", "my__plant", "ärger",
+                                  "a b", None, 3, "a\n", "a;", "nullptr"])
+def test_c_refuses_a_name_that_is_none(tmp_path, name):
+    refuses(StructureError, "C functions", siso().to_c, tmp_path / "a.c", name)
+    assert not (tmp_path / "a.c").exists()

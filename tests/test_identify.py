@@ -1,11 +1,13 @@
 """The search for a structure: blocks, exact sums, the ladder, the choice, and what stops it."""
 
+import re
 import time
 import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from tasks import anonymous, die_of_one, fail, hang, slow_square
 
 import optid
 from optid.bases import Linear
@@ -318,6 +320,11 @@ def test_inputs_of_few_levels_allow_linear_models_only(short):
 @pytest.mark.parametrize("changes, error, words", [
     ({"budget": 0}, StructureError, "budget is a number of seconds"), ({"blocks": 1}, StructureError, "blocks"),
     ({"classes": ["wiener"]}, StructureError, "wiener"), ({"horizon": 0}, StructureError, "horizon"),
+    ({"workers": 10**5000}, StructureError, "workers"), ({"horizon": 10**5000}, StructureError, "horizon"),
+    ({"budget": "x"}, StructureError, "budget"), ({"budget": np.nan}, StructureError, "budget"),
+    ({"budget": 10**400}, StructureError, "budget"), ({"budget": np.array([1, 2])}, StructureError, "budget"),
+    ({"accuracy": 0}, StructureError, "^accuracy=0"), ({"accuracy": np.nan}, StructureError, "^accuracy=nan"),
+    ({"blocks": np.inf}, StructureError, "blocks"), ({"blocks": 10**5000}, StructureError, "blocks"),
     ({"workers": 0}, StructureError, "workers"), ({"solver": "nothing"}, OptidError, "nothing"),
     ({"constraints": ["monotonous"]}, OptidError, "monotonous"),
 ])
@@ -364,7 +371,7 @@ def test_two_outputs():
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_pool_returns_results_in_order_and_stops_at_its_deadline(count):
     told = []
-    pool = Pool(lambda x: (time.sleep(0.01), x * x)[1], count)
+    pool = Pool(slow_square, count)
     try:
         assert pool.run(range(7), time.monotonic() + 60, told.append) == [x * x for x in range(7)]
         assert sorted(told) == [x * x for x in range(7)]
@@ -374,9 +381,7 @@ def test_a_pool_returns_results_in_order_and_stops_at_its_deadline(count):
 
 
 def test_a_pool_survives_the_death_of_a_process():
-    import os
-
-    pool = Pool(lambda x: os._exit(1) if x == 1 else x, 2)
+    pool = Pool(die_of_one, 2)
     try:
         found = pool.run([0, 1, 2, 3], time.monotonic() + 60, lambda result: None)
         assert found[1] is None and [x for x in found if x is not None] == [0, 2, 3]
@@ -386,9 +391,33 @@ def test_a_pool_survives_the_death_of_a_process():
 
 def test_what_hangs_ends_with_the_time(monkeypatch):
     monkeypatch.setattr("optid.identify.search.pool.GRACE", 0.1)
-    pool = Pool(lambda x: time.sleep(600) if x else x, 2)
+    pool = Pool(hang, 2)
     assert pool.run([0, 1], time.monotonic() + 0.5, lambda result: None) == [0, None]
     pool.close()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_a_trial_raises_in_a_process_is_raised_here(count):
+    pool = Pool(fail, count)
+    with pytest.raises(ZeroDivisionError, match="of 7"):
+        pool.run([7], time.monotonic() + 60, lambda result: None)
+    pool.close()
+
+
+def test_a_constraint_that_no_process_can_import_is_refused_by_its_name_or_leaves_the_search_alone(monkeypatch, short):
+    monkeypatch.setattr(searching, "available_cores", lambda number, name: number or 2)
+    words = "constraint '<lambda>': tasks.anonymous.*define it in a module that can be imported"
+    with pytest.raises(StructureError, match=f"workers=2: {words}, or use workers=1"):
+        identify(plant(300), classes=[LINEAR], constraints=[anonymous()], workers=2)
+    found = identify(plant(300), classes=[LINEAR], constraints=[anonymous()], budget=0.5)
+    assert re.search(f"the search worked in one process: {words}", found.reasons[-1])
+    assert "the search worked in one process" in str(found)
+
+
+def test_the_search_tells_nothing_of_processes_where_they_do(short, monkeypatch):
+    monkeypatch.setattr(searching, "available_cores", lambda number, name: number or 2)
+    found = identify(plant(300), classes=[LINEAR], constraints=["stable"], budget=0.5)
+    assert not any("process" in reason for reason in found.reasons)
 
 
 def test_nothing_that_can_be_fitted_is_an_error_with_the_most_frequent_reason(monkeypatch):

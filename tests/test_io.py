@@ -80,6 +80,9 @@ def test_every_truncation_is_named(tmp_path):
                           (lambda c: c["nonlinearities"][0]["basis"].update(type="wavelet"), "damaged.*wavelet"),
                           (lambda c: c["nonlinearities"][0]["basis"].update(p=-3), "damaged"),
                           (lambda c: c["nonlinearities"][0].update(basis=None), "damaged"),
+                          (lambda c: c.update(inputs=["a\n"]), r"damaged.*name of an input is 'a\\n'.*U\+000A"),
+                          (lambda c: c.update(outputs=["a\ud800"]), r"damaged.*name of an output is 'a\\ud800'"),
+                          (lambda c: c.update(output_units=["\u202ea"]), r"damaged.*unit of an output is '\\u202ea'"),
                           (lambda c: c.update(nonlinearities=7), "damaged")])
 def test_damaged_files(tmp_path, change, words):
     refuses(ModelFileError, words, load, damage(tmp_path, change))

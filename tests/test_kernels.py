@@ -1,6 +1,7 @@
 """Compiled functions are explicit scalar loops: a single assignment of an array to a slice costs seconds to compile."""
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -87,3 +88,16 @@ print(*(len(kernel.signatures) for kernel in (kernels.march, kernels.sensitiviti
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout.split() == ["1", "1"], done.stdout + done.stderr[-2000:]
+
+
+@pytest.mark.slow
+def test_kernels_stay_within_their_arrays(tmp_path):
+    """Every kernel is called by one of these tests, with every index checked."""
+    tests = Path(__file__).parent
+    names = ["recursion", "recursions", "tracking", "latent_signals", "hammerstein_ss", "noise_sensitivities",
+             "group_sparse", "fault_pairs", "fault_injection", "monitor", "plants", "regressors"]
+    files = [tests / f"test_{name}.py" for name in names]
+    done = subprocess.run([sys.executable, tests / "kernels_within_bounds.py", *files], cwd=tmp_path,
+                          capture_output=True, text=True,
+                          env={**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path / "cache")})
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]

@@ -1,15 +1,19 @@
 """solve: look-up, refusal, misbehaving back ends, time limits, re-solving without compiling again."""
 
+import pickle
 import time
 from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
 import pytest
+from problems import record
+from refusals import refuses
 from zoo import ABORTING, EVERYTHING, HANGING, RAISING, case, claiming, pose
 
+import optid
 from optid.backends import Answer, BackEnd, Settings, back_ends, choice
-from optid.errors import LookupFailed, SolverMissing, StructureError
+from optid.errors import LookupFailed, SolverMissing, SolverRefused, StructureError
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import run, solve
 
@@ -56,14 +60,19 @@ def test_a_claim_is_judged_at_its_point(claim, x, dual, status, words):
     assert found.has_point == (x is not None and len(x) == 2 and bool(np.all(np.abs(x) < 1e100)))
 
 
-@pytest.mark.parametrize("limit", [None, 5.0])
-@pytest.mark.parametrize("error", [TimeoutError("no licence"), ChildProcessError("no licence")])
-def test_an_error_of_the_solver_itself_is_no_limit_of_ours(error, limit):
-    def broken(program, settings):
-        raise error
+def late(program, settings):
+    raise TimeoutError("no licence")
 
+
+def lost(program, settings):
+    raise ChildProcessError("no licence")
+
+
+@pytest.mark.parametrize("limit", [None, 5.0])
+@pytest.mark.parametrize("broken, name", [(late, "TimeoutError"), (lost, "ChildProcessError")])
+def test_an_error_of_the_solver_itself_is_no_limit_of_ours(broken, name, limit):
     found = solve(projection(), broken, time_limit=limit)
-    assert found.status is Status.FAILED and f"{type(error).__name__}: no licence" in found.claimed + found.reason
+    assert found.status is Status.FAILED and f"{name}: no licence" in found.claimed + found.reason
 
 
 def test_nothing_claimed_is_not_false():
@@ -182,6 +191,56 @@ def test_answer_in_a_process_of_its_own_is_the_same(name):
     assert there.status is here.status is Status.OPTIMAL
     assert there.values["x"] == pytest.approx(here.values["x"], abs=1e-9)
     assert set(there.duals) == {"upper", "lower"}
+
+
+def strict(program, settings):
+    raise StructureError(f"no such function in {program.name!r}")
+
+
+@pytest.mark.parametrize("isolate", [False, True])
+def test_a_refusal_of_the_solver_is_a_refusal_from_everywhere(isolate):
+    refuses(SolverRefused, "no such function in 'projection'", solve, projection(), strict, isolate=isolate)
+
+
+def test_a_solver_that_no_process_can_import_is_refused_by_its_name():
+    refuses(SolverRefused, "test_solving.*<lambda> cannot be sent.*define it in a module that can be imported.*"
+            "neither time_limit nor isolate", solve, projection(), lambda program, settings: None, time_limit=5.0)
+
+
+@pytest.mark.parametrize("limit", [np.inf, 1e400, 1e300, 10**400, 3.2e7])
+def test_a_limit_of_years_is_none(limit):
+    assert solve(projection(), "clarabel", time_limit=limit).status is Status.OPTIMAL
+
+
+@pytest.mark.parametrize("limit", [0, 0.0, -1, -np.inf, np.nan, "5", True, [5.0], 1j])
+def test_a_time_limit_that_is_no_positive_number_is_named(limit):
+    refuses(StructureError, "time_limit=.*must be a positive number of seconds", solve, projection(), time_limit=limit)
+
+
+def test_what_only_models_and_proofs_need_stays_here():
+    program = replace(projection(), recover=lambda values: values, certify=lambda *_: (Bound(2.0, True, "hand"), None))
+    found = solve(program, "clarabel", time_limit=30.0)
+    assert found.status is Status.OPTIMAL and found.bound.method == "hand"
+
+
+def test_a_pickled_programme_does_not_share_ids_with_what_is_made_after_it(monkeypatch):
+    from cvxpy.lin_ops.lin_utils import ID_COUNTER  # not public: this fails first if CVXPY counts otherwise
+
+    packed = pickle.dumps(replace(projection(), recover=dict))
+    monkeypatch.setattr(ID_COUNTER, "count", 0)  # as in another process
+    program = pickle.loads(packed)
+    known = {v.id for v in program.problem.variables()}
+    assert not known & {cp.Variable().id for _ in range(max(known) + 1)}
+    assert solve(program, "clarabel").values["x"] == pytest.approx([1.0, 1.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("solver", ["gauss_newton", "alternating", "ipopt"])
+@pytest.mark.parametrize("constraints", [(), (lambda view: {"first": view["mu"][0] <= 0.5},)])
+def test_a_programme_stated_late_starts_elsewhere_where_it_starts_here(solver, constraints):
+    fit = optid.fit(record(), "hammerstein_arx.exact", na=1, nb=1, basis="triangular:4", constraints=constraints)
+    here, there = (solve(fit.program, solver, isolate=isolate) for isolate in (False, True))
+    assert there.status is here.status and there.iterations == here.iterations
+    assert there.objective == pytest.approx(here.objective, rel=1e-12)
 
 
 # look-up and refusal

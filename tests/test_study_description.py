@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tasks import killed_by_options
 
 import optid
 from optid.errors import LookupFailed, StudyError
@@ -243,15 +244,10 @@ def test_options_are_tried_only_where_that_says_something(monkeypatch):
 
 
 def test_options_that_kill_a_solver_are_told(monkeypatch):
-    import os
-
     from optid import backends
 
-    def run(program, settings):
-        return os.kill(os.getpid(), 9) if settings.options else clarabel.run(program, settings)
-
     clarabel = backends.back_ends()["clarabel"]
-    monkeypatch.setitem(backends.back_ends(), "clarabel", replace(clarabel, run=run))
+    monkeypatch.setitem(backends.back_ends(), "clarabel", replace(clarabel, run=killed_by_options))
     (told,) = problems(OPTIONS.format("50", "equilibrate_enable = true").replace("max_iter = 50, ", ""))
     assert "equilibrate_enable makes clarabel fail" in told and "SIGKILL" in told
 

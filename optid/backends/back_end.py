@@ -9,16 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.arrays import is_number, shown
 from optid.errors import StructureError
 from optid.program.solution import Status
 from optid.program.structure import Structure
 
 if TYPE_CHECKING:  # programmes import CVXPY, which the list of solvers does not need
     from optid.program.program import Program
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
 @dataclass(frozen=True)
@@ -32,10 +29,10 @@ class Settings:
     options: Mapping[str, Any] = field(default_factory=dict)  # native options, passed through
 
     def __post_init__(self) -> None:
-        if not _is_number(self.accuracy) or not 0 < self.accuracy < 1:
-            raise StructureError(f"accuracy={self.accuracy!r}: it must be a number between 0 and 1")
-        if self.time_limit is not None and (not _is_number(self.time_limit) or not self.time_limit > 0):
-            raise StructureError(f"time_limit={self.time_limit!r}: it must be a positive number of seconds")
+        if not is_number(self.accuracy) or not 0 < self.accuracy < 1:
+            raise StructureError(f"accuracy={shown(self.accuracy)}: it must be a number between 0 and 1")
+        if self.time_limit is not None and (not is_number(self.time_limit) or not self.time_limit > 0):
+            raise StructureError(f"time_limit={shown(self.time_limit)}: it must be a positive number of seconds")
 
 
 @dataclass(frozen=True)

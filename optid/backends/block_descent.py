@@ -6,10 +6,10 @@ the optimality conditions. The iteration stops by the duality gap, whose dual po
 """
 
 import numpy as np
-from numba import njit
 
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Minimum, Settings
+from optid.kernel_cache import cached_njit
 from optid.program.program import Program
 from optid.program.solution import Status, tolerance
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
@@ -125,7 +125,7 @@ def _newton(gram: Array, pull: Array, edges: np.ndarray, levels: Array, a: Array
     return result
 
 
-@njit(cache=True)
+@cached_njit
 def _sweep(gram: np.ndarray, edges: np.ndarray, squares: np.ndarray, levels: np.ndarray, slope: np.ndarray,
            a: np.ndarray) -> None:
     """Minimise over one group at a time, in place: the coefficients a (q,) and the slope M'(r - M a) (q,).

@@ -3,7 +3,8 @@
 A solver's code is imported when it is first asked to solve something.
 """
 
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -56,40 +57,51 @@ WITHOUT_DUALS = {"scip"}  # none for quadratic programmes, wrong ones for linear
 WARM = {"clarabel", "daqp", "osqp", "piqp", "proxqp", "scs"}
 
 
+@dataclass(frozen=True)
+class _Function:
+    """A function "module:name" and its first argument, if any; imported at the first call, or by who receives it."""
+
+    target: str
+    word: str = ""
+
+    def __call__(self, *arguments: Any) -> Answer:
+        module, _, name = self.target.partition(":")
+        return getattr(import_module(module), name)(*filter(None, [self.word]), *arguments)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        with suppress(ImportError):  # which the call says
+            import_module(self.target.partition(":")[0])  # before the time limit of another process begins
+
+
 def back_ends() -> list[BackEnd]:
     """Return all of them, installed or not."""
     return [
-        *(BackEnd(name, frozenset(classes.split()), partial(_run, "optid.backends.conic:solve_with", name),
+        *(BackEnd(name, frozenset(classes.split()), _Function("optid.backends.conic:solve_with", name),
                   installed=_is_installed(package), pip=pip, duals=name not in WITHOUT_DUALS,
                   warm=name in WARM, about="through CVXPY")
           for name, (classes, package, pip) in CONIC.items()),
-        *(BackEnd(name, frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.casadi:solve_with", name),
+        *(BackEnd(name, frozenset({"LP", "QP", "NLP"}), _Function("optid.backends.casadi:solve_with", name),
                   installed=_is_installed("casadi"), pip="casadi", warm=True,
                   about=f"interior point with exact Hessians, through CasADi; {more}")
           for name, more in (("ipopt", "large sparse programmes"), ("fatrop", "blind to infeasibility"))),
-        BackEnd("uno", frozenset({"LP", "QP", "NLP"}), partial(_run, "optid.backends.uno:run"),
+        BackEnd("uno", frozenset({"LP", "QP", "NLP"}), _Function("optid.backends.uno:run"),
                 installed=_is_installed("unopy") and _is_installed("sparsediffpy"), pip="unopy sparsediffpy", warm=True,
                 about="SQP through CVXPY's derivative engine; small dense programmes"),
-        BackEnd("lstsq", frozenset(), partial(_run, "optid.backends.lstsq:run"), structures=(LinearStructure,),
+        BackEnd("lstsq", frozenset(), _Function("optid.backends.lstsq:run"), structures=(LinearStructure,),
                 about="one factorisation, for least squares without products and constraints"),
-        BackEnd("gauss_newton", frozenset(), partial(_run, "optid.backends.gauss_newton:run"),
+        BackEnd("gauss_newton", frozenset(), _Function("optid.backends.gauss_newton:run"),
                 structures=(RankOneStructure,), warm=True, thorough={"starts": 32, "directions": 16, "descents": 12},
                 about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints"),
-        BackEnd("alternating", frozenset(), partial(_run, "optid.solving.alternating:run"),
+        BackEnd("alternating", frozenset(), _Function("optid.solving.alternating:run"),
                 structures=(RankOneStructure,), warm=True,
                 about="alternating convex half-steps for rank-one least squares, through any convex back end"),
-        BackEnd("admm", frozenset(), partial(_run, "optid.backends.admm:run"), structures=(NuclearNormStructure,),
+        BackEnd("admm", frozenset(), _Function("optid.backends.admm:run"), structures=(NuclearNormStructure,),
                 about="own ADMM for nuclear-norm subspace fits; stops by the duality gap"),
-        BackEnd("block_descent", frozenset(), partial(_run, "optid.backends.block_descent:run"),
+        BackEnd("block_descent", frozenset(), _Function("optid.backends.block_descent:run"),
                 structures=(GroupSparseStructure,), warm=True,
                 about="own active-set block descent for group-sparse programmes; stops by the duality gap"),
     ]
-
-
-def _run(target: str, *arguments: Any) -> Answer:
-    """Call the function "module:name", with a solver's word where one is given first."""
-    module, _, function = target.partition(":")
-    return getattr(import_module(module), function)(*arguments)
 
 
 def _is_installed(package: str) -> bool:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.arrays import shown
 from optid.bases.basis import Basis
 from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
@@ -135,12 +136,12 @@ def _one_each(given: Any, channels: Sequence[str], kind: str, ranges: Sequence[A
                              + (", None for an output that is not fed back" if feedback else ""))
     found: list[Basis | None] = []
     for channel, one, low, high in zip(channels, several, *ranges):
-        if feedback and (one is None or one == "none"):
+        if feedback and (one is None or isinstance(one, str) and one == "none"):
             found.append(None)
             continue
         family = parse(one) if isinstance(one, str) else one
         if not isinstance(family, Basis):
-            raise StructureError(f"the {feedback}basis of {kind} {channel!r} is {one!r}: give one such as "
+            raise StructureError(f"the {feedback}basis of {kind} {channel!r} is {shown(one)}: give one such as "
                                  "Triangular(10) or its name, 'triangular:10'")
         if low != low:
             raise DataError(f"{kind} {channel!r} has no sample at all; choose another column or drop the {kind}")

@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperCommand, TyperGroup
 
+from optid.cli.encoding import readable_output
 from optid.errors import DataWarning, InfeasibleError, OptidError, SolverFailed, SolverMissing, UnboundedError
 
 PATIENCE = 2.0  # seconds of silence before progress is shown
@@ -47,6 +48,11 @@ class Command(TyperCommand):
 
 class Group(TyperGroup):
     """The commands; `--debug` may come anywhere."""
+
+    def main(self, *args: Any, **settings: Any) -> Any:
+        """Run the commands; the output needs no character that its encoding lacks."""
+        with readable_output():
+            return super().main(*args, **settings)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse, after `--debug` has been moved in front of the command."""

@@ -1,14 +1,16 @@
 """Channels: names, units, statistics, and the transform to raw units."""
 
+import unicodedata
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from optid.errors import DataError
+from optid.errors import DataError, OptidError
 
+TURNS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}  # characters that turn the direction of text
 MOST_LEVELS = 1000  # largest number of distinct values that is counted; above it a channel is continuous
 
 
@@ -148,7 +150,7 @@ def channel_fields(
     Names are "u" and "y" when not given, numbered from 1 when there are several; units are "".
 
     Raises:
-        DataError: wrong number of names or units, an empty name, or one name for two channels.
+        DataError: wrong number of names or units, an empty name, one name for two channels, or as of `check_texts`.
     """
     found: dict[str, tuple[str, ...]] = {}
     for kind, letter, count, given, units in (
@@ -161,11 +163,24 @@ def channel_fields(
             raise DataError(f"{kind}_units {units}: must be one unit for each of the {count} channels.")
         found[f"{kind}s"] = numbered_names(letter, count) if names is None else tuple(names)
         found[f"{kind}_units"] = tuple(str(unit) for unit in units)
+        check_texts(f"the name of an {kind}", found[f"{kind}s"])
+        check_texts(f"the unit of an {kind}", found[f"{kind}_units"])
     everything = found["inputs"] + found["outputs"]
     for name, count in Counter(everything).items():
         if count > 1:
             raise DataError(f"two channels are named {name!r}; give every channel a name of its own.")
     return found
+
+
+def check_texts(what: str, texts: Iterable[str], error: type[OptidError] = DataError) -> None:
+    """Refuse names or units with control characters, which change what a terminal or an editor shows."""
+    for text in texts:
+        for character in text:
+            if unicodedata.category(character) in ("Cc", "Cs", "Zl", "Zp") or \
+                    unicodedata.bidirectional(character) in TURNS:
+                shown = text if len(text) <= 60 else f"{text[:60]}..."
+                raise error(f"{what} is {shown!r}, which contains the control character U+{ord(character):04X}: use "
+                            "printable characters.")
 
 
 def sampling_time(dt: Any) -> float:

@@ -1,12 +1,12 @@
 """Compiled recursions of faulty plants, and of the effect of faults on the innovations."""
 
 import numpy as np
-from numba import njit
 
+from optid.kernel_cache import cached_njit
 from optid.models.state_kernels import INSIDE, LEFT, REFUSED, value_and_slope
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, true_feedback, x, states, outputs):
     """Run a plant with faults.
 
@@ -65,7 +65,7 @@ def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, 
     return INSIDE, outputs.shape[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def respond(A, C, K, L, present, into_state, into_output, response):
     """Write the response of the innovations of the steady predictor to additions to state and output.
 
@@ -101,7 +101,7 @@ def respond(A, C, K, L, present, into_state, into_output, response):
                 x[i, p] = later[i, p]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def add_product(M, v, out):
     """Add M v(k) to out(k) for every sample; the same digits for blocks of any length."""
     for k in range(v.shape[0]):
@@ -112,7 +112,7 @@ def add_product(M, v, out):
             out[k, i] += total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def predict(A, C, K, root, drive, y, direct, x, r):
     """Run the steady predictor; write states x (T + 1, n) from x[0] on and whitened innovations r (T, l)."""
     n, l = A.shape[0], C.shape[0]  # noqa: E741

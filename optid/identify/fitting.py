@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.annotations import check_values
 from optid.bases import Linear, fitted_bases
 from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
@@ -32,7 +33,7 @@ from optid.program.prices import Price, price_constraints, price_earlier_steps
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.progress import log
-from optid.registry import Rendered, check_arguments, defaults, formulation, named_constraint
+from optid.registry import Rendered, annotations, check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
 
 
@@ -292,10 +293,15 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     if built:
         arguments["constraints"] = built
     check_arguments(name, pose, arguments)
-    findings, words = [], {**defaults(pose), **arguments}
-    if isinstance(data, Data):
-        findings = examine(data, fitted_bases(data, words.get("basis", Linear())), words)
-    problem = pose(data, **arguments)
+    try:
+        findings = _examined(data, {**defaults(pose), **arguments})
+        problem = pose(data, **arguments)
+    except OptidError:
+        raise
+    except Exception:  # of a value that only the annotation refuses
+        check_values(arguments, annotations(pose))
+        raise
+    check_values(arguments, annotations(pose))
     settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate,
                 "prove": prove and not _stand_in(arguments),
                 **(solver_options or {})}
@@ -342,6 +348,12 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
               time.perf_counter() - started)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
                time.perf_counter() - started, {**settings, "solver": solver})
+
+
+def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:
+    """Return what the checks of a record in memory find, one sentence each."""
+    return [] if isinstance(data, Stream) else examine(
+        data, fitted_bases(data, arguments.get("basis", Linear())), arguments)
 
 
 def _in_raw_units(model: Any, data: Data | Stream) -> Any:

@@ -1,5 +1,6 @@
 """Models for other tools: SciPy, python-control, CasADi for predictive control, and C."""
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,10 @@ from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, LINEAR, USER, ta
 from optid.models.nonlinearity import Nonlinearity
 
 DROPPED = 1e-14  # leading coefficients of a numerator that SciPy takes for zero
+KEYWORDS = frozenset("""
+alignas alignof auto bool break case char const constexpr continue default do double else enum extern false float for
+goto if inline int long main nullptr register restrict return short signed sizeof static struct switch thread_local true
+typedef typeof union unsigned void volatile while""".split())  # of C99 to C23, without those that begin with "_"
 
 
 def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
@@ -115,8 +120,9 @@ def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
     """
     import casadi as ca
 
-    if not (name.isidentifier() and name.isascii()):
-        raise StructureError(f"name={name!r} cannot be the name of a C function: use letters, digits and underscores")
+    if not isinstance(name, str) or not re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in KEYWORDS:
+        raise StructureError(f"name={name!r} cannot begin the names of C functions: use letters, digits and single "
+                             "underscores, a letter first, and no word of the language")
     function = model.to_casadi()
     x, u = (ca.SX.sym(word, function.size1_in(i)) for i, word in enumerate("xu"))
     kernel = ca.Function(f"{name}_kernel", [x, u], list(function(x, u)))
@@ -126,7 +132,7 @@ def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
         ("u", model.inputs, model.input_units), ("y", model.outputs, model.output_units))
         for k, (channel, unit) in enumerate(zip(names, units))]
     lines = [model.title, *channels, *model.equation().splitlines(), model.sampling]
-    notes = "\n".join(f" * {line.replace('*/', '* /')}" for line in lines)
+    notes = "\n".join(f" * {_commented(line)}" for line in lines)
     up = name.upper()
     path = Path(path)
     path.write_text(f"""/*
@@ -137,7 +143,15 @@ def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
 #define {up}_OUTPUTS {model.l}
 #define {up}_DT {model.dt!r}
 
+#ifdef __GNUC__
+#pragma GCC diagnostic push
+#pragma GCC diagnostic ignored "-Wunused-parameter"
+#endif
 {code.dump()}
+#ifdef __GNUC__
+#pragma GCC diagnostic pop
+#endif
+
 /* Compute y (of {up}_OUTPUTS) from x and u (of {up}_STATES, {up}_INPUTS), and take x to the next sample. */
 void {name}_step(double *x, const double *u, double *y) {{
   const double *arg[{max(kernel.sz_arg(), 2)}] = {{x, u}};
@@ -149,6 +163,13 @@ void {name}_step(double *x, const double *u, double *y) {{
 }}
 """, encoding="utf-8")
     return path
+
+
+def _commented(line: str) -> str:
+    """Return a line that stays inside a C comment: no end, start, trigraph, continued line or hidden character."""
+    shown = "".join(c if c.isprintable() else f"(U+{ord(c):04X})" for c in line)
+    apart = re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", r"\g<0> ", shown)
+    return f"{apart}." if apart.rstrip().endswith("\\") else apart
 
 
 def state_space(model: Any) -> tuple[Array, Array, Array, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array, as_list, check_integer, one_of, one_or_all
-from optid.data.channels import Ports, Transform, interval_text, numbered_names
+from optid.data.channels import Ports, Transform, check_texts, interval_text, numbered_names
 from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError
@@ -76,6 +76,8 @@ class Model(Ports):
             units = tuple(getattr(self, f"{kind}_units")) or ("",) * len(names)
             if len(names) != count or len(units) != count:
                 raise StructureError(f"{len(names)} names and {len(units)} units for {count} {kind}s.")
+            check_texts(f"the name of an {kind}", map(str, names), StructureError)
+            check_texts(f"the unit of an {kind}", map(str, units), StructureError)
             fixed |= {f"{kind}s": names, f"{kind}_units": units}
         for name, value in fixed.items():
             object.__setattr__(self, name, value)

@@ -12,6 +12,7 @@ from scipy.linalg import expm
 from scipy.optimize import least_squares, root
 
 from optid.arrays import Array, finite
+from optid.data.channels import check_texts
 from optid.errors import DataError, StructureError
 from optid.models.experiments import Record, check_inputs, signal_units
 from optid.models.model import Model, frequency_response, impulse_response, static_solution
@@ -69,6 +70,7 @@ class PhysicalModel(Model):
                        for low, high in self.bounds)
         given = {"nonlinearities": (), "start": finite(self.start, "start"), "point": finite(self.point, "point"),
                  "parameters": {name: float(value) for name, value in self.parameters.items()}, "bounds": bounds}
+        check_texts("the name of a state or parameter", map(str, (*names["states"], *self.parameters)), StructureError)
         self._fix({**given, **names}, len(self.inputs), len(self.outputs))
 
     @property

@@ -29,9 +29,9 @@ WARMING = 10  # times the lags of a record that is begun with held samples, duri
 @cache
 def late_njit(function: Callable[..., Any]) -> Any:
     """Compile a function at its first use, so that a module with a kernel does not import numba."""
-    from numba import njit
+    from optid.kernel_cache import cached_njit
 
-    return njit(cache=True, nogil=True, error_model="numpy")(function)
+    return cached_njit(function)
 
 
 def lfilter(b: ArrayLike, a: ArrayLike, x: ArrayLike) -> Array:

@@ -12,14 +12,15 @@ of `optid.models.state_signals` and `optid.models.feedback_tables`. Compiled at 
 """
 
 import numpy as np
-from numba import njit
+
+from optid.kernel_cache import cached_njit
 
 # how a run ended: to the last sample, out of the range allowed, beyond the interval of a basis that refuses
 INSIDE, LEFT, REFUSED = 0, 1, 2
 FORGOTTEN = 1e-150  # derivatives of the state below this size count as zero
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def evaluate(kind, low, high, outside, cells, angular, numbers, v):
     """Return (f(v), f'(v), whether v was refused) of a function: its entries of `Tables`."""
     slack = 1e-12 * max(abs(low), abs(high))
@@ -64,14 +65,14 @@ def evaluate(kind, low, high, outside, cells, angular, numbers, v):
     return value + slope * excess, 0.0 if frozen else slope, refused
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def value_and_slope(tables, j, v):
     """Return (f_j(v), f_j'(v), whether v was refused)."""
     return evaluate(tables.kind[j], tables.low[j], tables.high[j], tables.outside[j], tables.cells[j], tables.rate[j],
                     tables.numbers[j], v)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def slopes(tables, first, z, found):
     """Write the slopes (T, k) of the k functions of a table behind the first ones at arguments z (T, k)."""
     kind, low, high, outside, cells, rate, numbers = tables
@@ -82,7 +83,7 @@ def slopes(tables, first, z, found):
                 kind[c], low[c], high[c], outside[c], cells[c], rate[c], numbers[c], z[k, j])[1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def march(parts, stretch, x, outputs, states):
     """Run a model (`Parts`) over a `Stretch` and return how and at which sample the run ended.
 
@@ -138,10 +139,13 @@ def march(parts, stretch, x, outputs, states):
     return INSIDE, measured.shape[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def combine(weights, rows, into):
-    """Write sum_j weights[j] rows[j] of as many rows as there are weights; four at a time saves memory traffic."""
-    count, q = weights.size, into.size
+    """Write sum_j weights[j] rows[j] of as many rows as there are weights; four at a time saves memory traffic.
+
+    ``into`` may have further columns, which are left as they are.
+    """
+    count, q = weights.size, rows.shape[1]
     left = count % 4
     if left == 0:
         for p in range(q):
@@ -164,7 +168,7 @@ def combine(weights, rows, into):
             into[p] += a * rows[j, p] + b * rows[j + 1, p] + c * rows[j + 2, p] + d * rows[j + 3, p]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def sensitivities(parts, direct, signals, turn, jacobian):
     """Carry the derivative S of the state along a run (`Signals`) of a model (`Parts`), and leave it behind.
 
@@ -174,7 +178,7 @@ def sensitivities(parts, direct, signals, turn, jacobian):
         S(k+1) = A S + Ez H + (what theta changes in x(k+1) directly) + R J   where R is what comes back of the output.
 
     The direct changes are a `Direct`; the initial state has the first n columns. Written are ``turn`` S (n, q) and the
-    ``jacobian`` J (T, l, q).
+    ``jacobian`` J, the first q columns of (T, l, q or more).
     """
     n, l, q, latent = parts.A.shape[0], parts.C.shape[0], turn.shape[1], parts.Ez.shape[1]  # noqa: E741
     returned, bent, values = signals

@@ -1,14 +1,14 @@
 """Compiled recursions of the simulated plants: the next sample needs the last, so no array expression serves."""
 
 import numpy as np
-from numba import njit
 
 from optid.arrays import Array
+from optid.kernel_cache import cached_njit
 
 PENDULUM, VAN_DER_POL, TANKS = 0, 1, 2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def _rates(plant: int, x: Array, drive: float, v: float, p: Array, out: Array) -> None:
     """Write the time derivative of the state; p as `ReactionWheelPendulum.coefficients`, (eps,), or of the tanks."""
     if plant == PENDULUM:  # angle, rate, wheel speed, driven by a torque
@@ -26,7 +26,7 @@ def _rates(plant: int, x: Array, drive: float, v: float, p: Array, out: Array) -
         out[1] = drive - x[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array, dt: float, substeps: int,
               stages: int) -> Array:
     """Return the states (N, n) of `PENDULUM`, `VAN_DER_POL` or `TANKS` at the sampling instants, from x0 (n,).
@@ -61,7 +61,7 @@ def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array,
     return states
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def with_feedback(a: Array, drive: Array, direct: Array, c: Array, e: Array, v: Array, x0: Array) -> Array:
     """Return the states (N, n) of a `FeedbackSystem`: x+ = A x + drive + E g(y), y = C x + direct + v, from x0 (n,).
 

@@ -9,6 +9,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
+from cvxpy.lin_ops.lin_utils import ID_COUNTER, get_id
 
 from optid.errors import StructureError, nearest
 from optid.program.compressed import Compressed
@@ -122,6 +123,17 @@ class Program:
             with suppress(ValueError):  # CVXPY takes no derived value that overflowed; the judgement has said so
                 self.assign(held)
         return vars(self)[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        stated = object.__new__(type(self))  # what this one need not be
+        vars(stated).update(vars(self))
+        _ = stated.objective  # which also assigns the values that are held for it
+        return {**{name: value for name, value in vars(stated).items() if name != "problem"},  # solvers keep more there
+                "_last_id": get_id()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        ID_COUNTER.count = max(ID_COUNTER.count, state.pop("_last_id"))  # CVXPY's next objects must have other ids
+        vars(self).update(state)
 
     @property
     def is_stated(self) -> bool:

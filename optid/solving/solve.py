@@ -1,6 +1,5 @@
 """Solve a programme: look the solver up, refuse what it cannot take, run it, judge its point, prove it."""
 
-import os
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,8 @@ from optid.backends.choice import choose, fallbacks, find
 from optid.certificate.convex import TANGENT, certify_convex
 from optid.certificate.infeasibility import satisfiable
 from optid.errors import SolverRefused, StructureError
-from optid.processes import run_forked
+from optid.packing import Unsendable
+from optid.processes import LONGEST, run_apart
 from optid.program.expressions import is_crash
 from optid.program.judging import judge, measure_violation
 from optid.program.program import Program, Values
@@ -24,6 +24,7 @@ from optid.structures.least_squares import rank_one_of
 Procedure = Generator[Program, Solution, Any]
 
 FALSE_CLAIM = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
+ENDLESS = LONGEST / 2  # seconds; a longer time limit, such as infinity, is none
 GRACE = 0.5  # seconds after its time limit at which a solver is killed
 UNUSABLE = (Status.FAILED, Status.LIMIT)
 OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
@@ -40,8 +41,9 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
         program: what to solve.
         solver: the back end's word, "auto", or a `BackEnd` (or plain ``run`` function) of your own.
         accuracy: requested relative accuracy, translated for each solver.
-        time_limit: seconds; implies a separate process, which is killed when it does not stop.
-        isolate: run in a separate process (default: only with a time limit), so that a crash is an outcome.
+        time_limit: seconds, infinity for none; implies a separate process, which is killed when it does not stop.
+        isolate: run in a separate process (default: only with a time limit), so that a crash is an outcome; back ends
+            of your own must then be importable.
         warm: start from the programme's ``start``.
         prove: ask the programme's certificate for a proof of global optimality.
         verbose: let the solver print.
@@ -67,6 +69,8 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     if refusal:
         raise SolverRefused(refusal)
     settings = Settings(accuracy, time_limit, warm, verbose, options)
+    if time_limit is not None and time_limit > ENDLESS:
+        settings, time_limit = replace(settings, time_limit=None), None
     separate = (time_limit is not None) if isolate is None else isolate
 
     def attempt(back_end: BackEnd, settings: Settings, chosen: str, spent: float = 0.0) -> Solution:
@@ -105,26 +109,34 @@ def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
 
 
 def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
-    """Run a back end from the programme's start, in a forked child where it is to be separate; every outcome counts."""
+    """Run a back end from the programme's start, in another process where it is to be separate; every outcome counts.
+
+    What only models and proofs need may stay here (`optid.packing.Absent`).
+    """
     program.clear_duals()
     if settings.warm and program.start:
         program.assign(program.start)
-    if not separate or not hasattr(os, "fork"):
+    if not separate:
         return _run(back_end, program, settings)
     clock = time.monotonic()
     try:
         limit = None if settings.time_limit is None else settings.time_limit + GRACE
-        return run_forked(_run, back_end, program, settings, seconds=limit)
+        return run_apart(_run, back_end, program, settings, seconds=limit, lenient=True)
     except TimeoutError:
         return Answer(Status.LIMIT, f"stopped after {time.monotonic() - clock:.1f} s: it did not keep its time limit")
     except ChildProcessError as death:
         return Answer(Status.FAILED, f"the solver's process died: {death}")
+    except Unsendable as refusal:
+        raise SolverRefused(f"a separate process for {back_end.name!r} is not possible: {refusal}; or use neither "
+                            "time_limit nor isolate") from refusal
 
 
 def _run(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
     """Run a back end; an exception of its own is an answer, too, also in a child."""
     try:
         return back_end.run(program, settings)
+    except Unsendable:
+        raise
     except StructureError as refusal:  # its message has the remedy for the user
         raise SolverRefused(str(refusal)) from refusal
     except BaseException as error:  # a solver that crashes is an outcome, not a traceback

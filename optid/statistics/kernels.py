@@ -5,17 +5,17 @@ the machine. Indices are unsigned: signed ones are tested for counting from the 
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.kernel_cache import cached_njit
 
 Indices = NDArray[np.int32]
 unsigned = np.uintp
 ONE = unsigned(1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def local_by_local(first: Indices, weights: Array, other: Indices, others: Array, start: int, stop: int, lag: int,
                    out: Array) -> None:
     """Add sum_t g(t) h(t - lag - d)^T to out[:, d, :] for samples start <= t < stop of two local families g and h.
@@ -46,7 +46,7 @@ def local_by_local(first: Indices, weights: Array, other: Indices, others: Array
                 s -= ONE
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: Array) -> None:
     """Add w(t) * flat[t * step : t * step + width] to the rows of out (functions, width) of a local family.
 
@@ -68,7 +68,7 @@ def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: 
                 out[row, d] += weight * flat[start + d]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def add_outer(columns: Indices, values: Array, scale: Array, gram: Array) -> None:
     """Add scale[k] * x_k x_k^T to the upper triangle of gram (n, n), x_k sparse: increasing columns (K, z), values."""
     for k in range(unsigned(columns.shape[0])):

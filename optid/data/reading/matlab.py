@@ -1,6 +1,5 @@
 """MAT files of versions 4 to 7.3, read in a child process: a damaged file may crash the library or exhaust memory."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -13,7 +12,7 @@ from optid.data.reading.clock import is_time_name
 from optid.data.reading.mat_contents import MatContents, read_contents
 from optid.data.reading.mat_tree import open_tree
 from optid.errors import DataError
-from optid.processes import run_forked
+from optid.processes import run_apart
 
 MAT = 'pip install "optid[mat]"'
 MEMORY, EXPANSION = 4 << 30, 32  # memory limit in bytes, or `EXPANSION` times the size of the file if that is more
@@ -26,12 +25,10 @@ def mat_contents(path: Path, names: Sequence[str] | None = None) -> MatContents:
     `DataError`: a damaged file, a link to another file, too much time or memory for its size, h5py is missing, no such
     name, or an experiment that lacks a variable that others have.
     """
-    if not hasattr(os, "fork"):
-        return _variables(path, names)
     size, damaged = path.stat().st_size, f"{path.name} is damaged, or not a MAT file"
     try:
-        return run_forked(_variables, path, names, quiet=True, seconds=SECONDS * (1 + size / PACE),
-                          memory=max(MEMORY, EXPANSION * size))
+        return run_apart(_variables, path, names, quiet=True, seconds=SECONDS * (1 + size / PACE),
+                         memory=max(MEMORY, EXPANSION * size))
     except TimeoutError:
         raise DataError(f"{damaged}: reading it took more than {SECONDS:g} s.") from None
     except ChildProcessError as death:

@@ -6,8 +6,8 @@ contiguous numbers; the onsets in use are the first ones of the ring.
 """
 
 import numpy as np
-from numba import njit
 
+from optid.kernel_cache import cached_njit
 from optid.models.state_kernels import value_and_slope
 
 LASTING, DRIFT, JUMP, DRIVEN = range(4)
@@ -17,7 +17,7 @@ DEPENDENT = 1e-9
 """A column with less than this share of its energy beside the columns before it counts as dependent."""
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def expand(functions, channels, signals, values):
     """Write functions (T, r) of signals (T, m), NaN where a signal is missing; return the sample refused or -1."""
     for k in range(signals.shape[0]):
@@ -32,7 +32,7 @@ def expand(functions, channels, signals, values):
     return -1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@cached_njit(fastmath={"contract", "reassoc", "nsz"})
 def accumulate(v, source, target, count):
     """Add v times the first entries of source to those of target."""
     if v != 0.0:
@@ -40,7 +40,7 @@ def accumulate(v, source, target, count):
             target[a] += v * source[a]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@cached_njit(fastmath={"contract", "reassoc", "nsz"})
 def search(matrices, parts, signals, r, limit, tabled, table, work, memory, found):
     """Search the windows that end with each of T samples, until one exceeds a limit; return the samples searched.
 

@@ -7,10 +7,11 @@ products of N onsets and D columns cost O(N^2 D^2 n).
 """
 
 import numpy as np
-from numba import njit
+
+from optid.kernel_cache import cached_njit
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def joint_energy(first, second, cosines, floor, work):
     """Return the energy that two subspaces explain together; -1 where the larger one contains the smaller one.
 
@@ -55,7 +56,7 @@ def joint_energy(first, second, cosines, floor, work):
     return energy if kept > 0 else -1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def search(tables, products, states, along, roots, tested, z, q, same, floor, best, onsets, alike):
     """Find the best pair of onsets for every pair of candidates; return the number of indistinguishable pairs.
 

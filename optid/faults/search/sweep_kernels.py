@@ -6,10 +6,11 @@ helper among those that last: an earlier drift is, from k on, a drift of onset k
 """
 
 import numpy as np
-from numba import njit
+
+from optid.kernel_cache import cached_njit
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+@cached_njit(fastmath={"contract", "reassoc", "nsz"})
 def correlate(tables, r, found):
     """Write the correlations (N, D) of a window (N, l) with all columns at all onsets, by one backward sweep."""
     of, F, C, W, h, e = tables.of, tables.F, tables.C, tables.W, tables.h, tables.e
@@ -50,7 +51,7 @@ def correlate(tables, r, found):
             costate[i] = later[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def clear(matrix):
     """Set a matrix to zero."""
     for i in range(matrix.shape[0]):
@@ -58,7 +59,7 @@ def clear(matrix):
             matrix[i, j] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def add(result, first, second):
     """Add first' second to a matrix."""
     for a in range(first.shape[0]):
@@ -67,7 +68,7 @@ def add(result, first, second):
                 result[i, j] += first[a, i] * second[a, j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def grams(tables, slots, products, states):
     """Products of the signatures of columns with the same onset, for all onsets, by one backward sweep.
 
@@ -141,7 +142,7 @@ def grams(tables, slots, products, states):
         add(M, F[t], moved)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def explained(tables, correlations, roots, statistic):
     """Write the energies (C, N) that the candidates explain at all onsets, from correlations (N, D) and their roots."""
     for c in range(tables.first.size):

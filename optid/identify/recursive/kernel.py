@@ -6,17 +6,17 @@ stays symmetric and positive definite, and P_0 = infinity is R = 0.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.kernel_cache import cached_njit
 
 FADED = 1e-120  # diagonal entry of R below which forgetting stops: a direction without excitation keeps its estimate
 NOTHING = 1e-250  # entries of R below this are set to zero: subnormal numbers are slow
 UNDETERMINED = 1e-12  # share of a column, or of a row, outside the span of those before that counts as rounding
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def rotate(root: Array, row: Array, first: int, last: int, fade: float) -> float:
     """Rotate a row (s,) into rows `first` to `last` - 1 of an upper triangular factor (s, s) after scaling by `fade`.
 
@@ -43,7 +43,7 @@ def rotate(root: Array, row: Array, first: int, last: int, fade: float) -> float
     return kept
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def absorb(
     root: Array, signals: Array, y: Array, source: NDArray[np.intp], lag: NDArray[np.intp], used: NDArray[np.bool_],
     weights: Array, forgetting: float, rows: int, innovations: Array, marks: NDArray[np.bool_], traced: Array,
@@ -92,7 +92,7 @@ def absorb(
     return rows
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def solve(root: Array, n: int, theta: Array) -> None:
     """Solve R theta = z for the estimate (n, l); NaN while a column depends on those before it."""
     theta[:] = np.nan

@@ -1,90 +1,83 @@
-"""Trials side by side: forked processes that work until the search is over or its time is."""
+"""Trials side by side, in processes that work until the search is over or its time is."""
 
-import multiprocessing
-import signal
 import time
-import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from typing import Any
 
-import numpy as np
+from optid.packing import Unsendable, pack
+from optid.processes import LONGEST, Worker, start_workers
 
 GRACE = 1.0  # seconds after a deadline, which work looks at itself
 
 
 class Pool:
-    """Runs a function of one argument in processes of their own; here where one is to do, or none can be forked.
+    """Runs a function of one argument in processes of their own, or here if one is enough or none can be used.
 
-    Processes are forked once, so that they know all that is known here, and load what they need once.
+    Attributes:
+        reason: why no other process can be used, "" otherwise.
     """
 
     def __init__(self, function: Callable[[Any], Any], count: int) -> None:
-        """Fork `count` processes."""
-        self._function, self._connections, self._children = function, list[Any](), list[Any]()
-        if count < 2 or "fork" not in multiprocessing.get_all_start_methods():
+        """Start `count` processes and send them the function."""
+        self._function, self._idle, self._busy, self.reason = function, list[Worker](), dict[Worker, int](), ""
+        if count < 2:
             return
-        context = multiprocessing.get_context("fork")
-        for _ in range(count):
-            ours, theirs = context.Pipe()
-            child = context.Process(target=_work, args=(theirs, function), daemon=True)
-            with warnings.catch_warnings():  # forking a process with threads is deprecated; they are not used there
-                warnings.simplefilter("ignore", DeprecationWarning)
-                child.start()
-            theirs.close()
-            self._connections.append(ours)
-            self._children.append(child)
+        try:
+            self._idle = start_workers(count, pack(function))
+        except (Unsendable, ChildProcessError) as error:
+            self.reason = str(error)
 
     def run(self, tasks: Sequence[Any], deadline: float, told: Callable[[Any], None]) -> list[Any]:
         """Return the results in the order of the tasks, None for those that time or a process did not last for.
 
-        The deadline is by `time.monotonic`; `told` is told every result as it comes.
+        The deadline is by `time.monotonic`; `told` is told every result as it comes. What the function raises is raised
+        here.
         """
         results: list[Any] = [None] * len(tasks)
-        if not self._connections:
+        if not self._idle:
             for i, task in enumerate(tasks):
                 if time.monotonic() < deadline:
                     results[i] = self._function(task)
                     told(results[i])
             return results
-        waiting, busy, idle = list(range(len(tasks)))[::-1], {}, list(self._connections)
-        while (waiting and idle) or busy:
-            while waiting and idle and time.monotonic() < deadline:
-                connection = idle.pop()
-                busy[connection] = waiting.pop()
-                connection.send(tasks[busy[connection]])
-            if not busy:
+        waiting = list(range(len(tasks)))[::-1]
+        while (waiting and self._idle) or self._busy:
+            while waiting and self._idle and time.monotonic() < deadline:
+                worker, i = self._idle.pop(), waiting.pop()
+                self._busy[worker] = i
+                try:
+                    worker.request(None, pack((tasks[i],)))
+                    worker.wait_until_begun()
+                except ChildProcessError:
+                    self._drop(worker)
+            if not self._busy:
                 break
             left = max(deadline + GRACE - time.monotonic(), 0.0)
-            ready: list[Any] = wait(list(busy), None if left == np.inf else left)
+            by_connection = {worker.connection: worker for worker in self._busy}
+            ready: list[Any] = wait(list(by_connection), None if left > LONGEST else left)
             if not ready:
                 self.close()
                 break
-            for connection in ready:
-                i = busy.pop(connection)
+            for worker in map(by_connection.__getitem__, ready):
                 try:
-                    results[i] = connection.recv()
-                except EOFError:  # it died: the others go on
-                    self._connections.remove(connection)
+                    result = worker.receive()
+                except ChildProcessError:  # it died: the others go on
+                    self._drop(worker)
                     continue
-                idle.append(connection)
-                told(results[i])
+                i = self._busy.pop(worker)
+                self._idle.append(worker)
+                results[i] = result
+                told(result)
         return results
 
     def close(self) -> None:
-        """End the processes."""
-        for child in self._children:
-            child.kill()
-        for child in self._children:
-            child.join()
-        for connection in self._connections:  # fewer where a process died
-            connection.close()
-        self._connections, self._children = [], []
+        """End the processes that work, and keep the others for later use."""
+        while self._busy:
+            self._drop(next(iter(self._busy)))
+        while self._idle:
+            self._idle.pop().rest()
 
-
-def _work(connection: Connection, function: Callable[[Any], Any]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with suppress(EOFError):
-        while True:
-            connection.send(function(connection.recv()))
+    def _drop(self, worker: Worker) -> None:
+        del self._busy[worker]
+        worker.kill()

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import check_integer, one_of
+from optid.arrays import LARGEST, check_integer, is_number, one_of, shown
+from optid.backends.back_end import Settings
 from optid.data.record import Data, not_a_record
 from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
@@ -19,6 +20,7 @@ from optid.identify.search.ladder import CLEAR, EQUAL, KINDS, LINEAR, RUNGS, Lad
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, spared, tried
 from optid.identify.verdict import Verdict, verdict
+from optid.packing import Unsendable, pack
 from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
 
@@ -84,20 +86,22 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         constraints: as in `optid.fit`; every candidate satisfies them.
         solver: name of the back end, for every programme.
         accuracy: as in `optid.fit`.
-        workers: number of processes; None for one per available processor.
+        workers: number of processes; constraints must then be importable. None for one per available processor, or one
+            alone if something cannot be sent to others (see ``reasons``).
         progress: called with a sentence after every trial; default the log "optid" and a progress bar on a terminal.
 
     Raises:
         DataError: the record is not in memory.
         RankError: the record is too short for the blocks.
-        StructureError: invalid arguments.
+        StructureError: invalid arguments, or constraints that cannot be sent to `workers`.
         SolverFailed: no structure could be fitted; with the most frequent reason.
     """
     clock = time.monotonic()
     if not isinstance(data, Data):
         raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
-    if not budget > 0:
-        raise StructureError(f"budget is a number of seconds above 0; got {budget!r}")
+    if not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf:
+        raise StructureError(f"budget is a number of seconds above 0; got {shown(budget)}")
+    Settings(accuracy)  # every trial would refuse it
     for word in classes:
         one_of("classes", word, KINDS)
     possible = [kind for kind in KINDS if kind in classes and (kind == LINEAR or not few_levels(data))]
@@ -111,11 +115,11 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     ladder, stopped = Ladder.of(cut), ""
     end = clock + (1 - RESERVED) * budget
 
-    def attempt(task: tuple[Candidate, Trial | None, float]) -> Trial:
-        candidate, rival, deadline = task
-        return tried(candidate, cut, rival, {"solver": solver, "accuracy": accuracy}, rules, horizon, deadline)
-
-    pool = Pool(attempt, available_cores(workers, "workers"))
+    pool = Pool(partial(_attempt, cut, {"solver": solver, "accuracy": accuracy}, rules, horizon),
+                available_cores(workers, "workers"))
+    alone = pool.reason and (_unsendable(rules, solver) or pool.reason)
+    if alone and workers is not None:
+        raise StructureError(f"workers={workers!r}: {alone}, or use workers=1")
     with Clock("search", budget) if progress is None else nullcontext(progress) as told:
         try:
             if not _climb(ladder, possible, pool, FIRST * budget, end, partial(_told, ladder, told, clock, budget)):
@@ -133,6 +137,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     if len(possible) < len(classes):
         why.append("no input has more than five levels: static functions cannot be distinguished from straight lines, "
                    "and only linear models were tried")
+    if alone:
+        why.append(f"the search worked in one process: {alone}")
     return Identification(found, chosen, best, tuple(ladder.trials.values()), tuple(why), horizon, blocks,
                           stopped, time.monotonic() - clock)
 
@@ -166,6 +172,23 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: 
         except StopIteration:
             del rungs[kind]
     return True
+
+
+def _attempt(blocks: Blocks, settings: Mapping[str, Any], rules: Sequence[Any], horizon: int | None,
+             task: tuple[Candidate, Trial | None, float]) -> Trial:
+    """Try a candidate against a rival until a deadline."""
+    candidate, rival, deadline = task
+    return tried(candidate, blocks, rival, settings, rules, horizon, deadline)
+
+
+def _unsendable(rules: Sequence[Any], solver: Any) -> str:
+    """Return which constraint or solver cannot be sent to another process, and the remedy; "" if all can."""
+    for what, one in (*(("constraint", rule) for rule in rules), ("solver", solver)):
+        try:
+            pack(one)
+        except Unsendable as refusal:
+            return f"{what} {getattr(one, 'name', getattr(one, '__name__', repr(one)))!r}: {refusal}"
+    return ""
 
 
 def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from optid.arrays import Array, compact
 from optid.identify.subspace.imputation import clipping_range
+from optid.kernel_cache import cached_njit
 from optid.statistics.expansion import Expansion
 
 # points at which feedback functions are tabulated, which need not be exact, and samples expanded at a time
@@ -43,7 +43,7 @@ def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c
     return simulated
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def clipped_run(
     a: Array, c: Array, drive: Array, direct: Array, tables: Array, injection: Array, low: Array, high: Array,
     x: Array, out: Array) -> None:

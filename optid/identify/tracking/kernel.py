@@ -7,16 +7,16 @@ W + e g^T by the inverse square root of its Gram matrix I + |e|^2 g g^T, which k
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.identify.recursive.kernel import rotate
+from optid.kernel_cache import cached_njit
 
 WEAK = 1e-8  # relative pivot of the Gram matrix of the rows of W present below which the coordinates are undetermined
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def track(
     basis: Array, root: Array, sums: Array, counts: NDArray[np.int64], x: Array, forgetting: float, orthonormal: bool,
     residuals: Array,
@@ -83,7 +83,7 @@ def track(
                 basis[i, j] += step * g[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def _gain(root: Array, y: Array, g: Array) -> None:
     """Solve R^T R g = y; g may be y."""
     r = len(y)
@@ -99,7 +99,7 @@ def _gain(root: Array, y: Array, g: Array) -> None:
         g[i] = total / root[i, i] if root[i, i] > 0.0 else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@cached_njit
 def _solved(basis: Array, x: Array, factor: Array, y: Array) -> bool:
     """Replace y = W_p^T x_p by the least-squares coordinates (W_p^T W_p)^-1 y of the rows p present, if they exist."""
     n, r = basis.shape

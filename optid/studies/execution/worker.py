@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from optid.processes import limit_memory
+from optid.child import limit_memory
 from optid.studies.execution.machine import MB, resident_mb
 from optid.studies.storage.rows import ERROR, MEMORY_LIMIT
 
