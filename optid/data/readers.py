@@ -14,7 +14,7 @@ from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading import columns as known
 from optid.data.reading import long_tables
-from optid.data.reading.clock import Clock, clock_columns, clock_values, seconds
+from optid.data.reading.clock import TimeColumn, clock_columns, clock_values, seconds
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.rival_clocks import settle
@@ -106,7 +106,7 @@ class _Run:
     u: np.ndarray
     y: np.ndarray
     stamps: np.ndarray | None  # (N,)
-    clock: Clock | None
+    clock: TimeColumn | None
     units: Mapping[str, str]
     step: float | None  # sampling time that the source states
     findings: tuple[str, ...]
@@ -192,7 +192,7 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
 
 
 def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time: Any
-           ) -> tuple[Clock | None, np.ndarray | None, list[str]]:
+           ) -> tuple[TimeColumn | None, np.ndarray | None, list[str]]:
     """Return the clock of a table, its stamps and what is to be said of it."""
     if not clocks:
         return None, None, []
@@ -321,7 +321,7 @@ def _between(runs: list[_Run], how: Format, dt: float | None) -> list[_Run]:
     return kept
 
 
-def _instant(value: Any, name: str, stamps: np.ndarray, clock: Clock | None) -> Any:
+def _instant(value: Any, name: str, stamps: np.ndarray, clock: TimeColumn | None) -> Any:
     """Return an instant in the type of some stamps."""
     try:
         if isinstance(value, bool):

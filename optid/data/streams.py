@@ -11,7 +11,7 @@ import numpy as np
 from optid.arrays import check_integer
 from optid.data.channels import Ports, Transform, channel_fields, interval_text, sampling_time
 from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surveyed
-from optid.data.reading.clock import Clock, clock_columns, recognise
+from optid.data.reading.clock import TimeColumn, clock_columns, recognise
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.parts import Part
@@ -248,7 +248,7 @@ def _chosen(opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str
 
 
 def _clock_and_step(sources: Iterable[Any], columns: Sequence[str], how: Format, unit: str, dt: float | None
-                    ) -> tuple[Clock | None, float | None]:
+                    ) -> tuple[TimeColumn | None, float | None]:
     """Return the clock and the sampling time that the first source with two stamps shows; dt if given."""
     clock = None
     for one in sources:

@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import check_finite, check_integers
 from optid.data.channels import Transform
-from optid.data.reading.clock import Clock, seconds
+from optid.data.reading.clock import TimeColumn, seconds
 from optid.data.reading.columns import cell_error, to_numbers, without_marks
 from optid.data.reading.format import Format
 from optid.data.reading.uniform import uniform_step
@@ -36,7 +36,7 @@ class Channels:
 
     inputs: Mapping[str, str]  # {channel: column}
     outputs: Mapping[str, str]  # {channel: column}
-    clock: Clock | None  # how the time stamps are read, or None
+    clock: TimeColumn | None  # how the time stamps are read, or None
     step: float  # sampling time that the stamps are compared with
     how: Format = Format()  # how the source is written
     # in which the samples are given, raw = value * scale + offset; None for those of the source

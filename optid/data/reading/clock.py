@@ -50,7 +50,7 @@ class NoStamps(DataError):
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeColumn:
     """How the stamps of a record are read from its columns.
 
     Attributes:
@@ -220,7 +220,7 @@ def clock_columns(known: Sequence[str], time: Any, taken: Sequence[str], label: 
     return found
 
 
-def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str, unit: str = "") -> Clock:
+def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str, unit: str = "") -> TimeColumn:
     """Return the clock that some samples of one column show, or of a date and a time of day.
 
     Args:
@@ -237,7 +237,7 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     where = f"{label}, column {name!r}"
     head = np.ravel(block[name][:2000])
     if head.dtype.kind in "Mm":
-        return Clock((name,), "ready", how)
+        return TimeColumn((name,), "ready", how)
     if head.dtype.kind in "UO":
         cells = ["" if cell is None else str(cell) for cell in head.tolist()]
         values, row = to_numbers(cells, how)
@@ -253,7 +253,7 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     return _of_numbers(values, name, how, unit, where)
 
 
-def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str) -> Clock:
+def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str) -> TimeColumn:
     forms = []
     for name in columns:
         cells = np.ravel(block[name][:200]).astype(str)
@@ -281,33 +281,33 @@ def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     finding = f"clock {columns[0]!r}: dates with an offset, shown in UTC" if "%z" in forms[0] else ""
     if forms[-1] in ("%H:%M", "%M:%S"):
         finding = f"clock {columns[-1]!r}: read as {'hours:minutes' if forms[-1] == '%H:%M' else 'minutes:seconds'}"
-    return Clock(tuple(columns), "dates" if dated else "times of day", how, forms=tuple(forms), finding=finding)
+    return TimeColumn(tuple(columns), "dates" if dated else "times of day", how, forms=tuple(forms), finding=finding)
 
 
-def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str, where: str) -> Clock:
+def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str, where: str) -> TimeColumn:
     """Return the clock of numbers: a count of time, or dates in digits where the user says so."""
     if how.date_format and how.date_format not in COUNTS:
-        return Clock((name,), "digits", how, forms=(how.date_format,))
+        return TimeColumn((name,), "digits", how, forms=(how.date_format,))
     base, word = _parts(name)
     stated = _UNIT_WORDS.get(unit.strip().lower().strip("[]()"), "")
     if word and stated and word != stated:
         raise DataError(f"{where}: its name says {word}, its unit {stated}. Correct one, or pass time=False and dt=.")
     finite = values[np.isfinite(values.astype(float))]
     if not finite.size:
-        return Clock((name,), "numbers", how)
+        return TimeColumn((name,), "numbers", how)
     since = _SINCE.fullmatch(unit.strip().lower())
     if since and since[1] in _UNIT_WORDS:
         scale = UNITS[_UNIT_WORDS[since[1]]]
         start = dates.instant(since[2])
         if start is not None:
-            return Clock((name,), "numbers", how, scale, -start / scale, finding=f"clock {name!r}: {unit}")
+            return TimeColumn((name,), "numbers", how, scale, -start / scale, finding=f"clock {name!r}: {unit}")
     unknown = _unknown_unit(name)
     base = "mjd" if unknown.lower() == "mjd" else _plain(base)
     found = meaning(finite, name, base, word or stated, how.date_format, where)
     finding = found.finding
     if not finding and unknown and not stated:
         finding = f"clock {name!r}: the unit {unknown!r} is not known; read as seconds"
-    return Clock((name,), "numbers", how, found.scale, found.origin, finding=finding)
+    return TimeColumn((name,), "numbers", how, found.scale, found.origin, finding=finding)
 
 
 def _unknown_unit(name: str) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 
 from optid.data.reading.columns import cell_error, to_numbers
 from optid.data.reading.format import Format
-from optid.data.reading.layout import BLANKS, Layout, find_layout
+from optid.data.reading.layout import BLANKS, TextLayout, find_layout
 from optid.data.reading.textfile import clean, opened
 from optid.errors import DataError
 
@@ -41,7 +41,7 @@ class CsvFile:
     """A text table whose columns have names."""
 
     path: Path  # the file
-    layout: Layout  # where its samples are
+    layout: TextLayout  # where its samples are
 
     @property
     def names(self) -> list[str]:

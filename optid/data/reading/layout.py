@@ -36,7 +36,7 @@ _COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True)
-class Layout:
+class TextLayout:
     """Where the samples of a text table are, and how its cells are written."""
 
     names: list[str]  # one name a column, "" for one without a name
@@ -61,7 +61,7 @@ class _Row(NamedTuple):
     end: int  # characters before the next row
 
 
-def find_layout(path: Path, how: Format) -> Layout:
+def find_layout(path: Path, how: Format) -> TextLayout:
     """Find the layout of a text table; errors name the line, and what to type.
 
     Raises:
@@ -173,7 +173,7 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
 
 
 def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], where: str, lines: Sequence[str]
-            ) -> Layout:
+            ) -> TextLayout:
     """Return the layout of rows, of which the first may be a header and the next ones units and descriptions."""
     head, findings = rows[0], []
     cells = [cell.strip() for cell in head.cells]
@@ -227,7 +227,7 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
     columns = dict(zip(names, zip(*samples)))
     dated = tuple(name for name, column in columns.items() if (one := _first(column, how)) and dates.is_date(one))
     _propose(columns, dated, how, needed)
-    return Layout(names, how, rows[len(texts)].end, {name: unit.strip() for name, unit in units.items()},
+    return TextLayout(names, how, rows[len(texts)].end, {name: unit.strip() for name, unit in units.items()},
                   len(texts), dated, hints=clock_hints(columns), findings=tuple(findings))
 
 
@@ -315,7 +315,7 @@ def _propose(columns: dict[str, tuple[str, ...]], dated: Sequence[str], how: For
         needed["missing"] = ",".join(words)
 
 
-def _advice(found: Layout, needed: dict[str, Any]) -> str:
+def _advice(found: TextLayout, needed: dict[str, Any]) -> str:
     """Return the words to type as text; a format of dates that may be another one with it."""
     forms = needed.get("date_format")
     others = call({word: value for word, value in needed.items() if word != "date_format"})

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from optid.data.reading.clock import Clock, NoStamps, recognise, seconds
+from optid.data.reading.clock import NoStamps, TimeColumn, recognise, seconds
 from optid.data.reading.sources import Table
 from optid.errors import DataError
 
@@ -13,7 +13,7 @@ AGREEMENT = 1e-3  # share of the span by which two clocks may differ, beyond one
 
 
 def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: bool
-           ) -> tuple[Clock | None, np.ndarray | None, list[str]]:
+           ) -> tuple[TimeColumn | None, np.ndarray | None, list[str]]:
     """Return the clock that some columns hold, its stamps (N,), and findings.
 
     Args:
@@ -25,7 +25,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     Raises:
         DataError: the only column, or one that the user named, holds no stamps; or two clocks disagree.
     """
-    clocks: list[Clock] = []
+    clocks: list[TimeColumn] = []
     refused: dict[str, NoStamps] = {}
     for name in names:
         try:
@@ -56,8 +56,8 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     return clock, stamps, [clock.finding] * bool(clock.finding) + said
 
 
-def _paired(found: list[tuple[Clock, np.ndarray]], block: Mapping[str, Any], table: Table
-            ) -> list[tuple[Clock, np.ndarray]]:
+def _paired(found: list[tuple[TimeColumn, np.ndarray]], block: Mapping[str, Any], table: Table
+            ) -> list[tuple[TimeColumn, np.ndarray]]:
     """Join a column of dates without a time of day, and one of times of day."""
     hours = [one for one in found if one[0].kind == "times of day" or (one[1].dtype.kind == "m" and (
         one[1] < np.timedelta64(1, "D")).all() and one[0].kind == "ready")]
@@ -67,10 +67,10 @@ def _paired(found: list[tuple[Clock, np.ndarray]], block: Mapping[str, Any], tab
         return [(clock, _unwrapped(stamps) if clock.kind == "times of day" else stamps) for clock, stamps in found]
     (day, dates), (hour, of_day) = days[0], hours[0]
     if day.kind == "ready":
-        clock = Clock((day.columns[0],), "ready", table.how)
+        clock = TimeColumn((day.columns[0],), "ready", table.how)
         stamps = dates + of_day
     else:
-        clock = Clock((day.columns[0], hour.columns[0]), "dates", table.how, forms=(day.forms[0], hour.forms[0]))
+        clock = TimeColumn((day.columns[0], hour.columns[0]), "dates", table.how, forms=(day.forms[0], hour.forms[0]))
         stamps = clock.stamps(block, table.label)
     return [(clock, stamps), *(one for one in found if one not in (days[0], hours[0]))]
 
@@ -99,6 +99,6 @@ def _resolution(t: np.ndarray) -> float:
     return float(np.max(steps)) if np.mean(steps == 0) > 0.2 else 0.01 * float(np.median(steps))
 
 
-def _told(clock: Clock, stamps: np.ndarray) -> str:
+def _told(clock: TimeColumn, stamps: np.ndarray) -> str:
     step = float(np.median(seconds(np.diff(stamps))))
     return f"{clock.columns[0]!r} steps by {step:.6g} s from {stamps[0]}"

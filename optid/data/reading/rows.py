@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.data.reading import dates
-from optid.data.reading.clock import Clock, clock_columns, recognise, seconds
+from optid.data.reading.clock import TimeColumn, clock_columns, recognise, seconds
 from optid.data.reading.columns import choose, to_numbers
 from optid.data.reading.format import Format, is_number
 from optid.errors import DataError
@@ -76,7 +76,7 @@ class RowReader:
         self._time, self._delimiter = time, how.delimiter or ","
         self._names: list[str] | None = None
         self._headed = how.columns is None
-        self._reads: Clock | None = None
+        self._reads: TimeColumn | None = None
         self.begin_file()
         if how.columns is not None:
             self._known([str(name) for name in how.columns])
