@@ -250,7 +250,7 @@ SECONDS = [f"06:07:{k:02d}" for k in range(9)]
     (lines(["2024-03-05 00:00:02", "2024-03-05 00:00:01", "2024-03-05 00:00:00"]), {}, 1.0, "turned round"),
     (lines([f'"Mar 05, 2024 {one} AM"' for one in SECONDS]), {}, 1.0, ""),
     (lines([f"{0.05 * k:.2f}" for k in range(9)], "x-axis,u,y"), {}, 1.0, "pass time='x-axis' if it is the clock"),
-    ("t,u,y\n(ms),(V),(mV)\n\n0,1,2\n1,2,3\n2,3,4\n", {}, 0.001, "read as units: t ms, u V, y mV"),
+    ("t,u,y\n(ms),(V),(mV)\n\n0,1,2\n1,2,3\n2,3,4\n", {}, 0.001, "units t ms, u V, y mV"),
     ('t,u,y\n0,"57,5",1\n1,"57,5",2\n', {"decimal": ","}, 1.0, ""),
     ("t,u,y,Status\n0,1,2,192\n1,2,3,216\n2,3,4,0\n", {}, 1.0, "Pass quality='Status:192|216'"),
 ])

@@ -220,9 +220,9 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
         texts = rows[1 : how.units_row + 1]
     if texts and how.units_row is None:
         shown = ", ".join(f"{name} {unit}" for name, unit in units.items() if unit)
-        numbers = " and ".join(str(k + 1) for k in range(len(texts)))
-        rest = f"read as units: {shown}" if shown else "skipped as descriptions"
-        findings.append(f"after the header, without numbers: row{'s' if len(texts) > 1 else ''} {numbers}, {rest}")
+        skipped = f"{len(texts) - bool(shown)} row{'s' if len(texts) - bool(shown) > 1 else ''} of descriptions skipped"
+        findings.append("after the header: " + "; ".join(
+            part for part in (f"units {shown}" if shown else "", skipped if len(texts) > bool(shown) else "") if part))
     samples = [row.cells for row in rows[1 + len(texts) :] if len(row.cells) == len(names)]
     columns = dict(zip(names, zip(*samples)))
     dated = tuple(name for name, column in columns.items() if (one := _first(column, how)) and dates.is_date(one))
