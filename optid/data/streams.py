@@ -183,7 +183,7 @@ def open_stream(  # noqa: D417 - the others stand with `read`
             collections. They must see files under the same path, and run the same versions. The result of a fit is the
             same to the last digit on any number of workers, and on this machine when it reads the same parts. A fit
             makes two passes: `persist` a Dask collection that is costly to compute.
-        words: fields of `Format`; those that repair (gaps, resample, quality, from_, to) need the record in memory.
+        words: fields of `Format`; those that repair (gaps, resample, quality, ``from_``, to) need the record in memory.
 
     Raises:
         DataError: as `read`, here or when the chunk is reached.
