@@ -136,6 +136,10 @@ def test_daily_files_continue_each_other(tmp_path):
     turned = optid.read(paths[::-1])
     np.testing.assert_array_equal(turned.y, whole.y)
     assert "in the order of their dates" in turned.findings[0]
+    frames = [pd.read_csv(path) for path in paths]  # without names of their own
+    np.testing.assert_array_equal(optid.read(frames[::-1]).y, whole.y)
+    twice = optid.read([frames[0], frames[0]])
+    assert twice.n_experiments == 2 and "overlaps" in twice.findings[0]
     apart = optid.read([paths[0], paths[2]])
     assert [e.n_samples for e in apart.experiments] == [13, 13] and not apart.findings
     filled = optid.read([paths[0], paths[2]], gaps="missing")

@@ -3,8 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +17,8 @@ from optid.data.reading.clock import TimeColumn, clock_columns, clock_values, se
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.rival_clocks import settle
+from optid.data.reading.runs import RawRun, cut_between, join_continued, sample_evenly
 from optid.data.reading.sources import Table, open_tables
-from optid.data.reading.uniform import agreed_step, regular
 from optid.data.record import Data, Experiment
 from optid.data.streams import Stream, open_stream
 from optid.errors import DataError
@@ -67,7 +66,7 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     sources = list(source) if isinstance(source, list | tuple) else [source]
     if not sources:
         raise DataError("the list of sources is empty; give at least one.")
-    runs: list[_Run] = []
+    runs: list[RawRun] = []
     for item in sources:
         runs += _runs_of(open_tables(item, how), inputs, outputs, time, experiment)
     for run in runs:
@@ -78,9 +77,9 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
                 raise DataError(f"{run.label} has channel {channel!r} in {run.units[channel]}, {runs[0].label} in "
                                 f"{runs[0].units[channel]}. Convert one file, or give the units, input_units= and "
                                 "output_units=.")
-    runs, joined = _continued(runs, how) if experiment is None and len(sources) > 1 else (runs, [])
-    runs = _between(runs, how, dt)
-    experiments, step, findings = _sampled(runs, how, dt)
+    runs, joined = join_continued(runs, how) if experiment is None and len(sources) > 1 else (runs, [])
+    runs = cut_between(runs, how, dt)
+    pieces, step, findings = sample_evenly(runs, how, dt)
     dated = all(run.is_dated for run in runs)
     notes = [*(note for run in runs for note in run.findings), *joined, *findings]
     if step is None:
@@ -89,7 +88,8 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     first = sources[0]
     units = runs[0].units
     return Data.of_experiments(
-        experiments, 1.0 if step is None else step, *runs[0].names,
+        [Experiment(piece.u, piece.y, float(seconds(np.atleast_1d(piece.stamp))[0])) for piece in pieces],
+        1.0 if step is None else step, *runs[0].names,
         how.input_units or [units.get(one, "") for one in runs[0].names[0]],
         how.output_units or [units.get(one, "") for one in runs[0].names[1]],
         name if name is not None else Path(first).stem if isinstance(first, str | Path) else "",
@@ -97,33 +97,7 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     )
 
 
-@dataclass(frozen=True)
-class _Run:
-    """One experiment of one source."""
-
-    label: str
-    names: tuple[tuple[str, ...], tuple[str, ...]]  # of inputs and outputs
-    u: np.ndarray
-    y: np.ndarray
-    stamps: np.ndarray | None  # (N,)
-    clock: TimeColumn | None
-    units: Mapping[str, str]
-    step: float | None  # sampling time that the source states
-    findings: tuple[str, ...]
-
-    @property
-    def has_offset(self) -> bool:
-        return self.clock is not None and any("%z" in form for form in self.clock.forms)
-
-    @property
-    def is_dated(self) -> bool:
-        return self.stamps is not None and self.stamps.dtype.kind == "M"
-
-    def part(self, rows: Any) -> "_Run":
-        return replace(self, u=self.u[rows], y=self.y[rows], stamps=None if self.stamps is None else self.stamps[rows])
-
-
-def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any, experiment: Any) -> list[_Run]:
+def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any, experiment: Any) -> list[RawRun]:
     """Return the experiments of a source; of several tables those that have all channels."""
     if len(tables) == 1:
         return _runs(tables[0], inputs, outputs, time, experiment)
@@ -140,7 +114,7 @@ def _runs_of(tables: Sequence[Table], inputs: Wanted, outputs: Wanted, time: Any
     return [run for table in whole for run in _runs(table, inputs, outputs, time, experiment)]
 
 
-def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: str | int | None) -> list[_Run]:
+def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: str | int | None) -> list[RawRun]:
     label, how = table.label, table.how
     inputs = table.inputs if inputs is None else inputs
     outputs = table.outputs if outputs is None else outputs
@@ -181,7 +155,7 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
     if not how.numbers:
         findings += known.likely_marks({**dict(zip(u_names, u.T)), **dict(zip(y_names, y.T))})
     units = {name: table.units.get(column, "") for name, column in (ins | outs).items()}
-    whole = _Run(label, (u_names, y_names), u, y, stamps, clock, units, table.step, tuple(findings))
+    whole = RawRun(label, (u_names, y_names), u, y, stamps, clock, units, table.step, tuple(findings))
     runs = []
     for value, rows in _groups(groups, len(u), label):
         part = replace(whole.part(rows), label=label if value is None else f"{label}, experiment {value!r}")
@@ -257,118 +231,3 @@ def _groups(values: np.ndarray | None, rows: int, label: str) -> list[tuple[Any,
                             "experiment, or give the second run a value of its own.")
         seen.add(value)
     return [(value, slice(a, b)) for value, a, b in zip(labels, starts, [*starts[1:], rows])]
-
-
-# -- from runs to experiments
-
-
-def _continued(runs: list[_Run], how: Format) -> tuple[list[_Run], list[str]]:
-    """Join runs whose clock continues that of the run before; with `gaps` or `resample` also those behind a gap."""
-    findings = []
-    if all(run.is_dated for run in runs):
-        ordered = sorted(runs, key=lambda run: run.stamps[0])  # type: ignore[index]
-        findings = ["the files are taken in the order of their dates"] * (ordered != runs)
-        runs = ordered
-    found = [runs[0]]
-    for run in runs[1:]:
-        last = found[-1]
-        if last.stamps is not None and run.stamps is not None and last.is_dated and run.is_dated and (
-                run.stamps[0] <= last.stamps[-1]):
-            findings.append(f"{run.label} overlaps {last.label.rpartition(' + ')[2]} in time")
-        if _follows(last, run, how):
-            findings.append(f"{run.label} continues {last.label.rpartition(' + ')[2]}")
-            assert last.stamps is not None and run.stamps is not None
-            found[-1] = replace(last, label=f"{last.label} + {run.label}", u=np.vstack([last.u, run.u]),
-                                y=np.vstack([last.y, run.y]), stamps=np.concatenate([last.stamps, run.stamps]),
-                                findings=tuple(dict.fromkeys([*last.findings, *run.findings])))
-        else:
-            found.append(run)
-    if len(findings) > 3:
-        findings = [f"{len(findings)} files continue the one before"]
-    return found, findings
-
-
-def _follows(last: _Run, run: _Run, how: Format) -> bool:
-    if last.stamps is None or run.stamps is None or last.stamps.dtype != run.stamps.dtype or last.stamps.size < 2:
-        return False
-    if last.has_offset != run.has_offset:
-        return False
-    border = float(seconds(run.stamps[:1] - last.stamps[-1:])[0])
-    median = float(np.median(seconds(np.diff(last.stamps))))
-    if how.gaps is not None or how.resample is not None:
-        return border > 0
-    return median > 0 and abs(border - median) <= how.time_tolerance * median
-
-
-def _between(runs: list[_Run], how: Format, dt: float | None) -> list[_Run]:
-    """Return the samples from the instant `from_` to the instant `to`."""
-    if how.from_ is None and how.to is None:
-        return runs
-    kept = []
-    for run in runs:
-        stamps = run.stamps if run.stamps is not None else (dt or 1.0) * np.arange(len(run.u))
-        inside = np.ones(len(run.u), dtype=bool)
-        for name, value in (("from_", how.from_), ("to", how.to)):
-            if value is not None:
-                instant = _instant(value, name, stamps, run.clock)
-                inside &= stamps >= instant if name == "from_" else stamps <= instant
-        if inside.any():
-            kept.append(run.part(inside))
-    if not kept:
-        stamps = runs[0].stamps
-        span = "" if stamps is None else f"; {runs[0].label} has {stamps[0]} to {stamps[-1]}"
-        raise DataError(f"from_={how.from_!r}, to={how.to!r}: no sample lies between{span}.")
-    return kept
-
-
-def _instant(value: Any, name: str, stamps: np.ndarray, clock: TimeColumn | None) -> Any:
-    """Return an instant in the type of some stamps."""
-    try:
-        if isinstance(value, bool):
-            raise ValueError
-        if stamps.dtype.kind == "M":
-            date = np.datetime64(value).astype("M8[ns]") if not isinstance(value, str | datetime) else None
-            if date is None:
-                moment = value if isinstance(value, datetime) else datetime.fromisoformat(value.strip())
-                if moment.tzinfo is not None:
-                    return np.datetime64(moment.astimezone(UTC).replace(tzinfo=None), "ns")
-                date = np.datetime64(moment, "ns")
-            if clock is not None and clock.how.time_zone is not None:
-                from optid.data.reading.dates import to_utc
-
-                date = to_utc(np.array([date]), clock.how.time_zone, name)[0]
-            return date
-        number = float(value)
-        return np.timedelta64(round(number * 1e9), "ns") if stamps.dtype.kind == "m" else number
-    except (ValueError, TypeError, OverflowError):
-        kind = "a date such as '2024-05-01T12:00'" if stamps.dtype.kind == "M" else "a number of seconds"
-        raise DataError(f"{name}={value!r}: must be {kind}, as the clock has.") from None
-
-
-def _sampled(runs: Sequence[_Run], how: Format, dt: float | None
-             ) -> tuple[list[Experiment], float | None, list[str]]:
-    """Return the experiments of some runs, their sampling time and what was repaired."""
-    experiments: list[Experiment] = []
-    findings: list[str] = []
-    step = dt
-    for run in runs:
-        if run.stamps is None:
-            if run.step is not None:
-                step = agreed_step(run.step, step, how.time_tolerance, run.label)
-            if how.resample is not None or how.gaps is not None:
-                word = "resample" if how.resample is not None else "gaps"
-                raise DataError(f"{run.label} has no time column, which {word}= needs. Name it: time=.")
-            experiments.append(Experiment(run.u, run.y, 0.0))
-            continue
-        where = run.label if run.clock is None else f"{run.label}, column {run.clock.columns[0]!r}"
-        pieces, found, said = regular(run.stamps, run.u, run.y, dt, how, where)
-        findings += said
-        step = agreed_step(found, step, how.time_tolerance, run.label)
-        if dt is None and found and run.step and abs(found - run.step) > how.time_tolerance * run.step:
-            raise DataError(f"{run.label}: the time stamps step by {found:.6g} s, and the sampling time beside them is "
-                            f"{run.step:.6g} s. Pass the right one as dt.")
-        for piece in pieces:
-            for part in (piece.u, piece.y):
-                part.flags.writeable = False
-            experiments.append(Experiment(piece.u, piece.y, float(seconds(np.atleast_1d(piece.stamp))[0])))
-    return experiments, step, findings

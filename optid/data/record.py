@@ -11,7 +11,7 @@ from optid.arrays import as_list, as_records, frozen, one_or_all
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, interval_text, listed, sampling_time
 from optid.data.description import Description, instant
-from optid.data.timeline import Timeline
+from optid.data.timeline import Timeline, seconds_of, starts_of
 from optid.errors import DataError, nearest
 from optid.registry import render
 
@@ -94,7 +94,7 @@ class Data(Ports):
         ys = as_records(y, "y", listed(outputs))
         if len(us) != len(ys):
             raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
-        starts, dated = _starts(start, len(us))
+        starts, dated = starts_of(start, len(us))
         experiments = []
         for k, (ue, ye, s) in enumerate(zip(us, ys, np.broadcast_to(starts, len(us)))):
             try:
@@ -293,8 +293,8 @@ class Data(Ports):
                             "use decimate for every k-th sample, .u and .y for arrays.")
         asked, ends = part, [end for end in (part.start, part.stop) if end is not None]
         if self.dated:
-            ends = [_seconds_of(end) for end in ends]
-            part = slice(*(None if end is None else _seconds_of(end) for end in (part.start, part.stop)))
+            ends = [seconds_of(end) for end in ends]
+            part = slice(*(None if end is None else seconds_of(end) for end in (part.start, part.stop)))
         whole = all(isinstance(end, int | np.integer) and not isinstance(end, bool) for end in ends)
         if not whole and not all(isinstance(end, float | np.floating) and end == end for end in ends):
             raise DataError(f"data[{asked.start!r}:{asked.stop!r}]: two integers are samples, two floats are times.")
@@ -406,29 +406,6 @@ def _filled(data: Data, **values: Any) -> Data:
     for name, value in values.items():
         object.__setattr__(data, name, value)
     return data
-
-
-def _starts(start: Any, count: int) -> tuple[np.ndarray, bool]:
-    """Return the start of every experiment in seconds, and whether they are dates."""
-    try:
-        starts = np.atleast_1d(np.asarray(start))
-        dated = starts.dtype.kind in "MUO"
-        if dated:
-            starts = starts.astype("M8[us]").astype(np.int64) / 1e6
-        starts = starts.astype(float)
-    except (ValueError, TypeError):
-        starts, dated = np.array([np.nan]), False
-    if starts.shape not in ((1,), (count,)) or not (np.isfinite(starts) & (np.abs(starts) < 1e15)).all():
-        raise DataError(f"start = {start!r}: one finite time or date, or one for each of the {count} experiments.")
-    return starts, dated
-
-
-def _seconds_of(end: Any) -> Any:
-    """Return a date as seconds since 1970; other ends of a slice as they are."""
-    try:
-        return float(np.asarray(end).astype("M8[us]").astype(np.int64)) / 1e6 if not np.isreal(end) else end
-    except (ValueError, TypeError):
-        return end
 
 
 def _positions(wanted: str | Sequence[str] | None, known: tuple[str, ...], what: str) -> list[int]:

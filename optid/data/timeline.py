@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from optid.data.description import instant
+from optid.errors import DataError
 
 
 @dataclass(frozen=True)
@@ -47,3 +48,26 @@ class Timeline:
     def with_times(self, sentence: str) -> str:
         """Put the time beside every number of a sample in a sentence."""
         return re.sub(r"\bsample (\d+)", lambda found: self.sample_text(int(found[1])), sentence)
+
+
+def starts_of(start: Any, count: int) -> tuple[np.ndarray, bool]:
+    """Return the start of every experiment in seconds, and whether they are dates."""
+    try:
+        starts = np.atleast_1d(np.asarray(start))
+        dated = starts.dtype.kind in "MUO"
+        if dated:
+            starts = starts.astype("M8[us]").astype(np.int64) / 1e6
+        starts = starts.astype(float)
+    except (ValueError, TypeError):
+        starts, dated = np.array([np.nan]), False
+    if starts.shape not in ((1,), (count,)) or not (np.isfinite(starts) & (np.abs(starts) < 1e15)).all():
+        raise DataError(f"start = {start!r}: one finite time or date, or one for each of the {count} experiments.")
+    return starts, dated
+
+
+def seconds_of(end: Any) -> Any:
+    """Return a date as seconds since 1970; other ends of a slice as they are."""
+    try:
+        return float(np.asarray(end).astype("M8[us]").astype(np.int64)) / 1e6 if not np.isreal(end) else end
+    except (ValueError, TypeError):
+        return end
