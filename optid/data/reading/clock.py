@@ -112,6 +112,10 @@ class TimeColumn:
         if values.dtype.kind in "iu" and 1e-9 <= self.scale <= 1.0 and self.origin == round(self.origin):
             return ((values.astype(np.int64) - round(self.origin)) * round(self.scale * 1e9)).view("M8[ns]")
         lost = np.isnan(values)
+        bad = np.abs(np.where(lost, self.origin, values) - self.origin) * self.scale > dates.SECONDS
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise DataError(f"{where}, row {row + 1}: {values[row]:g} is outside the years 1678 to 2261.")
         nanoseconds = np.round((np.where(lost, self.origin, values) - self.origin) * (self.scale * 1e9) / 1000) * 1000
         stamps = nanoseconds.astype(np.int64).view("M8[ns]")
         stamps[lost] = np.datetime64("NaT")

@@ -104,9 +104,10 @@ def opened(path: Path, encoding: str | None) -> Iterator[TextFile]:
     with open(path, "rb", buffering=0) as file:
         try:
             yield TextFile(file, encoding)
-        except UnicodeDecodeError as error:
-            raise DataError(f"{path.name} is not {error.encoding} text ({error.reason}): save it as UTF-8, or pass its "
-                            "encoding='latin-1' or whatever it is.") from error
+        except UnicodeError as error:
+            kind = encoding or getattr(error, "encoding", "UTF-8")
+            raise DataError(f"{path.name} is not {kind} text ({getattr(error, 'reason', error)}): save it as UTF-8, or "
+                            "pass its encoding='latin-1' or whatever it is.") from error
 
 
 def clean(block: bytes, comment: str | None, blanks: bool) -> bytes:
