@@ -317,4 +317,5 @@ def test_impossible_instants_and_encodings_are_named(tmp_path):
     values = np.append(1714543200.0 + np.arange(N - 1), 1e300)
     refuses(DataError, rf"row {N}: 1e\+300 is outside the years", optid.read, {"time": values, "u": U, "y": Y})
     (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n1,2,3\n")
-    refuses(DataError, "r.csv is not utf-16 text.*encoding='latin-1'", optid.read, tmp_path / "r.csv", encoding="utf-16")
+    refuses(DataError, "r.csv is not utf-16 text.*encoding='latin-1'", optid.read, tmp_path / "r.csv",
+            encoding="utf-16")
