@@ -78,8 +78,9 @@ class Format:
     def __post_init__(self) -> None:
         for name in ("delimiter", "decimal", "thousands", "encoding", "comment", "date_format", "time_zone", "gaps"):
             value = getattr(self, name)
-            if not isinstance(value, str) and (value is not None or name == "decimal"):
-                raise DataError(f"{name}={value!r}: must be a text.")
+            given = value is not None or name == "decimal"
+            if given and (not isinstance(value, str) or not value):
+                raise DataError(f"{name}={value!r}: must be a text with at least one character.")
             if any("\ud800" <= sign <= "\udfff" for sign in value or ""):
                 raise DataError(f"{name}={value!r}: holds half a character.")
         for name in ("columns", "input_units", "output_units"):
