@@ -208,7 +208,7 @@ def trouble(seed: int, files: dict[str, list[Path]], folder: Path) -> str:
 
 def _run(words: list[str], text: io.StringIO) -> tuple[int, list[Any]]:
     with (warnings.catch_warnings(record=True) as heard, contextlib.redirect_stdout(text),
-          contextlib.redirect_stderr(text), limited(60)):
+          contextlib.redirect_stderr(text), limited(150)):
         warnings.simplefilter("always")
         try:
             typer.main.get_command(app).main(words, prog_name="optid")
