@@ -1,6 +1,5 @@
 """From files, frames and dictionaries to `Data`."""
 
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
@@ -13,7 +12,7 @@ from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading import columns as known
 from optid.data.reading import long_tables
-from optid.data.reading.clock import TimeColumn, clock_columns, clock_values, seconds
+from optid.data.reading.clock import TimeColumn, UnreadStamps, clock_columns, clock_values, seconds
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.rival_clocks import settle
@@ -171,13 +170,11 @@ def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time:
     if not clocks:
         return None, None, []
     try:
-        clock, stamps, said = settle(loaded, clocks, table, asked=time is not None and time is not True)
-    except DataError as error:
+        return settle(loaded, clocks, table, asked=time is not None and time is not True)
+    except UnreadStamps as error:
         if not table.advice:
             raise
-        cause = re.split(r" Pass | Name their format", str(error))[0]
-        raise DataError(f"{cause} Pass {table.advice}.") from None
-    return clock, stamps, said
+        raise DataError(f"{error.cause} Pass {table.advice}.") from None
 
 
 def _numeric(values: Any, column: str, table: Table) -> Any:

@@ -45,7 +45,17 @@ FEWEST_HINTS = 5  # cells from which a column may be a clock
 _BRACKETS = re.compile(r"(.*?)[ _]*[\[({<]([^\])}>]*)[\])}>]\s*")
 _SUFFIX = re.compile(r"(.*?)(?:[ _.]*/[ _]*| in |[ _.,-]+)([a-zµμ]+)")
 
-class NoStamps(DataError):
+
+class UnreadStamps(DataError):
+    """Stamps that need words of the user; what the layout of a file proposes may take the place of the remedy."""
+
+    def __init__(self, cause: str, remedy: str = "") -> None:
+        """Keep what is wrong apart from what to do."""
+        super().__init__(f"{cause} {remedy}".rstrip())
+        self.cause = cause
+
+
+class NoStamps(UnreadStamps):
     """A column named as a clock holds something else."""
 
 
@@ -83,8 +93,7 @@ class TimeColumn:
         values = np.ravel(block[self.columns[0]])
         if self.kind == "digits":
             width = len(datetime(2024, 1, 1).strftime(self.forms[0]))
-            texts = ["" if value != value else f"{value:0{width}.0f}" for value in values.astype(float).tolist()]
-            stamps = dates.parse(texts, self.forms[0], where)[0]
+            stamps = dates.parse(dates.spelled(values, width), self.forms[0], where)[0]
             return self._in_utc(stamps, where) if dates.has_day(self.forms[0]) else stamps.view("m8[ns]")
         if self.kind == "ready":
             stamps = dates.in_nanoseconds(values, where)
@@ -246,8 +255,8 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
         cells = ["" if cell is None else str(cell) for cell in head.tolist()]
         values, row = to_numbers(cells, how)
         if row is not None and row > len(cells) // 2:
-            raise NoStamps(f"{where}: row {row + 1} holds {cells[row]!r}, no number like the others. Remove the row, "
-                           "or pass time=False and dt=.")
+            raise NoStamps(f"{where}: row {row + 1} holds {cells[row]!r}, no number like the others.",
+                           "Remove the row, or pass time=False and dt=.")
         if row is not None or (how.date_format and how.date_format not in COUNTS):
             return _of_texts(block, columns, how, label)
     else:
@@ -274,12 +283,12 @@ def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
         if not found:
             odd = next((cell for cell in full if dates.formats(first) and not dates.formats(cell)), None)
             what = f"(first: {first!r})" if odd is None else f"(first: {first!r}; then {odd!r})"
-            raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as "
-                           "2024-05-01T12:00:00. Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to "
-                           "seconds, or pass time=False and dt=.")
+            raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as 2024-05-01T12:00:00.",
+                           "Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to seconds, or pass "
+                           "time=False and dt=.")
         if not given and not dates.is_unambiguous(found[0]):
-            raise DataError(f"{where}: the dates (first: {first!r}) do not begin with the year. Pass "
-                            f"{dates.choices(found)}.")
+            raise UnreadStamps(f"{where}: the dates (first: {first!r}) do not begin with the year.",
+                               f"Pass {dates.choices(found)}.")
         forms.append(found[0])
     dated = any(map(dates.has_day, forms))
     finding = f"clock {columns[0]!r}: dates with an offset, shown in UTC" if "%z" in forms[0] else ""
@@ -333,4 +342,3 @@ def _parts(name: str) -> tuple[str, str]:
 
 def _plain(name: str) -> str:
     return re.sub(r"[\s_.\-/]+", "", name.strip().lower())
-

@@ -34,7 +34,7 @@ def is_time_of_day(cell: str) -> bool:
 def formats(cell: str) -> list[str]:
     """Return the formats that a date or a time of day may have, in the notation of `strptime`; none for other text.
 
-    Two formats are one too many: day and month, or month and day.
+    Several formats mean that the order of day, month and year is ambiguous.
     """
     text = cell.strip()
     day = _DAY.match(text)
@@ -220,6 +220,15 @@ def instant(text: str) -> float | None:
     except ValueError:
         return None
     return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+
+
+def spelled(values: np.ndarray, width: int) -> Any:
+    """Return numbers (N,) as a series of texts with at least so many digits, NaN as missing."""
+    import polars as pl
+
+    lost = ~np.isfinite(values.astype(float))
+    series = pl.Series(np.where(lost, 0, values).astype(np.int64)).cast(pl.String).str.zfill(width)
+    return series if not lost.any() else pl.select(pl.when(pl.Series(lost)).then(None).otherwise(series)).to_series()
 
 
 def in_nanoseconds(values: np.ndarray, label: str) -> np.ndarray:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -70,7 +71,7 @@ class Format:
     time_zone: str | None = None
     time_tolerance: float = TIME_TOLERANCE
     gaps: str | None = None
-    resample: str | float | None = None
+    resample: Any = None
     quality: Any = None
     from_: Any = None
     to: Any = None
@@ -122,12 +123,12 @@ class Format:
         word = cell.strip().lower()
         return word in MISSING or word in self.marks
 
-    @property
+    @cached_property
     def marks(self) -> frozenset[str]:
         """The further words of missing samples, in lower case."""
         return frozenset(word.lower() for word in self.missing)
 
-    @property
+    @cached_property
     def numbers(self) -> list[float]:
         """The numbers among the words of missing samples."""
         return [float(word) for word in self.missing if is_number(word)]

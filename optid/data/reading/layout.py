@@ -72,13 +72,11 @@ def find_layout(path: Path, how: Format) -> TextLayout:
         text, encoding = file.head()
         how = how if how.encoding else replace(how, encoding=encoding)
         needed = {} if file.trusted else {"encoding": encoding}
-        where = f"{path.name}"
+        where = path.name
         if file.longest_line():
             raise DataError(f"{where}: its first line has more than {len(text)} characters; it is not a table.")
     lines = list(io.StringIO(text, newline=""))
-    lines, how, skipped = _declared(lines, how)
-    if skipped and not how.skip_rows:
-        needed.pop("delimiter", None)
+    how, skipped = _declared(lines, how)
     first = skipped + how.skip_rows
     if first >= len(lines):
         raise DataError(f"{where} has {len(lines)} lines; skip_rows={how.skip_rows} leaves none.")
@@ -102,19 +100,19 @@ def find_layout(path: Path, how: Format) -> TextLayout:
     return replace(found, offset=len(text[: found.offset].encode()), advice=_advice(found, needed))
 
 
-def _declared(lines: list[str], how: Format) -> tuple[list[str], Format, int]:
-    """Return the lines, the format completed by what the file declares of itself, and the lines of that declaration."""
+def _declared(lines: list[str], how: Format) -> tuple[Format, int]:
+    """Return the format completed by what the file declares of itself, and the lines of that declaration."""
     if lines and (mark := re.fullmatch(r'"?sep=(.)"?\s*', lines[0])):  # Excel
-        return lines, replace(how, delimiter=how.delimiter or mark[1]), 1
+        return replace(how, delimiter=how.delimiter or mark[1]), 1
     if not lines or not lines[0].startswith("LabVIEW Measurement"):
-        return lines, how, 0
+        return how, 0
     words = dict(line.rstrip().split("\t", 1) for line in lines[:40] if "\t" in line.rstrip() and line[0].isalpha())
     words |= dict(line.rstrip().split(",", 1) for line in lines[:40] if "," in line.rstrip() and "\t" not in line)
     ends = [k for k, line in enumerate(lines) if line.startswith("***End_of_Header***")][:2]  # of file and channels
     marks = {"Tab": "\t", "Comma": ","}
     known = {"delimiter": how.delimiter or marks.get(words.get("Separator", ""), "\t"),
              "decimal": words.get("Decimal_Separator", how.decimal).strip()[:1] or how.decimal}
-    return lines, replace(how, **known), ends[-1] + 1 if ends and not how.skip_rows else 0
+    return replace(how, **known), ends[-1] + 1 if ends and not how.skip_rows else 0
 
 
 def _is_comment(line: str, how: Format) -> bool:
@@ -150,11 +148,11 @@ def _delimiter(lines: Sequence[str], where: str) -> tuple[str, int]:
 def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str) -> list[_Row]:
     """Return the first rows of a table, without comments and blank lines."""
     rows: list[_Row] = []
-    taken = [0, first, start]  # lines taken, number of the last one, characters before the next
+    taken = [first, start]  # number of the last line, characters before the next
 
     def given() -> Any:
         for line in lines:
-            taken[0], taken[1], taken[2] = taken[0] + 1, taken[1] + 1, taken[2] + len(line)
+            taken[0], taken[1] = taken[0] + 1, taken[1] + len(line)
             if not _is_comment(line, how):
                 yield line
 
@@ -162,9 +160,9 @@ def _rows(lines: Sequence[str], first: int, start: int, how: Format, where: str)
     try:
         for cells in (map(str.split, given()) if blanks else csv.reader(given(), delimiter=how.delimiter or ",")):
             if any(cells) or len(rows) > MOST_TEXT_ROWS or any(any(map(_is_value, row.cells)) for row in rows):
-                rows.append(_Row(cells, taken[1], taken[2]))
+                rows.append(_Row(cells, *taken))
             elif rows:  # a blank line after the header
-                rows[-1] = rows[-1]._replace(end=taken[2])
+                rows[-1] = rows[-1]._replace(end=taken[1])
             if len(rows) >= SAMPLE:
                 break
     except csv.Error as error:
@@ -180,8 +178,9 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
     if cells[0][:1] in ("#", "%") and how.columns is None:
         bare = cells[0].lstrip("#% ")
         fits = len(rows) > 1 and any(map(_is_value, rows[1].cells))
-        if fits and len(cells) + (not bare) * -1 == len(rows[1].cells):  # as numpy.savetxt writes a header
-            cells = [bare, *cells[1:]] if bare else cells[1:]
+        marked = [bare, *cells[1:]] if bare else cells[1:]
+        if fits and len(marked) == len(rows[1].cells):  # as numpy.savetxt writes a header
+            cells = marked
         elif how.comment is None:
             mark = cells[0][0]
             raise DataError(f"{where}: line {head.line} begins with {mark!r}. If it is a comment pass "
@@ -205,7 +204,7 @@ def _headed(rows: list[_Row], width: int, how: Format, needed: dict[str, Any], w
     else:
         if odd := [cell for cell in cells if _is_value(cell) and not cell.isdigit()]:
             raise DataError(f"{where}: line {head.line} would be the header, but holds {odd[0]!r}. If the file has no "
-                            f"header name its columns, columns=[...]; if it begins later pass skip_rows=.")
+                            "header name its columns, columns=[...]; if it begins later pass skip_rows=.")
         if len(cells) != width:
             _refuse_preamble(rows, width, where, needed)
         names = _fitted(cells, rows[1:])

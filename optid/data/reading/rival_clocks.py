@@ -7,13 +7,14 @@ import numpy as np
 
 from optid.data.reading.clock import NoStamps, TimeColumn, recognise, seconds
 from optid.data.reading.sources import Table
+from optid.data.reading.uniform import COARSE, repeated
 from optid.errors import DataError
 
 AGREEMENT = 1e-3  # share of the span by which two clocks may differ, beyond one step of the coarser one
 
 
 def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: bool
-           ) -> tuple[TimeColumn | None, np.ndarray | None, list[str]]:
+           ) -> tuple[TimeColumn, np.ndarray, list[str]]:
     """Return the clock that some columns hold, its stamps (N,), and findings.
 
     Args:
@@ -48,8 +49,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
                 f"{table.label}: two clocks disagree: {_told(clock, stamps)}, {_told(other, rival)}. Choose one: "
                 f"time={clock.columns[0]!r} or time={other.columns[0]!r}.")
     if len(found) > 1:  # of clocks that agree the one with the finer stamps, dated if both are
-        clock, stamps = min(found, key=lambda one: (np.mean(np.diff(one[1]) == np.diff(one[1][:1].repeat(2)))
-                                                    if one[1].size > 1 else 0, one[1].dtype.kind != "M"))
+        clock, stamps = min(found, key=lambda one: (repeated(one[1]), one[1].dtype.kind != "M"))
     if table.how.time_zone is not None and clock.kind == "numbers" and clock.scale != 86400.0:
         raise DataError(f"{table.label}: time_zone={table.how.time_zone!r} is for local dates; the clock "
                         f"{clock.columns[0]!r} holds numbers.")
@@ -96,7 +96,7 @@ def _agree(one: np.ndarray, other: np.ndarray) -> bool:
 def _resolution(t: np.ndarray) -> float:
     """Return the resolution of stamps that rows share, or a hundredth of the usual step."""
     steps = np.abs(np.diff(t))
-    return float(np.max(steps)) if np.mean(steps == 0) > 0.2 else 0.01 * float(np.median(steps))
+    return float(np.max(steps)) if repeated(t) > COARSE else 0.01 * float(np.median(steps))
 
 
 def _told(clock: TimeColumn, stamps: np.ndarray) -> str:

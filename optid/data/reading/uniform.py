@@ -13,7 +13,7 @@ MOST_INSERTED = 1 << 20  # missing samples that gaps may add beyond twenty times
 COARSE = 0.2  # share of stamps equal to the one before from which the resolution of the stamps is too low
 FEWEST = 10  # stamps from which that is told
 LINE = 1 << 16  # stamps to which a line is fitted
-WHOLE = 0.25  # deviation of a step from a multiple of the median step up to which rows are said to be lost
+WHOLE = 0.1  # deviation of a step from a multiple of the median step up to which rows are said to be lost
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,11 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
     _check_whole(stamps, label, 0)
     if how.resample is not None:
         return _resampled(stamps, u, y, how, label)
-    if stamps.size > 1 and np.mean(np.diff(stamps) == stamps[:1] - stamps[:1]) > COARSE and dt is not None:
+    if dt is not None and repeated(stamps) > COARSE:
         return [Piece(stamps[0], u, y)], dt, [_check_spread(stamps, dt, label)]
     if how.gaps is None or stamps.size < 2:
         said = []
-        if stamps.size > 1 and (seconds(np.diff(stamps)) < 0).all():
+        if stamps.size > 1 and stamps[1] < stamps[0] and (seconds(np.diff(stamps)) < 0).all():
             stamps, u, y = stamps[::-1], u[::-1].copy(), y[::-1].copy()
             said = ["the newest sample came first: the rows are turned round"]
         step = uniform_step(stamps, how.time_tolerance, label)
@@ -122,6 +122,11 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
             said.append(f"clock: the stamps leave an even grid of {step:g} s by up to {drift:.3g} s")
         return [Piece(stamps[0], u, y)], step, said
     return _without_gaps(stamps, u, y, how, label)
+
+
+def repeated(stamps: np.ndarray) -> float:
+    """Return the share of stamps that are equal to the one before."""
+    return float(np.mean(stamps[1:] == stamps[:-1])) if stamps.size > 1 else 0.0
 
 
 def _check_whole(stamps: np.ndarray, label: str, first: int) -> None:
@@ -150,7 +155,7 @@ def _not_uniform(stamps: np.ndarray, steps: np.ndarray, median: float, bad: np.n
         remedy = "sort the rows by time, or cut the record at that row."
     else:
         multiples = np.round(size / median)
-        whole = np.abs(size / median - multiples) <= max(WHOLE * 0.4, tolerance)
+        whole = np.abs(size / median - multiples) <= max(WHOLE, tolerance)
         lost, twice = int(np.sum((multiples - 1)[multiples > 1])), int(np.sum(multiples == 0))
         if whole.all() and (multiples != 1).all():
             rows = [f"{lost} row{'s' if lost > 1 else ''} seem{'s' if lost == 1 else ''} to be lost"] * bool(lost)
@@ -263,7 +268,7 @@ def _without_gaps(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, how: Format,
 
 def _resampled(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, how: Format, label: str
                ) -> tuple[list[Piece], float, list[str]]:
-    dt = float(how.resample)  # type: ignore[arg-type]
+    dt = float(how.resample)
     t = seconds(stamps - stamps[0])
     if (np.diff(t) < 0).any():
         steps = np.diff(t)
