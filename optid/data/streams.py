@@ -254,7 +254,7 @@ def _clock_and_step(sources: Iterable[Any], columns: Sequence[str], how: Format,
     for one in sources:
         stamps = np.empty(0)
         for block in one.blocks(columns, dict.fromkeys(columns, "clock")):
-            clock = clock or recognise(block, columns, how, one.label, unit)
+            clock = clock or recognise(block[columns[0]], columns[0], how, one.label, unit)
             more = clock.stamps(block, one.label)
             stamps = np.concatenate([stamps, more]) if stamps.size else more
             if stamps.size > 1:

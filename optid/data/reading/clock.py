@@ -233,12 +233,12 @@ def clock_columns(known: Sequence[str], time: Any, taken: Sequence[str], label: 
     return found
 
 
-def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str, unit: str = "") -> TimeColumn:
-    """Return the clock that some samples of one column show, or of a date and a time of day.
+def recognise(values: Any, name: str, how: Format, label: str, unit: str = "") -> TimeColumn:
+    """Return the clock that some samples of a column show.
 
     Args:
-        block: samples of the columns.
-        columns: the column, or two.
+        values: (N,) samples: numbers, dates, texts or a series of texts.
+        name: of the column.
         how: format of the table.
         label: name of the source, for messages.
         unit: unit of the column, where the source tells it.
@@ -246,55 +246,48 @@ def recognise(block: Mapping[str, Any], columns: Sequence[str], how: Format, lab
     Raises:
         DataError: neither numbers, dates nor times of day, or dates of a format that a user must name.
     """
-    name = columns[0]
     where = f"{label}, column {name!r}"
-    head = np.ravel(block[name][:2000])
+    head = np.ravel(values[:2000])
     if head.dtype.kind in "Mm":
         return TimeColumn((name,), "ready", how)
     if head.dtype.kind in "UO":
         cells = ["" if cell is None else str(cell) for cell in head.tolist()]
-        values, row = to_numbers(cells, how)
+        numbers, row = to_numbers(cells, how)
         if row is not None and row > len(cells) // 2:
             raise NoStamps(f"{where}: row {row + 1} holds {cells[row]!r}, no number like the others.",
                            "Remove the row, or pass time=False and dt=.")
         if row is not None or (how.date_format and how.date_format not in COUNTS):
-            return _of_texts(block, columns, how, label)
+            return _of_texts(cells[:200], name, how, where)
     else:
-        values = np.ravel(block[name])
-    if values.dtype.kind not in "iuf":
-        raise NoStamps(f"{where}: time stamps of type {values.dtype} cannot be read; convert them to seconds.")
-    return _of_numbers(values, name, how, unit, where)
+        numbers = np.ravel(values)
+    if numbers.dtype.kind not in "iuf":
+        raise NoStamps(f"{where}: time stamps of type {numbers.dtype} cannot be read; convert them to seconds.")
+    return _of_numbers(numbers, name, how, unit, where)
 
 
-def _of_texts(block: Mapping[str, Any], columns: Sequence[str], how: Format, label: str) -> TimeColumn:
-    forms = []
-    for name in columns:
-        cells = np.ravel(block[name][:200]).astype(str)
-        full = [cell for cell in cells.tolist() if not how.is_missing(cell) and cell.strip().lower() != "nat"]
-        first = full[0] if full else ""
-        given = how.date_format
-        if given and (dates.is_time_of_day(first) if dates.has_day(given) else any(
-                map(dates.has_day, dates.formats(first)))):
-            given = None  # it is the format of the other column
-        if given is None and "mm:ss" in name.lower().replace(" ", "") and re.fullmatch(r"\d+:\d\d", first):
-            given = "%M:%S"
-        found = [given] if given else dates.agreed_format(full)
-        where = f"{label}, column {name!r}"
-        if not found:
-            odd = next((cell for cell in full if dates.formats(first) and not dates.formats(cell)), None)
-            what = f"(first: {first!r})" if odd is None else f"(first: {first!r}; then {odd!r})"
-            raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as 2024-05-01T12:00:00.",
-                           "Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to seconds, or pass "
-                           "time=False and dt=.")
-        if not given and not dates.is_unambiguous(found[0]):
-            raise UnreadStamps(f"{where}: the dates (first: {first!r}) do not begin with the year.",
-                               f"Pass {dates.choices(found)}.")
-        forms.append(found[0])
-    dated = any(map(dates.has_day, forms))
-    finding = f"clock {columns[0]!r}: dates with an offset, shown in UTC" if "%z" in forms[0] else ""
-    if forms[-1] in ("%H:%M", "%M:%S"):
-        finding = f"clock {columns[-1]!r}: read as {'hours:minutes' if forms[-1] == '%H:%M' else 'minutes:seconds'}"
-    return TimeColumn(tuple(columns), "dates" if dated else "times of day", how, forms=tuple(forms), finding=finding)
+def _of_texts(cells: Sequence[str], name: str, how: Format, where: str) -> TimeColumn:
+    full = [cell for cell in cells if not how.is_missing(cell) and cell.strip().lower() != "nat"]
+    first, given = full[0] if full else "", how.date_format
+    if given and (dates.is_time_of_day(first) if dates.has_day(given) else any(
+            map(dates.has_day, dates.formats(first)))):
+        given = None  # it is the format of the other column of a date and a time of day
+    if given is None and "mm:ss" in name.lower().replace(" ", "") and re.fullmatch(r"\d+:\d\d", first):
+        given = "%M:%S"
+    found = [given] if given else dates.agreed_format(full)
+    if not found:
+        odd = next((cell for cell in full if dates.formats(first) and not dates.formats(cell)), None)
+        what = f"(first: {first!r})" if odd is None else f"(first: {first!r}; then {odd!r})"
+        raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as 2024-05-01T12:00:00.",
+                       "Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to seconds, or pass "
+                       "time=False and dt=.")
+    if not given and not dates.is_unambiguous(found[0]):
+        raise UnreadStamps(f"{where}: the dates (first: {first!r}) do not begin with the year.",
+                           f"Pass {dates.choices(found)}.")
+    form = found[0]
+    finding = f"clock {name!r}: dates with an offset, shown in UTC" if "%z" in form else ""
+    if form in ("%H:%M", "%M:%S"):
+        finding = f"clock {name!r}: read as {'hours:minutes' if form == '%H:%M' else 'minutes:seconds'}"
+    return TimeColumn((name,), "dates" if dates.has_day(form) else "times of day", how, forms=(form,), finding=finding)
 
 
 def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str, where: str) -> TimeColumn:

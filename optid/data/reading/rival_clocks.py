@@ -30,7 +30,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     refused: dict[str, NoStamps] = {}
     for name in names:
         try:
-            clocks.append(recognise(block, [name], table.how, table.label, table.units.get(name, "")))
+            clocks.append(recognise(block[name], name, table.how, table.label, table.units.get(name, "")))
         except NoStamps as error:
             if asked:
                 raise

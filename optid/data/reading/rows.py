@@ -175,8 +175,7 @@ class RowReader:
         block = {"time": np.array(texts, dtype=object)}
         if self._reads is None:
             assert self._names is not None
-            found = recognise({self._names[self._clock[0]]: block["time"]}, [self._names[self._clock[0]]], self._how,
-                              self._label)
+            found = recognise(block["time"], self._names[self._clock[0]], self._how, self._label)
             self._reads = replace(found, columns=("time",))
         return self._reads.stamps(block, self._label)
 
