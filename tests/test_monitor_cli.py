@@ -13,6 +13,7 @@ import pytest
 from processes import wait_for
 from test_monitor import plant, stream
 
+from optid import Format
 from optid.data.reading.rows import RowReader
 from optid.errors import DataError
 
@@ -233,7 +234,7 @@ def test_reading_goes_on_where_it_stopped():
     found = again.read(["1.0,1,2"])  # one row, of which no stamp is known, lies between
     assert found.error == "" and found.lines.tolist() == [4]
     with pytest.raises(DataError, match="not the delimiter"):
-        reader(delimiter=",", decimal=",")
+        reader(how=Format(delimiter=",", decimal=","))
 
 
 @pytest.mark.slow
