@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, as_list, check_integer, one_of, one_or_all
+from optid.arrays import Array, as_list, check_integer, finite, one_of, one_or_all
 from optid.data.channels import Ports, Transform, check_texts, interval_text, numbered_names
 from optid.data.record import Data
 from optid.data.stretches import runs_of
@@ -40,6 +40,8 @@ class Model(Ports):
         c0: offset of f where the data tell it from the constants of the equations, else None.
         offset_note: why c0 is None; "" where it is known.
         structure: the kind of linear part and noise: "arx", "armax", "oe", "bj" or "ss".
+        levels: (E, l) constants of the experiments of its record where each has one of its own, else None. The constant
+            of the model is then their mean, and that of another record unknown: a state that does not change.
     """
 
     nonlinearities: tuple[Nonlinearity, ...]
@@ -52,6 +54,7 @@ class Model(Ports):
     poles: Any
     memory: int
     structure: Any
+    levels: Any = None
     __dataclass_fields__: ClassVar[dict[str, Any]]
     GAUGES: ClassVar[tuple[str, ...]]
     SIMULATORS: ClassVar[tuple[str, ...]]
@@ -79,6 +82,10 @@ class Model(Ports):
             check_texts(f"the name of an {kind}", map(str, names), StructureError)
             check_texts(f"the unit of an {kind}", map(str, units), StructureError)
             fixed |= {f"{kind}s": names, f"{kind}_units": units}
+        if self.levels is not None:
+            fixed["levels"] = finite(self.levels, "levels")
+            if fixed["levels"].ndim != 2 or not len(fixed["levels"]) or fixed["levels"].shape[1] != l:
+                raise StructureError(f"levels has shape {fixed['levels'].shape}; it must be (experiments, {l}).")
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
@@ -158,7 +165,14 @@ class Model(Ports):
     def __str__(self) -> str:
         """Return the equations, the poles and the sampling time."""
         poles = f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else ""
-        return f"{self.equation()}{poles}\n{self.sampling}"
+        return f"{self.equation()}{self._levels_in_words()}{poles}\n{self.sampling}"
+
+    def _levels_in_words(self) -> str:
+        if self.levels is None:
+            return ""
+        parts = [f"{low:.4g} to {high:.4g}" + f" ({name})" * (self.l > 1)
+                 for name, low, high in zip(self.outputs, self.levels.min(axis=0), self.levels.max(axis=0))]
+        return f"\nconstants of the {len(self.levels)} experiments: {', '.join(parts)}; above is their mean"
 
     # -- running over records ------------------------------------------------------------------------------------
 
@@ -217,7 +231,8 @@ class Model(Ports):
         Args:
             data: Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
             x0: "zero" (nothing before the record), "fit" (least squares on the outputs present; needs Data), or the
-                state, one for each experiment; see `initial_state`.
+                state, one for each experiment; see `initial_state`. Of a model with `levels` the last row of a state is
+                the deviation of the constant from the mean: "zero" runs at the mean, "fit" estimates it.
 
         Returns:
             (N, l) in raw units, or (N,) for u given as (N,) and one output; a tuple of such arrays for several
@@ -328,7 +343,7 @@ class Model(Ports):
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build what `to_dict` described, with the functions of UserFunctions by name; errors as of the parts."""
-        content = {"time_unit": "", **content}  # an older file has none
+        content = {"time_unit": "", "levels": None, **content}  # an older file has none
         given = {one.name: content[one.name] for one in fields(cls)}
         for name in given.keys() & {"nonlinearities", "feedback", "latent"}:
             given[name] = tuple(Nonlinearity.from_dict(f, functions) for f in given[name])

@@ -25,6 +25,7 @@ from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
 from optid.models.roots import contained, roots_of, with_roots
 from optid.statistics.expansion import expand
+from optid.statistics.experiments import collect_by_experiment
 from optid.statistics.hankel import hankel_statistics
 from optid.statistics.regression import collect
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
@@ -283,11 +284,15 @@ def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | Non
         data = Data(us, [one.y for one in data.experiments], data.dt, names, list(data.outputs))
         layout = replace(layout, nb=(*layout.nb, unknowns.nc), nk=(*layout.nk, 1), inputs=tuple(names),
                          bases=fitted_bases(data, (*layout.bases, Linear())))
-    na, point = layout.na, minimise(lifted_problem(collect(data, layout), positions(layout)), count=4).point
+    statistics, means = collect_by_experiment(data, layout) if unknowns.levels else (collect(data, layout), None)
+    na, point = layout.na, minimise(lifted_problem(statistics, positions(layout)), count=4).point
+    x0, a = np.zeros((unknowns.experiments, unknowns.memory)), np.array(point.w[:na])
+    if means is not None:
+        thetas = [np.ravel(np.outer(mu, b), order="F") for mu, b in zip(point.mus, point.bs)]
+        x0[:, -1:] = means.constants(np.concatenate([point.w, *thetas])[positions(layout)])
     pairs = [(np.array(mu, dtype=float), np.ravel(np.array(b, dtype=float))) for mu, b in zip(point.mus, point.bs)]
     c = pairs.pop() if innovations is not None else (np.ones(1), np.zeros(unknowns.nc))
     pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, (mu, b) in zip(unknowns.free, pairs)]
-    x0, a = np.zeros((unknowns.experiments, unknowns.memory)), np.array(point.w[:na])
     return TransferPoint(a, tuple(mu for mu, _ in pairs), tuple(b for _, b in pairs), float(point.w[na]), x0,
                          contained(c[0][0] * c[1], RADIUS), a)
 
