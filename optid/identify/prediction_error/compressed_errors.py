@@ -168,7 +168,8 @@ class CompressedStates(CompressedErrors):
         response, root = self._noise_filter(errors, noise)
         meat = np.zeros((unknowns.size, unknowns.size))
         for i in range(unknowns.experiments):
-            columns = np.r_[unknowns.shared + i * unknowns.n + np.arange(unknowns.n), np.arange(unknowns.shared)]
+            states = unknowns.shared + i * unknowns.memory + np.arange(unknowns.memory)
+            columns = np.r_[states, np.arange(unknowns.shared)]
             meat[np.ix_(columns, columns)] += scattered(criterion.blocks(x)(i), response, root)
         covariance = moves.T @ meat @ moves
         taken = 1 + float(np.trace(covariance)) / self.at.value  # what the fit has taken out of the errors
