@@ -8,6 +8,7 @@ extended least squares (ARMAX), the residuals of a plant (Box-Jenkins).
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain, count, islice
 from typing import Any
 
@@ -23,7 +24,7 @@ from optid.identify.prediction_error.tangent_fit import TangentFit, violation
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
-from optid.models.roots import contained, roots_of, with_roots
+from optid.models.roots import contained, roots_of, with_integrator, with_roots
 from optid.statistics.expansion import expand
 from optid.statistics.experiments import collect_by_experiment
 from optid.statistics.hankel import hankel_statistics
@@ -97,21 +98,24 @@ def _complete(data: Data) -> float:
 def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) -> Array:
     """Return the start under the constraints: the best of the optima with their poles moved into the region.
 
-    The other unknowns are fitted again; without constraints on the poles alone they stay.
+    The other unknowns are fitted again; without constraints on the poles alone they stay. Where a pole must lie at 1,
+    the nearest one is moved there.
     """
     if not fit.constraints:
         return fit.signed(found[0].x)
     at, ends = criterion.unknowns.slices["a"], []
     for one in found[:ENTRIES]:
         x = fit.signed(one.x)
-        for radius in PULLS:
-            pulled = x[at] if radius == 1.0 else contained(x[at], radius)
+        moved = [partial(contained, limit=radius) for radius in PULLS]
+        moved[0] = with_integrator if criterion.integrates else np.array
+        for move in moved:
+            pulled = move(x[at])
             program = fit.pose(np.concatenate([pulled, x[at.stop :]]), one.at, 0.0)
             a = program.variables.get("a")
             others = [name for name, group in program.user_constraints.items()
                       if a is not None and any({v.id for v in c.variables()} != {a.id} for c in group)]
             if violation(program.without(*others, "residual", "gauge")) <= 1e-9:  # those on the poles alone hold
-                again = one if radius == 1.0 else with_poles(criterion, x, pulled)
+                again = one if np.array_equal(pulled, x[at]) else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break
     return fit.signed(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)

@@ -25,6 +25,7 @@ from optid.statistics.sensitivities import TransferPredictor
 from optid.statistics.unknowns import TransferUnknowns
 
 STABLE = 1 - 1e-9  # radius inside which every pole of an iterate, or zero of C, lies
+INTEGRATES = 1e-6  # size of A(1) that is the accuracy of a solver, where a constraint makes it zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +36,7 @@ class TransferErrors(TransferPredictor, Criterion):
     units: Transform  # from those of the record (`optid.program.units`) to those of the model
     # (E, 1) what `levelled` subtracted from the outputs, where every experiment has a constant of its own
     shifts: Array | None = None
+    integrates: bool = False  # whether a constraint puts a pole of the plant at 1, where it counts as stable
     weight: ClassVar[Array] = np.eye(1)
 
     @property
@@ -61,11 +63,22 @@ class TransferErrors(TransferPredictor, Criterion):
         return [np.where(one.state == recursions.PRESENT, one.innovations, np.nan) for one in found]
 
     def admissible(self, x: Array) -> bool:
-        """Whether the predictor is stable: C invertible and, unless D is A, the plant stable."""
+        """Whether the predictor is stable: C invertible and, unless D is A, the plant stable but for an integrator."""
         at = self.unknowns.slices
         if not np.all(np.isfinite(x)) or roots.radius(x[at["c"]]) >= STABLE:
             return False
-        return not self.unknowns.apart or roots.radius(x[at["a"]]) < STABLE
+        a = x[at["a"]]
+        if self.integrates and abs(1 + a.sum()) <= INTEGRATES:
+            a = roots.without_integrator(a)
+        return not self.unknowns.apart or roots.radius(a) < STABLE
+
+    def normalised(self, x: Array) -> Array:
+        """Return the same model in the gauge; a pole that a constraint puts at 1 lies there to the last digit."""
+        x, at = super().normalised(x), self.unknowns.slices["a"]
+        rest = 1 + x[at].sum()
+        if self.integrates and abs(rest) <= INTEGRATES:
+            x[at.stop - 1] -= rest
+        return x
 
     def scale(self, x: Array, b: str) -> float:
         """Return the divisor of a part b of x, and factor of its mu, to reach the gauge."""
