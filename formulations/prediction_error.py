@@ -30,6 +30,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.constraints.poles import asks_for_integrator
 from optid.arrays import LARGEST_INTEGER, check_integer, one_of
 from optid.bases import Bases
 from optid.data.channels import model_meta
@@ -149,7 +150,7 @@ def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc:
     count = check_integer(starts, "starts")
     check_integer(seed, "seed", 0, LARGEST_INTEGER)
     criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
-    criterion = replace(criterion, integrates=any("integrator" in getattr(rule, "about", ()) for rule in constraints))
+    criterion = replace(criterion, integrates=asks_for_integrator(constraints))
     free = replace(criterion, gauge="none" if gauge is None else "norm")
     best, others, figures = search(free, lambda part: starts_of(part, count, seed))
     enough_rows(best.at.rows, criterion.errors, criterion.unknowns.size, "lags")

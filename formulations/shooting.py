@@ -26,6 +26,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.constraints.poles import asks_for_integrator
 from formulations.prediction_error import Orders, transfer_model
 from optid.arrays import one_of
 from optid.bases import Bases
@@ -62,6 +63,9 @@ def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk:
     if check_offset(offset, data) == "each":
         raise StructureError("this programme has one constant for all experiments; 'hammerstein_oe.exact' takes "
                              "offset='each'")
+    if asks_for_integrator(constraints):
+        raise StructureError("this programme keeps all poles inside the unit circle: use 'hammerstein_oe.exact' with "
+                             "'integrator'")
     criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset)
     if criterion.data.n_samples > LIMIT:
         raise StructureError(

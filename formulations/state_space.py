@@ -30,6 +30,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.constraints.poles import NO_EQUATION, asks_for_integrator
 from formulations.subspace_procedure import identified
 from optid.arrays import check_integer, one_of
 from optid.bases import Bases
@@ -217,6 +218,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
     """
     for what, word in {"criterion": criterion, "stability": stability, "weighting": weighting}.items():
         one_of(what, word, WORDS[what])
+    if asks_for_integrator(constraints):
+        raise StructureError(NO_EQUATION)
     check_integer(iterations, "iterations", 1 if finish is None else 0)
     record = in_memory(data, f"{criterion} errors")
     constants = check_offset(offset, record)

@@ -41,6 +41,9 @@ CHORDS = 12  # sides of the polygon inscribed in half of the region of a damping
 FREQUENCIES = 128
 NEARBY = 1e-4  # relative change of the radius by which the price of a larger one is found
 GAP = 1e-3  # least Re(A / C) on the grid, for what happens between its points
+NO_EQUATION = ("constraint 'integrator' applies to the coefficients of A; a pole at 1 of a state-space model is no linear "
+               "equation in its matrices. Use 'oe.exact' or 'hammerstein_oe.exact' with it, or 'ss.exact' with "
+               "stability='free', where a pole may come to lie at 1")
 LIMITS = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9997, 0.9999)  # where the roots of the centre end, as shares of the radius
 
 
@@ -243,6 +246,11 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
     return Rule(name, build, verify, frozenset({"poles"}), stand_in)
 
 
+def asks_for_integrator(constraints: Sequence[Any]) -> bool:
+    """Whether one of the constraints is `integrator`."""
+    return any("integrator" in getattr(rule, "about", ()) for rule in constraints)
+
+
 @recorded
 def integrator() -> Rule:
     """A pole lies at 1, ``1 + a_1 + ... + a_na = 0``: the output ramps while the inputs are held.
@@ -256,9 +264,7 @@ def integrator() -> Rule:
     def build(view: View) -> Any:
         a = view.poles
         if isinstance(a, tuple):
-            raise StructureError("constraint 'integrator' applies to the coefficients of A: a pole at 1 of a state-space "
-                                 "model is no linear equation. Use 'oe.exact' or 'hammerstein_oe.exact' with it, or "
-                                 "stability='free', which lets a pole come to lie at 1")
+            raise StructureError(NO_EQUATION)
         if a is None:
             raise StructureError("constraint 'integrator': there is no pole to be put at 1, since na is 0")
         if a.ndim != 1:
@@ -266,6 +272,8 @@ def integrator() -> Rule:
         return cp.sum(a) == -1
 
     def verify(model: Any) -> str:
+        if not hasattr(model, "a"):
+            raise StructureError(NO_EQUATION)
         rest = 1 + float(np.sum(model.a))
         return "" if abs(rest) <= 1e-9 else f"constraint 'integrator': A(1) = {rest:.3g} instead of 0"
 

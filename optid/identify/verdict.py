@@ -93,9 +93,12 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         parts.append(Finding("estimation minus cross-validated fit", _points(lost, " points"), lost <= OVERFIT))
     if np.isfinite(ahead) and np.isfinite(own):
         parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
+    # a pole nearer to 1 than the record is long grows by less than e over it: the record does not tell it from 1
+    ramps = model.integrates or (not model.is_stable and model.integrates_within(
+        1 / max(e.n_samples for e in raw.experiments)))
     steady = bool(model.is_stable) or (has_feedback(model) and np.isfinite(own))
     parts += [_residuals(raw, predicted), *_delays(model, raw),
-              Finding("stability", "stable" if steady else "unstable", steady),
+              Finding("stability", "integrates" if ramps else "stable" if steady else "unstable", steady or ramps),
               *_ranges(model, raw), *_structure(model, raw)]
     if not score >= USELESS_FIT:
         word = USELESS

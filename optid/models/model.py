@@ -20,6 +20,8 @@ from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
 
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
+ROUNDING = 1e-12  # of a pole on the unit circle
+AT_ONE = 1e-8  # distance from 1 within which a pole integrates: descents end 1e-9 before it
 
 
 class Model(Ports):
@@ -124,8 +126,18 @@ class Model(Ports):
 
     @property
     def is_stable(self) -> bool:
-        """Whether all poles lie inside the unit circle."""
-        return self.radius < 1
+        """Whether all poles lie inside the unit circle, by more than rounding."""
+        return self.radius < 1 - ROUNDING
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the model has a pole at 1 and is stable otherwise: its outputs ramp while the inputs are held."""
+        return self.integrates_within(AT_ONE)
+
+    def integrates_within(self, distance: float) -> bool:
+        """Whether a real pole lies so near to 1 and all others lie inside the unit circle, one an output at most."""
+        near = (np.abs(self.poles - 1) <= distance) & (np.abs(self.poles.imag) <= ROUNDING)
+        return 0 < int(near.sum()) <= self.l and bool(np.all(np.abs(self.poles[~near]) < 1 - ROUNDING))
 
     def step_response(self, n: int = 100) -> Array:
         """Return the response of the linear part to a unit step of every f, (n, l, r), in the gauge of the model."""
@@ -164,7 +176,8 @@ class Model(Ports):
 
     def __str__(self) -> str:
         """Return the equations, the poles and the sampling time."""
-        poles = f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else ""
+        ramps = " (integrates)" * self.integrates
+        poles = f"\npoles: {roots.in_words(self.poles)}{ramps}" if len(self.poles) else ""
         return f"{self.equation()}{self._levels_in_words()}{poles}\n{self.sampling}"
 
     def _levels_in_words(self) -> str:
@@ -244,7 +257,7 @@ class Model(Ports):
             StructureError: an x0 that cannot be read.
 
         Warns:
-            DataWarning: the model is unstable.
+            DataWarning: the model is unstable, and no integrator.
         """
         records, flat = records_of(self, data)
         outputs = self._run("free", records, x0)
@@ -289,7 +302,7 @@ class Model(Ports):
         return [state_like(state, self._state_shape) for state in states]
 
     def _warn_unstable(self) -> None:
-        if not self.is_stable:
+        if not (self.is_stable or self.integrates):
             warnings.warn(
                 f"The model is unstable: its largest pole has radius {self.radius:.6g}. Its simulation grows and tells "
                 "little about the fit; use one-step prediction, or identify with a stability constraint.",

@@ -37,7 +37,7 @@ EXPLAINED = 0.1
 BETTER = 2.0  # times the errors' energy that a local optimum may have of that at the border of stability, and win
 ROUNDING = 1e-9  # relative difference of two sums of squares that were added up in different ways
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
-          "constraint such as stable:0.999")
+          "constraint such as integrator (a pole at 1) or stable:0.999")
 
 
 class Criterion(ABC):
