@@ -227,6 +227,7 @@ def transfer_model(criterion: TransferErrors, values: Values) -> HammersteinTF:
         a=a, b=tuple(part[criterion.key("b", c)] for c in range(layout.m)),
         nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(layout.bases, mus)), nk=layout.nk,
         offset=part.get("offset", np.zeros(1)), levels=levels, gauge=criterion.gauge, c=part.get("c", np.zeros(0)),
-        d=part.get("d", np.zeros(0)) if criterion.unknowns.apart else None, **model_meta(criterion.data)
-    ).with_transform(criterion.units)
-    return model if criterion.shifts is None else model.with_output_levels(criterion.shifts)
+        d=part.get("d", np.zeros(0)) if criterion.unknowns.apart else None, **model_meta(criterion.data))
+    if criterion.shifts is not None:
+        model = model.with_output_levels(criterion.shifts)
+    return model.with_transform(criterion.units)

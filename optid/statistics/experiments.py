@@ -32,6 +32,11 @@ class ExperimentMeans:
         shares = 1 / self.weights
         return own + np.outer(shares / shares.mean(), mean - own.mean(axis=0))
 
+    def energy(self, shifts: Array) -> Array:
+        """Return the sum of squares (l,) of the mean outputs about their mean, with shifts (E, l) of the outputs."""
+        means = self.rows[:, self.rows.shape[1] - shifts.shape[1] :] + shifts
+        return self.weights @ (means - self.weights @ means / self.weights.sum()) ** 2
+
 
 def collect_by_experiment(data: Data, layout: Layout, weights: Sequence[Array] | None = None
                           ) -> tuple[Statistics, ExperimentMeans]:
@@ -39,8 +44,7 @@ def collect_by_experiment(data: Data, layout: Layout, weights: Sequence[Array] |
 
     The constants are eliminated but for their mean, which is the coefficient of the column of ones: rows are taken
     about the mean of their experiment, and one row, exact at the optimum, holds the mean of these means with the
-    weight that leaves the information about the mean of the constants as it is. `Statistics.rows` is reduced by the
-    constants that are eliminated. Arguments and errors as `collect`.
+    weight that leaves the information about the mean of the constants as it is. Arguments and errors as `collect`.
     """
     parts = _by_experiment(accumulate, data, layout, weights)
     for i, part in enumerate(parts, start=1):
@@ -77,6 +81,6 @@ def _about_means(parts: Sequence[Statistics]) -> tuple[Statistics, ExperimentMea
     mean = np.sqrt(len(parts) / shares.mean()) * np.mean(means, axis=0)
     root = add_to_root(np.zeros((order.size, order.size)), np.vstack([mean, inner[:, back]]))
     exact = any(part.factor is not None for part in parts)
-    total = Statistics(layout, root.T @ root, sum(part.rows for part in parts) - len(parts) + 1,
-                       sum(part.candidates for part in parts), root if exact else None)
+    total = Statistics(layout, root.T @ root, sum(part.rows for part in parts),
+                       sum(part.candidates for part in parts), root if exact else None, len(parts) - 1)
     return total, ExperimentMeans(np.array(means), np.array(weights))

@@ -45,7 +45,8 @@ class EquationError:
     unit: float = 1.0  # size of one unit of the objective in units of the record
     unweighted: Statistics | None = None  # of the same rows without weights, where ``statistics`` has weights
     means: ExperimentMeans | None = None  # of the rows of every experiment, where each has its own constant
-    shifts: np.ndarray | None = None  # (E, l) what `levelled` subtracted from the outputs, in the units of the record
+    shifts: np.ndarray | None = None  # (E, l) what `levelled` subtracted from the outputs
+    between: np.ndarray | float = 0.0  # (l,) sum of squares of the mean outputs of the experiments about their mean
 
     @property
     def layout(self) -> Layout:
@@ -112,7 +113,7 @@ class EquationError:
         statistics, n = self.unweighted or self.statistics, self.layout.n_columns
         columns = statistics.root[:, n:]
         ones = statistics.root[:n, n - 1]
-        return np.sum(columns**2, axis=0) - (ones @ columns[:n]) ** 2 / (ones @ ones)
+        return np.sum(columns**2, axis=0) - (ones @ columns[:n]) ** 2 / (ones @ ones) + self.between
 
     def one_step_fit(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the one-step fit in % of every output over the rows used, from the statistics alone."""
@@ -147,8 +148,10 @@ class EquationError:
             nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
                                  for s, basis, mu in zip(signs, self.layout.bases, mus)),
             nk=self.layout.nk, offset=np.asarray(values["offset"], dtype=float), levels=levels, gauge=gauge,
-            **self.meta).with_transform(self.units)
-        return model if self.shifts is None else model.with_output_levels(self.shifts)
+            **self.meta)
+        if self.shifts is not None:
+            model = model.with_output_levels(self.shifts)
+        return model.with_transform(self.units)
 
 
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
@@ -183,7 +186,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     if not constants:
         raise StructureError("offset=False: equation-error fits estimate the constant; hold it by "
                              "formulations.constraints.shape.fixed('offset', 0), or centre the record and use 'oe.exact' or 'armax.exact'")
-    shifts = means = None
+    shifts, means, between = None, None, 0.0
     if isinstance(data, Data) and constants == "each":
         data, shifts = levelled(data)
     bases = fitted_bases(data, basis)
@@ -197,7 +200,9 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     check_weight(ridge, "ridge")
     check_weight(curvature, "curvature")
     if shifts is not None and isinstance(data, Data):
+        shifts = shifts / np.array(units.y_scale)
         statistics, means = collect_by_experiment(data, layout, weights)
+        between = means.energy(shifts)
     else:
         statistics = collect(data, layout, weights=weights)
     unit = units.y_scale[0] ** degree
@@ -209,4 +214,4 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
 
         rows = likeliest(prior, statistics).rows(columns)
     problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale, prior=rows)
-    return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit, means=means, shifts=shifts)
+    return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit, None, means, shifts, between)

@@ -92,7 +92,8 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
     def weighted(sizes: list[np.ndarray], start: Any) -> tuple[Program, list[np.ndarray]]:
         """Return the programme and the weights of a pass, which starts from the solution of the pass before."""
         weights = used.only(_weights(r, kind, width) for r in sizes)
-        compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics)
+        compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics,
+                             between=problem.between)
         return replace(pose(compressed), start=start, certify=None, scale=scale), weights
 
     while True:

@@ -48,6 +48,7 @@ class ErrorRows(NamedTuple):
     candidates: int
     condition: float
     method: str
+    constants: int = 0
 
 
 @dataclass(eq=False)
@@ -66,7 +67,7 @@ class CompressedErrors:
     @property
     def energy(self) -> Array:
         """Sum of squares of the output about its mean, (1,)."""
-        return np.array([self.criterion.energy])
+        return np.array([self.criterion.energy_of_record])
 
     @property
     def problem(self) -> LeastSquares:

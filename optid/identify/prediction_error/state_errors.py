@@ -43,7 +43,6 @@ class StateErrors(Criterion):
     limit: float = STABLE  # modulus below which the poles that carry the state must stay
     # constraints on poles that every iterate satisfies: model -> violation, "" for none
     checks: tuple[Callable[[Any], str], ...] = ()
-    # (E, l) what `levelled` subtracted from the outputs, where every experiment has constants of its own
     shifts: Array | None = None
     gauge: ClassVar[str] = "norm"
 

@@ -34,7 +34,6 @@ class TransferErrors(TransferPredictor, Criterion):
 
     gauge: str  # how the scale between mu and b is fixed; "none" for a linear model
     units: Transform  # from those of the record (`optid.program.units`) to those of the model
-    # (E, 1) what `levelled` subtracted from the outputs, where every experiment has a constant of its own
     shifts: Array | None = None
     integrates: bool = False  # whether a constraint puts a pole of the plant at 1, where it counts as stable
     weight: ClassVar[Array] = np.eye(1)
@@ -119,7 +118,7 @@ class TransferErrors(TransferPredictor, Criterion):
         every = total[:, None] @ np.ones((1, self.unknowns.experiments))
         if self.shifts is None or not layout.na:
             return every
-        return every - (later @ a)[:, None] @ self.shifts.T / units.y_scale[0]
+        return every - (later @ a)[:, None] @ self.shifts.T
 
 
 def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None, gauge: str | None,
@@ -149,7 +148,8 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
                                 check_integer(nc, "nc", 0), nd, constants == "each")
     if states:
         enough_rows(outputs_present(record), "output samples", replace(unknowns, nc=0, nd=0).size, "lags")
-    return TransferErrors(record, unknowns, gauge or "none", units, shifts)
+    return TransferErrors(record, unknowns, gauge or "none", units,
+                          None if shifts is None else shifts / units.y_scale[0])
 
 
 def _check_inputs(data: Data, layout: Layout) -> None:
