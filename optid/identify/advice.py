@@ -14,7 +14,8 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
-from optid.identify.delays import LagSums, linear, shown_delays
+from optid.identify.lag_sums import LagSums, linear
+from optid.identify.informativity import informativity
 from optid.identify.validation.checks import shares_outside
 from optid.identify.validation.predictions import SIMULATION, fit_percent, prediction_fit, simulated_or_nan
 from optid.models.functions import has_feedback
@@ -153,8 +154,10 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield structures as a phrase, as options, and as changes of the arguments of a fit."""
     name, arguments, data = fit.formulation, fit.arguments, fit.data
     if hasattr(fit.model, "nk") and "nb" in arguments:
-        sharp = [delay for delay in shown_delays(fit.model, data) if delay is not None]
-        found = [(0,) * data.m, *(k for delay in sharp for k in (delay, tuple(max(k - 1, 0) for k in delay)))]
+        told = informativity(data)
+        shown = [told.lags] if told.processes else []
+        found = [(told.least,) * data.m, *(k for lags in shown for k in (
+            lags, tuple(max(lag - 1, told.least) for lag in lags)))]
         for delay in dict.fromkeys(found):
             if delay != tuple(fit.model.nk):
                 words = _words(delay)
