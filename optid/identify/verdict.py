@@ -6,6 +6,7 @@ gains over it; whether the residuals still depend on the inputs; and whether del
 functions suit the record. It speaks of this record only.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -85,7 +86,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     if pooled is not None and closed:
         own = ahead  # blocks were compared one sample ahead
     score, lost = (own, 0.0) if pooled is None else (pooled, own - pooled)
-    parts = [Finding("record", told.reason or "informative", not told.reason)]
+    parts = [Finding("record", re.split(r"[:;(]", told.reason)[0].strip() or "informative", not told.reason)]
     parts.append(Finding("simulation fit" if pooled is None else "cross-validated fit", _points(score),
                          score >= POOR_FIT))
     by_block = _by_block(raw, runs) if cross_validated is None else np.asarray(cross_validated)
