@@ -67,7 +67,8 @@ def excitation(signals: Signals, c: int, name: str) -> Excitation:
     records = signals.inputs(c)
     moves = sum(int(np.count_nonzero(np.diff(u))) for u in records)
     x = max(records, key=len)[:LONGEST]
-    return Excitation(name, signals.levels(c), moves, 2 * moves < signals.samples, _lines(x), moves > 1 and all(map(_even, records)))
+    return Excitation(name, signals.levels(c), moves, 2 * moves < signals.samples, _lines(x),
+                      moves > 1 and all(map(_even, records)))
 
 
 def _lines(x: Array) -> int | None:
