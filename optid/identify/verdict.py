@@ -18,7 +18,7 @@ from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.informativity import Informativity, informativity
-from optid.identify.validation.checks import record_structure, shares_outside
+from optid.identify.validation.checks import record_structure, shares_outside, tested_residuals
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
@@ -101,6 +101,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         parts.append(Finding("estimation minus cross-validated fit", _points(lost, " points"), lost <= OVERFIT))
     if np.isfinite(ahead) and np.isfinite(own) and not closed:
         parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
+    parts += _residuals(model, raw, predicted)
     wrong = [*_response(model, raw, runs, told, closed), *_lags(model, told), *_uncertain(model, raw, known)]
     # a pole nearer to 1 than the record is long grows by less than e over it: the record does not tell it from 1
     ramps = model.integrates or (not model.is_stable and model.integrates_within(
@@ -116,6 +117,20 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         failed = any(part.counts and not part.passed for part in parts)
         word = GOOD if score >= GOOD_FIT and not worst < GOOD_BLOCK and not failed else FAIR
     return Verdict(word, tuple(parts), score)
+
+
+def _residuals(model: Any, data: Data, predicted: Sequence[Array]) -> list[Finding]:
+    """Say what the residual tests find, those of a page too."""
+    if all(np.isnan(p).all() for p in predicted):
+        return [Finding("residuals", "not available: no one-step prediction", True, counts=False)]
+    tests = tested_residuals(model, data, predicted)
+    found = []
+    for name, kind in (("independence of the inputs", "cross_correlations"), ("whiteness", "autocorrelations")):
+        failed = [test for test in tests[kind].values() if not test.passed]
+        known = any(np.isfinite(test.p_value) for test in tests[kind].values())
+        words = ", ".join(f"{test.output} {'on ' + test.input if kind[0] == 'c' else 'on its past'}" for test in failed)
+        found.append(Finding(name, words or ("kept" if known else "not available"), not failed, known))
+    return found
 
 
 def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity, closed: bool) -> list[Finding]:
