@@ -341,3 +341,15 @@ def test_evidence_tells_levels_from_one_level(seed):
 def test_evidence_needs_several_experiments():
     with pytest.raises(StructureError, match="one experiment"):
         level_evidence(record()[0].select(experiments=0))
+
+
+@pytest.mark.parametrize("criterion", ["simulation", "prediction"])
+def test_every_output_of_a_state_space_model_has_its_levels(criterion):
+    rng = np.random.default_rng(14)
+    us = [rng.standard_normal(120) for _ in range(4)]
+    zeros = rng.normal(0, 30, (4, 2))
+    ys = [np.column_stack([lfilter([0, 0.5], [1, -0.8], u), lfilter([0, 1.0], [1, -0.4], u)]) + zero
+          + 0.05 * rng.standard_normal((120, 2)) for u, zero in zip(us, zeros)]
+    fit = optid.fit(Data(us, ys), "ss.exact", nx=2, offset="each", criterion=criterion, feedthrough=False)
+    assert np.ravel(fit.model.static_gain(0.0)) == pytest.approx([2.5, 1 / 0.6], rel=0.02)
+    assert fit.model.levels - fit.model.levels.mean(axis=0) == pytest.approx(zeros - zeros.mean(axis=0), abs=0.1)

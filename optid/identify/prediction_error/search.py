@@ -107,7 +107,7 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
     for one in found[:ENTRIES]:
         x = fit.signed(one.x)
         moved = [partial(contained, limit=radius) for radius in PULLS]
-        moved[0] = with_integrator if criterion.integrates else np.array
+        moved[0] = with_integrator if criterion.integrates and criterion.unknowns.layout.na else np.array
         for move in moved:
             pulled = move(x[at])
             program = fit.pose(np.concatenate([pulled, x[at.stop :]]), one.at, 0.0)
