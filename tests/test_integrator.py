@@ -11,6 +11,7 @@ import optid
 from formulations.constraints.poles import integrator, stable
 from optid import Data
 from optid.errors import InfeasibleError, StructureError
+from optid.identify.advice import advise_on_poles
 from optid.models import HammersteinTF, Nonlinearity, roots
 from optid.program.solution import Status
 
@@ -18,7 +19,7 @@ from optid.program.solution import Status
 def tank(seed, drift=0.0, noise=0.02, samples=600):
     """Return the level of a tank: the integral of .02 (u - 20), delayed by one sample, with a drift."""
     rng = np.random.default_rng(seed)
-    u = np.repeat(rng.choice([-3.0, -1.0, 0.0, 2.0, 3.0], samples // 20), 20)
+    u = np.repeat(rng.uniform(-3.0, 3.0, samples // 20), 20)
     level = 50 + np.concatenate([[0.0], np.cumsum(0.02 * u + drift)[:-1]])
     return Data(20 + u, level + noise * rng.standard_normal(samples))
 
@@ -132,12 +133,10 @@ def test_advice_and_verdict_call_a_pole_at_one_an_integrator():
         for name in ("arx", "oe.exact"):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                steps = [one.step for one in optid.fit(tank(seed), name, **ORDERS).advice]
-            assert "--constraint integrator" in steps and not any("stable" in step for step in steps)
+                free = optid.fit(tank(seed), name, **ORDERS)
+            assert [one.step for one in advise_on_poles(free)] == ["--constraint integrator"]
             held = optid.fit(tank(seed), name, constraints=[integrator()], **ORDERS)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                assert not any("integrator" in one.step or "stable" in one.step for one in held.advice)
+            assert not list(advise_on_poles(held))
             part, = [one for one in held.verdict.parts if one.name == "stability"]
             assert part.value == "integrates" and part.passed
 
@@ -149,7 +148,7 @@ def test_a_pole_far_outside_the_circle_keeps_its_advice():
     fit = optid.fit(data, "arx", **ORDERS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        assert [one.step for one in fit.advice if "constraint" in one.step] == ["--constraint stable:0.99"]
+        assert [one.step for one in advise_on_poles(fit)] == ["--constraint stable:0.99"]
         parts = fit.verdict.parts
     part, = [one for one in parts if one.name == "stability"]
     assert part.value == "unstable" and not part.passed
@@ -159,7 +158,7 @@ def test_a_fast_stable_plant_is_not_called_an_integrator():
     rng = np.random.default_rng(0)
     u = rng.standard_normal(300)
     data = Data(u, lfilter([0, 1], [1, -0.95], u) + 0.1 * rng.standard_normal(300))
-    assert not any("integrator" in one.step for one in optid.fit(data, "oe.exact", **ORDERS).advice)
+    assert not list(advise_on_poles(optid.fit(data, "oe.exact", **ORDERS)))
 
 
 @pytest.mark.parametrize(("name", "arguments", "words"), [
@@ -168,7 +167,7 @@ def test_a_fast_stable_plant_is_not_called_an_integrator():
     ("hammerstein_oe.shooting", {**ORDERS, "basis": "polynomial:2"}, r"hammerstein_oe\.exact")])
 def test_what_cannot_integrate_says_so(name, arguments, words):
     with pytest.raises(StructureError, match=words):
-        optid.fit(tank(0, samples=200), name, constraints=[integrator()], **arguments)
+        optid.fit(tank(0), name, constraints=[integrator()], **arguments)
 
 
 def test_several_outputs_and_contradictions_are_refused():

@@ -131,7 +131,8 @@ def simulated_errors(data, a, b, states, levels):
 def test_simulation_errors_with_levels_are_those_of_brute_force(name):
     rng = np.random.default_rng(3)
     us = [rng.uniform(-1, 1, 50 + 9 * i) for i in range(4)]
-    data = Data(us, [rng.normal(0, 20) + lfilter([0, 0.5], [1, -0.8], u) + 0.2 * rng.standard_normal(len(u)) for u in us])
+    data = Data(us, [rng.normal(0, 20) + lfilter([0, 0.5], [1, -0.8], u) + 0.2 * rng.standard_normal(len(u))
+                     for u in us])
     count = data.n_experiments
 
     def errors(x):
@@ -141,7 +142,8 @@ def test_simulation_errors_with_levels_are_those_of_brute_force(name):
     best = least_squares(errors, np.concatenate([[-0.8, 0.5], np.zeros(count), means]), xtol=1e-14, ftol=1e-14)
     orders = {"na": 1, "nb": 1, "nk": 1} if name == "oe.exact" else {"nx": 1, "feedthrough": False}
     fit = optid.fit(data, name, offset="each", **orders)
-    energy = sum(float(np.sum((e.y - run) ** 2)) for e, run in zip(data.experiments, fit.model.simulate(data, x0="fit")))
+    runs = fit.model.simulate(data, x0="fit")
+    energy = sum(float(np.sum((e.y - run) ** 2)) for e, run in zip(data.experiments, runs))
     assert energy == pytest.approx(2 * best.cost, rel=1e-7)
     assert fit.model.poles[0].real == pytest.approx(-best.x[0], abs=1e-5)
     scale = 1 + best.x[0] if name == "oe.exact" else 1.0

@@ -49,8 +49,8 @@ def collect_by_experiment(data: Data, layout: Layout, weights: Sequence[Array] |
     parts = _by_experiment(accumulate, data, layout, weights)
     for i, part in enumerate(parts, start=1):
         if not part.rows:
-            raise RankError(f"Experiment {i} has no complete row, so that its constant is unknown: leave it out, or use "
-                            "fewer lags.")
+            raise RankError(f"Experiment {i} has no complete row, so that its constant is unknown: leave it out, or "
+                            "use fewer lags.")
     found, means = _about_means(parts)
     found.check()
     if found.condition > CONDITION_LIMIT or found.remainder < LEAST_REMAINDER:
