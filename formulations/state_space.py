@@ -225,8 +225,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
     constants = check_offset(offset, record)
     if constants == "each":
         if feedback_basis is not None or extend is not None or finish is not None:
-            raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant "
-                                 "for all experiments: offset='each' is for 'ss.exact' and 'hammerstein_ss.exact' without "
+            raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant for "
+                                 "all experiments: offset='each' is for 'ss.exact' and 'hammerstein_ss.exact' without "
                                  "feedback, and for transfer functions")
         data = levelled(record)[0]
     instruments = "inputs+past" if feedback_basis is None else "simulated"
