@@ -355,3 +355,16 @@ def test_every_output_of_a_state_space_model_has_its_levels(criterion):
     fit = optid.fit(Data(us, ys), "ss.exact", nx=2, offset="each", criterion=criterion, feedthrough=False)
     assert np.ravel(fit.model.static_gain(0.0)) == pytest.approx([2.5, 1 / 0.6], rel=0.02)
     assert fit.model.levels - fit.model.levels.mean(axis=0) == pytest.approx(zeros - zeros.mean(axis=0), abs=0.1)
+
+
+def test_an_input_that_is_constant_within_every_experiment_is_refused():
+    rng = np.random.default_rng(0)
+    us = [np.column_stack([rng.standard_normal(60), np.full(60, rng.normal())]) for _ in range(5)]
+    ys = [lfilter([0, 1.0], [1, -0.5], u[:, 0]) + 2 * u[:, 1] + 0.1 * rng.standard_normal(60) for u in us]
+    held, both = Data([u[:, 1] for u in us], ys), Data(us, ys)
+    for name, more in (("arx", {}), ("oe.exact", {}), ("armax.exact", {"nc": 1})):
+        for data in (held, both):
+            with pytest.raises(RankError, match=r"u2?\(k-1\).*constant within every experiment"):
+                optid.fit(data, name, na=1, nb=1, nk=1, offset="each", **more)
+    with pytest.raises(RankError):
+        optid.fit(both, "ss.exact", nx=1, offset="each")
