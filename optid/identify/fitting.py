@@ -50,6 +50,7 @@ class Fit(Rendered):
         findings: of the checks of the record, one sentence each.
         seconds: wall time of the whole call.
         settings: solver, accuracy and other settings of the solve.
+        cross_validated: fits in % of the blocks that were left out when the structure was searched, and the pooled one.
     """
 
     outcome: Outcome = field(repr=False)
@@ -60,6 +61,7 @@ class Fit(Rendered):
     findings: tuple[str, ...] = ()
     seconds: float = 0.0
     settings: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    cross_validated: tuple[tuple[float, ...], float] | None = None
 
     @property
     def program(self) -> Program:
@@ -162,17 +164,15 @@ class Fit(Rendered):
     @cached_property
     def verdict(self) -> Any:
         """Tests of the model on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
-        return self.judged() if isinstance(self.data, Data) and self.model is not None else None
-
-    def judged(self, cross_validated: Sequence[float] | None = None, pooled: float | None = None) -> Any:
-        """Return the verdict on the model, by fits of blocks that were left out where there are some."""
         from optid.identify.verdict import verdict
 
+        if not isinstance(self.data, Data) or self.model is None:
+            return None
         try:
             known = self.uncertainty
         except OptidError:
             known = None
-        return verdict(self.model, self._record(), cross_validated, pooled, known)
+        return verdict(self.model, self.data, *(self.cross_validated or (None, None)), known)
 
     @cached_property
     def advice(self) -> tuple[Any, ...]:

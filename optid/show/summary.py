@@ -70,7 +70,7 @@ def judgement(found: "Verdict") -> str:
 
 def verdict_table(found: "Verdict") -> Table:
     """The tests behind the verdict on a model, each with its value and outcome."""
-    rows = [(part.name, part.value, "PASS" if part.passed else "FAIL") for part in found.parts]
+    rows = [(part.name, part.value, part.outcome) for part in found.parts]
     return Table("", ("test", "value", "outcome"), rows)
 
 
