@@ -248,9 +248,4 @@ def aligned(model: Any, reference: Any) -> Any:
     """Give every f and B of a model the sign nearest to that of a reference; predictions do not change."""
     signs = np.array([-1.0 if float(np.sum(f.mu * other.mu)) < 0 else 1.0
                       for f, other in zip(model.nonlinearities, reference.nonlinearities)])
-    if np.all(signs > 0):
-        return model
-    turned = tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities))
-    if model.structure == "ss":
-        return replace(model, B=model.B * signs, D=model.D * signs, nonlinearities=turned)
-    return replace(model, b=tuple(sign * b for sign, b in zip(signs, model.b)), nonlinearities=turned)
+    return model if np.all(signs > 0) else model.turned(signs)

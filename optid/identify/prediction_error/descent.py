@@ -89,6 +89,10 @@ class Criterion(ABC):
         """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge: its norm."""
         return float(np.linalg.norm(x[self.unknowns.slices[b]]))
 
+    @abstractmethod
+    def gain_sign(self, x: Array, b: str) -> float:
+        """Return 1 where an output of the model at x rises with what part b of x takes in, -1 where it falls."""
+
     def normalised(self, x: Array) -> Array:
         """Return the same model in the gauge."""
         x, at = np.array(x), self.unknowns.slices
