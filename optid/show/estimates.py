@@ -6,28 +6,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.bases.splines import Triangular
-from optid.errors import OptidError
 from optid.identify.parameters import Parameter, Parameters, function_parameters
+from optid.identify.parameters import uncertainty_or_reason as uncertainty
 from optid.models.functions import static_functions
 from optid.show.wording import Table, number
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
-    from optid.identify.uncertainty import Uncertainty
 
 MOST_NODES, EVEN = 20, 11
 """A piecewise linear f with fewer cells than the first is listed at its nodes, any other at so many points."""
 
 MOST_ROWS, ABREAST = 12, 3
 """More coefficients than the first, without errors to show, are set in so many columns."""
-
-
-def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:
-    """Return the uncertainty of a fit, or None and the reason why there is none."""
-    try:
-        return fit.uncertainty, ""
-    except OptidError as error:
-        return None, str(error)
 
 
 def parameter_tables(fit: "Fit") -> list[Table]:
@@ -82,16 +73,18 @@ def coefficient_table(fit: "Fit") -> Table | None:
 
 
 def parameters_table(found: Parameters) -> Table:
-    """Every parameter with its interval."""
-    note = f"No standard errors: {found.reason.rstrip('.')}." if found.reason else ""
-    return _parameter_table("Parameters", found, bool(found.reason), found.level, note)
+    """Every parameter with its interval, and its unit where one is known."""
+    reason = [f"No standard errors: {found.reason.rstrip('.')}."] if found.reason else []
+    return _parameter_table(found.title, found, bool(found.reason), found.level, " ".join([*reason, *found.notes]))
 
 
 def _parameter_table(title: str, rows: Iterable[Parameter], bare: bool, level: float = 0.95, note: str = "") -> Table:
-    if bare:
-        return Table(title, ("parameter", "estimate"), [(row.name, number(row.estimate)) for row in rows], note)
-    ends = (f"{100 * level:g} % low", f"{100 * level:g} % high")
-    return Table(title, ("parameter", "estimate", "std. error", *ends), [_interval_row(*row) for row in rows])
+    listed, ends = list(rows), (f"{100 * level:g} % low", f"{100 * level:g} % high")
+    head = ("parameter", "estimate") if bare else ("parameter", "estimate", "std. error", *ends)
+    cells = [(row.name, number(row.estimate)) if bare else _interval_row(*row[:5]) for row in listed]
+    if any(row.unit for row in listed):
+        head, cells = (*head, "unit"), [(*line, row.unit) for line, row in zip(cells, listed)]
+    return Table(title, head, cells, note)
 
 
 def _interval_row(
@@ -99,15 +92,20 @@ def _interval_row(
 ) -> tuple[str, ...]:
     """Write an estimate to the second digit of its standard error, as one reads it in a paper.
 
-    Errors far below `size` are roundoff: the gauge or the basis fixes the value.
+    Errors far below `size` are roundoff: the gauge or the basis fixes the value. An error that is not known is a dash, an
+    end that does not exist "none".
     """
     size = max(size, abs(value))
+    if np.isnan(error):
+        return name, number(value), "-", "-", "-"
     if not error > 1e-9 * size:
         return name, number(value if abs(value) > 1e-9 * size else 0.0), "fixed", "-", "-"
-    decimals = 1 - int(np.floor(np.log10(error)))
-    if decimals > 7 or max(abs(value), abs(lower), abs(upper)) >= 1e7:
-        return name, f"{value:.4e}", f"{error:.1e}", f"{lower:.4e}", f"{upper:.4e}"
-    return name, *(f"{x:.{max(decimals, 0)}f}" for x in (value, error, lower, upper))
+    decimals, cells = 1 - int(np.floor(np.log10(error))), (value, error, lower, upper)
+    if decimals > 7 or max(abs(x) for x in cells if np.isfinite(x)) >= 1e7:
+        written = [f"{x:.{1 if x is error else 4}e}" for x in cells]
+    else:
+        written = [f"{x:.{max(decimals, 0)}f}" for x in cells]
+    return name, *("none" if np.isinf(x) else word for x, word in zip(cells, written))
 
 
 def _basis(basis: Any) -> str:

@@ -105,10 +105,7 @@ class StateErrors(Criterion):
 
     def gain_sign(self, x: Array, b: str) -> float:
         """Return the sign of the gain from an input, or of the largest entry of what a latent signal adds."""
-        if b.startswith("b"):
-            return float(self._placed(x)[1].gain_signs[int(b[1:])])
-        part = x[self.unknowns.slices[b]]
-        return -1.0 if part[np.argmax(np.abs(part))] < 0 else 1.0
+        return float(self._placed(x)[1].gain_signs[int(b[1:])]) if b.startswith("b") else super().gain_sign(x, b)
 
     def gauge_rows(self, x: Array) -> Array:
         """Orthonormal directions (rows, shared) of theta that a step does not take, since they change no output."""

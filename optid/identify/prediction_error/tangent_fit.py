@@ -228,8 +228,8 @@ class _Iterate:
     def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
         bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
         values, value = self.fit.places.values(self.x), self.fit.criterion.unit * self.at.value
-        model = self.fit.recover(values)
-        model = model.turned(self.fit.turns(self.x, self.at)) if self.fit.constraints else model
+        model, turns = self.fit.recover(values), self.fit.turns(self.x, self.at) if self.fit.constraints else np.ones(1)
+        model = model.turned(turns) if np.any(turns < 0) else model
         return Evidence(model, value, bound, status, reason, figures, values=values)
 
 
