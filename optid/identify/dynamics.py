@@ -29,10 +29,10 @@ def dynamics(model: Any, levels: Levels, known: Any = None, reason: str = "", le
     """Return time constants by size, damping and natural frequencies, dead times, and static gains or slopes.
 
     The dead time of an input is nk - 1 samples, and zero for nk = 0 and nk = 1: an input held over its sampling time
-    acts on the next sample (lag 1) without any dead time. A true dead time that is no multiple of the sampling time may
-    be longer by less than one sample. Where f is nonlinear the static gain is the slope of the static characteristic
-    between the two levels given, over the middle half of the input's range. A model that integrates has a slope instead:
-    how fast the output moves for a unit of the input.
+    acts on the next sample (lag 1) without any dead time. A true dead time that is no multiple of the sampling time is
+    longer by less than one sample. Where f is nonlinear the static gain is the slope of the static characteristic over
+    the middle half of the input's range, between two levels that a note states. A model that integrates has a slope
+    instead: how fast the output moves for a unit of the input.
 
     Args:
         model: the model.
@@ -70,7 +70,7 @@ def middle(low: float, high: float) -> tuple[float, float]:
 
 
 def integrating_pole(model: Any, known: Any = None) -> tuple[float, str]:
-    """Return a real pole that is 1, or that the record does not tell from 1, and the sentence about it; NaN, "" for none.
+    """Return a real pole that is 1, or not told from 1 by the record, and the sentence about it; NaN, "" for none.
 
     With nonlinear feedback, or functions of latent signals, the poles of the linear part do not decide.
     """
@@ -123,6 +123,17 @@ def jumps(model: Any, c: int, low: float, high: float) -> Array:
     return np.array([f(high) - f(low) if place == c else 0.0 for f, place in zip(model.nonlinearities, places)])
 
 
+def mean_slopes(model: Any, levels: Levels) -> Array:
+    """Return the range of every function of the inputs over that of its input (r,), negative where it falls."""
+    if not model.nonlinearities:
+        return np.ones(model.m)
+    found = []
+    for f, c in zip(model.nonlinearities, getattr(model, "input_of", range(model.m))):
+        values = f(np.linspace(*levels[c], 201))
+        found.append(float(np.copysign(np.ptp(values), values[-1] - values[0])) / (levels[c][1] - levels[c][0]))
+    return np.array(found)
+
+
 @dataclass(eq=False)
 class _Reading:
     model: Any
@@ -162,7 +173,7 @@ class _Reading:
         delays = sum(abs(pole) <= AT_ZERO for pole in poles)
         poles = [pole for pole in poles if abs(pole) > AT_ZERO]
         if delays:
-            self.notes.append(f"{delays} pole{'s' * (delays > 1)} at zero: so many samples of delay, no time constant.")
+            self.notes.append(f"Poles at zero, which are samples of delay and have no time constant: {delays}.")
         if has_feedback(model) and poles:
             self.notes.append("Time constants of the linear part: those of the whole depend on the level of the output.")
         kinds = ["pair" if pole.imag else "negative" if pole.real < 0 else "integrates" if abs(pole - 1) <= AT_ONE
@@ -242,8 +253,8 @@ class _Reading:
         for c, (name, nk) in enumerate(zip(model.inputs, model.nk)):
             more = self._insignificant(c)
             if more:
-                self.notes.append(f"The first {more} coefficients of B of {name} are not significant: the dead time may "
-                                  f"be up to {self._time(max(nk + more - 1, 0))}.")
+                self.notes.append(f"The first coefficients of B of {name} are not significant ({more}): the dead time "
+                                  f"may be up to {self._time(max(nk + more - 1, 0))}.")
             found.append(Parameter(f"dead time{self._of(name)}", max(nk - 1, 0) * model.dt, unit=self.time))
         return found
 

@@ -26,7 +26,7 @@ def parameter_tables(fit: "Fit") -> list[Table]:
     known, reason = uncertainty(fit)
     found = []
     if known is not None:
-        rows = [_interval_row(name, *row) for name, *row in known.table()]
+        rows = [interval_row(name, *row) for name, *row in known.table()]
         state_space = fit.model.structure == "ss"
         found.append(Table("Poles and static gain" if state_space else "Parameters",
                            ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows))
@@ -40,12 +40,15 @@ def parameter_tables(fit: "Fit") -> list[Table]:
     return [*found, Table(title, ("parameter", "estimate") * ABREAST, _abreast(rows), note)]
 
 
-def nonlinearity_tables(fit: "Fit") -> list[Table]:
-    """Values of every nonlinearity at a few points, with their pointwise bands where there are some."""
+def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:
+    """Values of nonlinearities at a few points, with their pointwise bands where there are some.
+
+    Those of the inputs, in the gauge of the model, or those of outputs that are fed back and of latent signals.
+    """
     found = []
     known, _ = uncertainty(fit)
     for function in static_functions(fit.model):
-        if function.is_linear:
+        if function.is_linear or inputs != (function.family == "nonlinearities"):
             continue
         f = function.nonlinearity
         basis: Any = f.basis
@@ -57,7 +60,7 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
             band = known.band(function.index, points, family=function.family)
             numeric = zip(points, band.value, band.error, band.lower, band.upper)
             size = float(np.max(np.abs(band.value)))
-            rows = [_interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
+            rows = [interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
             head = ("std. error", "95 % low", "95 % high")
         title = f"{function.what} {function.word}, basis {_basis(f.basis)}"
         found.append(Table(title, (label, function.word, *head), rows))
@@ -81,19 +84,19 @@ def parameters_table(found: Parameters) -> Table:
 def _parameter_table(title: str, rows: Iterable[Parameter], bare: bool, level: float = 0.95, note: str = "") -> Table:
     listed, ends = list(rows), (f"{100 * level:g} % low", f"{100 * level:g} % high")
     head = ("parameter", "estimate") if bare else ("parameter", "estimate", "std. error", *ends)
-    cells = [(row.name, number(row.estimate)) if bare else _interval_row(*row[:5]) for row in listed]
+    cells = [(row.name, number(row.estimate)) if bare else interval_row(*row[:5]) for row in listed]
     if any(row.unit for row in listed):
         head, cells = (*head, "unit"), [(*line, row.unit) for line, row in zip(cells, listed)]
     return Table(title, head, cells, note)
 
 
-def _interval_row(
+def interval_row(
     name: str, value: float, error: float, lower: float, upper: float, size: float = 0.0
 ) -> tuple[str, ...]:
     """Write an estimate to the second digit of its standard error, as one reads it in a paper.
 
-    Errors far below `size` are roundoff: the gauge or the basis fixes the value. An error that is not known is a dash, an
-    end that does not exist "none".
+    Errors far below `size` are roundoff: the gauge or the basis fixes the value. An error that is not known is a dash,
+    an end that does not exist "none".
     """
     size = max(size, abs(value))
     if np.isnan(error):
