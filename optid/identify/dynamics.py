@@ -2,10 +2,12 @@
 
 A pole p of the sampled model is exp(s dt): a real one between 0 and 1 has the time constant -dt / log p, a complex pair
 the natural frequency |s| and the damping -Re s / |s|. The interval of a time constant is that of its pole, mapped: it
-has no upper end where that of the pole contains 1. The other errors follow from the derivatives of the quantities.
+has no upper end where that of the pole contains 1. A static gain is a quotient by A(1) = prod (1 - p), which a slow
+plant leaves uncertain: its interval is that of Fieller (J. R. Statist. Soc. B 16, 1954). The other errors follow from
+the derivatives of the quantities.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -134,6 +136,11 @@ def mean_slopes(model: Any, levels: Levels) -> Array:
     return np.array(found)
 
 
+def _parameter(name: str, row: Iterable[Any], unit: str = "") -> Parameter:
+    estimate, error, lower, upper = map(float, row)
+    return Parameter(name, estimate, error, lower, upper, unit)
+
+
 @dataclass(eq=False)
 class _Reading:
     model: Any
@@ -175,7 +182,7 @@ class _Reading:
         if delays:
             self.notes.append(f"Poles at zero, which are samples of delay and have no time constant: {delays}.")
         if has_feedback(model) and poles:
-            self.notes.append("Time constants of the linear part: those of the whole depend on the level of the output.")
+            self.notes.append("Time constants of the linear part: those of the loop depend on the level of the output.")
         kinds = ["pair" if pole.imag else "negative" if pole.real < 0 else "integrates" if abs(pole - 1) <= AT_ONE
                  else "growth" if pole.real > 1 else "decay" for pole in poles]
         found, counts = [], dict.fromkeys(kinds, 0)
@@ -201,21 +208,21 @@ class _Reading:
             self.notes.append("A time constant without upper end: the record does not tell its pole from 1, the plant "
                               "may integrate.")
         row = -dt / np.log(p), error * dt / (p * np.log(p) ** 2), *ends
-        return [Parameter(f"time constant{number}", *map(float, row), self.time)]
+        return [_parameter(f"time constant{number}", row, self.time)]
 
     def _growth(self, pole: complex, number: str) -> list[Parameter]:
         p, error, low, high = self._real(pole)
         dt = self.model.dt
         if low <= 1:
-            return [Parameter(f"pole{number}", p, error, low, high)]
+            return [_parameter(f"pole{number}", (p, error, low, high))]
         ends = [dt / np.log(end) for end in (high, low)]
         self.notes.append("Time constant of growth: a pole above 1, the model is unstable.")
         row = dt / np.log(p), error * dt / (p * np.log(p) ** 2), *ends
-        return [Parameter(f"time constant of growth{number}", *map(float, row), self.time)]
+        return [_parameter(f"time constant of growth{number}", row, self.time)]
 
     def _negative(self, pole: complex, number: str) -> list[Parameter]:
         self.notes.append("A negative real pole alternates from sample to sample: it has no time constant.")
-        return [Parameter(f"negative pole{number}", *map(float, self._real(pole)))]
+        return [_parameter(f"negative pole{number}", self._real(pole))]
 
     def _integrates(self, pole: complex, number: str) -> list[Parameter]:
         return []  # its slopes say it
@@ -234,8 +241,8 @@ class _Reading:
             self.notes.append(f"The pair of poles at {pole.real:.4g} is nearly real: no standard error of its damping.")
             rows[:, 1:] = np.nan
         unit = {"samples": "sample"}.get(self.time, self.time)
-        return [Parameter(f"natural frequency{number}", *map(float, rows[0]), f"rad/{unit}" if unit else "rad"),
-                Parameter(f"damping{number}", *map(float, rows[1]))]
+        return [_parameter(f"natural frequency{number}", rows[0], f"rad/{unit}" if unit else "rad"),
+                _parameter(f"damping{number}", rows[1])]
 
     # -- inputs ----------------------------------------------------------------------------------------------------
 
@@ -295,14 +302,41 @@ class _Reading:
     def _gains(self, c: int, low: float, high: float) -> list[Parameter]:
         model = self.model
         if hasattr(model, "static_curve"):
-            rows = self.limits("static gain", lambda model: np.diff(
+            rows = self._quotients(lambda model: np.diff(
                 model.static_curve(c, np.array([low, high])), axis=0)[0] / (high - low))
         else:
             rows = self.limits("static gain", lambda model: np.reshape(
                 model.static_gain(self._middle()), (model.l, model.m))[:, c])
-        return [Parameter(f"static gain{self._of(model.inputs[c], name)}", *map(float, row),
-                          self._ratio(unit, model.input_units[c]))
+        return [_parameter(f"static gain{self._of(model.inputs[c], name)}", row,
+                           self._ratio(unit, model.input_units[c]))
                 for name, unit, row in zip(model.outputs, model.output_units, rows)]
+
+    def _quotients(self, gains: Callable[[Any], Array]) -> Array:
+        """Return the rows of static gains (l,), quotients by A(1), with the intervals of Fieller where they apply."""
+        rows = self.limits("static gain", gains)
+        fed = has_feedback(self.model) or getattr(self.model, "latent", ())
+        if self.known is None or fed or not poles_of(self.model).size or np.isnan(rows).any():
+            return rows
+
+        def below(model: Any) -> float:
+            return float(np.prod(1 - poles_of(model)).real)
+
+        parts = self.known.of(lambda model: np.append(gains(model) * below(model), below(model)))
+        sizes = np.where(parts.error > 0, parts.error, 1.0)
+        both = self.known.of(lambda model: gains(model) * below(model) / sizes[:-1] + below(model) / sizes[-1])
+        for o, row in enumerate(rows):
+            (n, d), (sn, sd) = parts.value[[o, -1]], parts.error[[o, -1]]
+            wide = rows[o, 3] - rows[o, 2]
+            if not min(row[1], sn, sd) > 0 or abs(row[3] + row[2] - 2 * row[0]) > 1e-6 * wide:
+                continue  # bounds by inequalities are not symmetric: theirs stay
+            t, covariance = wide / (2 * row[1]), sn * sd * (both.error[o] ** 2 / 2 - 1)
+            square, half, rest = d**2 - (t * sd) ** 2, n * d - t**2 * covariance, n**2 - (t * sn) ** 2
+            if square <= 0 or half**2 < square * rest:
+                row[2:] = -np.inf, np.inf
+            else:
+                root = np.sqrt(half**2 - square * rest)
+                row[2:] = (half - root) / square, (half + root) / square
+        return rows
 
     def _slopes(self, c: int, low: float, high: float) -> list[Parameter]:
         model, count = self.model, slope_samples(self.model)
@@ -312,8 +346,8 @@ class _Reading:
             return last @ jumps(model, c, low, high) / (high - low) / model.dt
 
         unit = f"{model.input_units[c]} {self.time}".strip()
-        return [Parameter(f"slope{self._of(model.inputs[c], name)}", *map(float, row),
-                          self._ratio(y, f"({unit})" if " " in unit else unit))
+        return [_parameter(f"slope{self._of(model.inputs[c], name)}", row,
+                           self._ratio(y, f"({unit})" if " " in unit else unit))
                 for name, y, row in zip(model.outputs, model.output_units, self.limits("slope", quantity))]
 
     def _middle(self) -> Array:

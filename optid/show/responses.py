@@ -1,6 +1,6 @@
 """Characteristics and step responses in the units of the outputs, as charts and tables, for every document."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +41,7 @@ def fit_responses(fit: Any, known: Any) -> tuple[list[Response], list[str]]:
     return responses(fit.model, input_levels(fit.model, record), known, longest(record))
 
 
-def curve_charts(curves: dict[str, Sequence[Response]], models: Sequence[Any], record: Data | None) -> list[Drawn]:
+def curve_charts(curves: Mapping[str, Sequence[Response]], models: Sequence[Any], record: Data | None) -> list[Drawn]:
     """Draw the curves of models by their labels, one chart for each input, output and kind, with bands if known."""
     groups: dict[tuple[int, int, str], list[tuple[str, Response, str]]] = {}
     for k, (label, found) in enumerate(curves.items()):
@@ -60,9 +60,8 @@ def _chart(part: list[tuple[str, Response, str]], model: Any, record: Data | Non
         series.append(Series(label, one.at, one.value, colour=colour, width=2.2))
     name, unit, channel = model.outputs[first.output], model.output_units[first.output], model.inputs[first.input]
     low, high = first.levels
-    of = f"{name} " if model.l > 1 else ""
     if first.kind == "step":
-        title = f"Step response {f'of {of}' if of else ''}to {channel} from {low:.3g} to {high:.3g}"
+        title = f"Step response of {name} to {channel} from {low:.3g} to {high:.3g}"
         caption = f"Change of {name} as {channel} goes from one level to the other."
         return Chart(title, caption, response_axis(model), channel_axis(name, unit), series, height=300)
     if record is not None:
@@ -73,7 +72,7 @@ def _chart(part: list[tuple[str, Response, str]], model: Any, record: Data | Non
         title, y = f"Rate of {name} against {channel}", Axis(f"rate of {name} ({rate_unit(model, first.output)})")
         caption = f"How fast {name} moves with {channel} held, above its rate at {low:.3g}."
     else:
-        title, y = f"Static characteristic of {of + 'against ' if of else ''}{channel}", channel_axis(name, unit)
+        title, y = f"Static characteristic of {name} against {channel}", channel_axis(name, unit)
         caption = f"{name} at rest{'; the functions of the other inputs are at zero' if model.m > 1 else ''}."
     return Chart(title, caption, channel_axis(channel, model.input_units[first.input]), y, series, height=300)
 
@@ -107,10 +106,10 @@ def _curve_table(one: Response, model: Any) -> Table:
         against, places = channel_axis(channel, model.input_units[one.input]).title, _listed(one, model)
     rows, head = np.unique(np.round(places).astype(int)), (against, channel_axis(name, unit).title)
     if not one.has_band:
-        return Table(title, head, [(number(one.at[k], 4), number(one.value[k])) for k in rows])
-    size = float(np.nanmax(np.abs(one.value)))
+        return Table(title, head, [(number(float(one.at[k]), 4), number(float(one.value[k]))) for k in rows])
+    size, bands = float(np.nanmax(np.abs(one.value))), np.column_stack([one.value, one.error, one.lower, one.upper])
     return Table(title, (*head, "std. error", "95 % low", "95 % high"), [
-        interval_row(number(one.at[k], 4), one.value[k], one.error[k], one.lower[k], one.upper[k], size) for k in rows])
+        interval_row(number(float(one.at[k]), 4), *map(float, bands[k]), size=size) for k in rows])
 
 
 def _listed(one: Response, model: Any) -> Any:
@@ -152,7 +151,7 @@ def comparison_dynamics(found: Any) -> Table:
                  " ".join(dict.fromkeys(note for _, part in parts for note in part.notes)))
 
 
-def comparison_tables(curves: dict[str, Sequence[Response]], model: Any) -> list[Table]:
+def comparison_tables(curves: Mapping[str, Sequence[Response]], model: Any) -> list[Table]:
     """Set the characteristics and the step responses of models side by side, a row for each model."""
     tables = []
     keys = dict.fromkeys((one.input, one.output, one.kind) for found in curves.values() for one in found)
