@@ -254,7 +254,7 @@ class _Reading:
         if not hasattr(model, "nk"):
             return []
         direct = [name for name, nk in zip(model.inputs, model.nk) if nk == 0]
-        self.notes.append("Dead time: nk - 1 samples, as given (a held input acts on the next sample without any)" + (
+        self.notes.append("Dead time: nk - 1 samples, as given" + (
             f"; with nk = 0 {', '.join(direct)} acts on the same sample." if direct else "."))
         found = []
         for c, (name, nk) in enumerate(zip(model.inputs, model.nk)):
