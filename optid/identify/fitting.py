@@ -125,7 +125,8 @@ class Fit(Rendered):
     def simulation_fit(self) -> np.ndarray:
         """Simulation fit in % of every output on the estimation record, initial conditions fitted.
 
-        NaN for a stream, where an input has missing samples, and where the simulation diverges.
+        NaN for a stream, and where the simulation diverges; missing inputs are left out, with an initial state after
+        each.
         """
         return self._fit("simulation")
 
@@ -147,12 +148,32 @@ class Fit(Rendered):
 
         return uncertainty(self)
 
+    @property
+    def informativity(self) -> Any:
+        """What the record can tell (`optid.identify.informativity.Informativity`); None for a stream."""
+        from optid.identify.informativity import informativity
+
+        return informativity(self.data) if isinstance(self.data, Data) else None
+
+    @property
+    def record_findings(self) -> tuple[str, ...]:
+        """What reading the record found, and what it can tell, one sentence each."""
+        return (*self.data.findings, *(self.informativity.findings if isinstance(self.data, Data) else ()))
+
     @cached_property
     def verdict(self) -> Any:
         """Tests of the model on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
+        return self.judged() if isinstance(self.data, Data) and self.model is not None else None
+
+    def judged(self, cross_validated: Sequence[float] | None = None, pooled: float | None = None) -> Any:
+        """Return the verdict on the model, by fits of blocks that were left out where there are some."""
         from optid.identify.verdict import verdict
 
-        return verdict(self.model, self.data) if isinstance(self.data, Data) and self.model is not None else None
+        try:
+            known = self.uncertainty
+        except OptidError:
+            known = None
+        return verdict(self.model, self._record(), cross_validated, pooled, known)
 
     @cached_property
     def advice(self) -> tuple[Any, ...]:
