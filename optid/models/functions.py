@@ -10,6 +10,8 @@ from optid.data.record import Data
 from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 
+LONGEST_STEP, SETTLED = 400, 0.02
+
 
 @dataclass(frozen=True, eq=False)
 class StaticFunction:
@@ -75,6 +77,17 @@ def latent_names(model: Any) -> tuple[list[str], list[str]]:
 def has_feedback(model: Any) -> bool:
     """Whether outputs are fed back through static functions, so that a simulation may take them from a record."""
     return bool(getattr(model, "feedback", ()))
+
+
+def step_length(model: Model) -> int:
+    """Return the number of samples after which the step response of the linear part has settled within 2 %.
+
+    At least 20 and at most 400, and 50 for an unstable model, whose response does not settle.
+    """
+    if not model.is_stable:
+        return 50
+    decay = 0 if model.radius == 0 else int(np.ceil(np.log(SETTLED) / np.log(model.radius)))
+    return int(np.clip(1.5 * decay, 20, LONGEST_STEP))
 
 
 def response_pairs(model: Model) -> list[tuple[str, str]]:
