@@ -26,7 +26,8 @@ from optid.errors import (
     nearest,
 )
 from optid.identify.arguments import violations
-from optid.identify.parameters import Parameters, criteria, parameters
+from optid.identify.dynamics import dynamics, input_levels
+from optid.identify.parameters import Parameters, criteria, parameters, uncertainty_or_reason
 from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
@@ -192,6 +193,15 @@ class Fit(Rendered):
     def params(self) -> Parameters:
         """Estimates with standard errors and 95 % intervals, by name: ``fit.params["a1"]``."""
         return parameters(self)
+
+    @cached_property
+    def dynamics(self) -> Parameters:
+        """Time constants, damping, dead time and static gain with their units, by name: ``fit.dynamics["dead time"]``.
+
+        See `optid.identify.dynamics.dynamics` for what is counted as dead time, and for models that integrate.
+        """
+        record = self.data.raw() if isinstance(self.data, Data) else None
+        return dynamics(self.model, input_levels(self.model, record), *uncertainty_or_reason(self))
 
     def conf_int(self, level: float = 0.95) -> Parameters:
         """Return the parameters with intervals of this level."""
