@@ -19,7 +19,7 @@ from optid.identify.fitting import Fit, fit
 from optid.identify.search.ladder import CLEAR, EQUAL, FEEDBACK, KINDS, LATENT, LINEAR, RUNGS, Ladder, few_levels
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, spared, tried
-from optid.identify.verdict import Verdict, verdict
+from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
 from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
@@ -62,7 +62,7 @@ class Identification(Rendered):
     def verdict(self) -> Verdict:
         """The quality of the model on the record, by cross-validation."""
         assert isinstance(self.fit.data, Data)
-        return verdict(self.model, self.fit.data, self.chosen.by_block.tolist(), self.chosen.score)
+        return self.fit.judged(self.chosen.by_block.tolist(), self.chosen.score)
 
 
 def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, blocks: int = 4,
