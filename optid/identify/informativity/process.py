@@ -220,19 +220,20 @@ def _found(regression: Regression, u: tuple[Array, ...], levels: int, least: int
     nodes = np.unique(np.quantile(whole, np.linspace(0, 1, NODES)))
     if nodes.size < 4:
         return best
-    term = best.term
+    starts = [best.term] if before is None or before.drive.nodes is None else [before.term, best.term]
     squares = _Drive(tuple((u - whole.mean()) ** 2 for u in straight.values))
     even = scan(regression, squares.values, longest, 1)
     if even and even[0].energy < 0.9 * best.energy and even[0].lag >= least:  # f is nearly even
-        term = _Term.of(even[0].poles, even[0].lag)
-    for _ in range(2):
-        bent = _bent(regression, straight, term, nodes)
-        if bent is None:
-            return best
-        found = _searched(regression, bent, least, longest, term, scanned=False)
-        term = found.term
-        if found.criterion < best.criterion:
-            best = found
+        starts[-1] = _Term.of(even[0].poles, even[0].lag)
+    for term in dict.fromkeys(starts):  # that of a straight f may be far from the one found for a bent f
+        for _ in range(2):
+            bent = _bent(regression, straight, term, nodes)
+            if bent is None:
+                break
+            found = _searched(regression, bent, least, longest, term, scanned=False)
+            term = found.term
+            if found.criterion < best.criterion:
+                best = found
     return best
 
 
