@@ -67,3 +67,28 @@ def _filtered(rows: Array, response: Array) -> Array:
 def _added(total: Array, filtered: Array, root: Array) -> Array:
     rows = np.einsum("co,kop->kcp", root, filtered).reshape(-1, filtered.shape[2])
     return rows.T @ rows + (total if total.size else 0.0)
+
+
+def autoregression(errors: Sequence[Array], most: int) -> Array:
+    """Fit [1, a_1, ...] to errors (N,) per experiment, NaN = missing, by Yule and Walker; its order by Akaike."""
+    from scipy.linalg import solve_toeplitz
+
+    present = [np.isfinite(e) for e in errors]
+    filled = [np.where(here, e, 0.0) for e, here in zip(errors, present)]
+    total = sum(int(here.sum()) for here in present)
+    most = min(most, total - 1)
+    sums, counts = np.zeros((2, max(most, 0) + 1))
+    for e, here in zip(filled, present):
+        for lag in range(min(most, len(e) - 1) + 1):
+            sums[lag] += e[lag:] @ e[: len(e) - lag]
+            counts[lag] += np.count_nonzero(here[lag:] & here[: len(e) - lag])
+    covariance = sums / np.maximum(counts, 1) * (1 - np.arange(sums.size) / max(total, 1))
+    best, least = np.ones(1), total * np.log(max(covariance[0], 1e-300))
+    for order in range(1, most + 1 if covariance[0] > 0 else 0):
+        a = np.concatenate([[1.0], -solve_toeplitz(covariance[:order], covariance[1 : order + 1])])
+        variance = float(a @ covariance[: order + 1])
+        if variance <= 0:
+            break
+        if (criterion := total * np.log(variance) + 2 * order) < least:
+            best, least = a, criterion
+    return best

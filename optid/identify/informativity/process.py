@@ -1,0 +1,402 @@
+"""A low-order transfer function with dead time from every input to every output, before any model is posed.
+
+    y(k) = level + sum_c q^-nk_c B_c(q) / A_c(q) f_c(u_c(k)) + decay + v(k),    N(q) v = white
+
+A bank of poles at all delays gives starts, Gauss-Newton steps over the poles with everything linear projected out
+refine them, and the Bayesian information criterion chooses order, delay, zeros, an integrator, and whether f is
+straight. The scan is repeated after the errors are whitened: coloured noise hides a dead time.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.identify.informativity.bank import scan
+from optid.identify.informativity.signals import Poles, Regression, Signals, delayed, respond
+from optid.models.roots import roots_of
+from optid.statistics.coloured import autoregression
+
+LATEST = 0.25  # longest delay as a share of the longest experiment
+KEPT = 4  # delays of the scan that are refined
+NOISE = 4  # order of the noise model, at most
+TURNS, SETTLED = 5, 0.01  # scans with a better noise model; largest change of its coefficients that is none
+LARGEST = 4  # poles, at most
+PICKED = 4.0  # cost, beside that of a parameter, of a pole or zero more: each is the best of many delays
+SWEEPS = 3  # over several inputs, each fitted beside the others
+LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
+LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice the log likelihood ratio
+UNIT = 0.5  # share of the longest experiment beyond which a time constant is compared with an integrator
+ROUNDING = 1e-13
+STEPS, FARTHEST, NUDGE = 12, 1.0, 1e-6  # of a descent; longest step in a logarithm; step of a difference
+ENOUGH = 1e-3  # fall of twice the log likelihood at which a descent ends
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """The response of an output to an input: ``q^-nk B(q) / A(q)``, in the units of the record.
+
+    Attributes:
+        poles: (n,) of A.
+        nk: lag of the first coefficient of B; a held input acts nk - 1 samples late.
+        b: (nb,) coefficients of B.
+        lag_interval: 95 % interval of nk.
+        nodes, values: of f, piecewise linear with slope one on average; None where it is straight.
+    """
+
+    poles: Poles
+    nk: int
+    b: Array
+    lag_interval: tuple[int, int]
+    nodes: Array | None = None
+    values: Array | None = None
+
+    @property
+    def integrates(self) -> bool:
+        """Whether a pole is 1."""
+        return bool(np.any(self.poles == 1))
+
+    @property
+    def gain(self) -> float:
+        """Static gain B(1)/A(1), infinite with a pole at 1."""
+        rest = float(np.real(np.prod(1 - self.poles)))
+        return float(self.b.sum() / rest) if rest else float(np.copysign(np.inf, self.b.sum()))
+
+    @property
+    def a(self) -> Array:
+        """Coefficients (n,) of A after the leading one."""
+        return np.real(np.poly(self.poles))[1:] if self.poles.size else np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """The responses of one output to all inputs.
+
+    Attributes:
+        output: its name.
+        responses: one per input.
+        noise: polynomial [1, a1, ...] that whitens what they leave.
+        residuals: what they leave, beside level and decay, (T,) per experiment in the unit of the output.
+        explained: share of the variance of the output that they explain.
+        criterion: Bayesian information criterion.
+    """
+
+    output: str
+    responses: tuple[Response, ...]
+    noise: Array
+    residuals: tuple[Array, ...] = field(repr=False)
+    explained: float
+    criterion: float
+
+
+@dataclass(frozen=True)
+class _Term:
+    """Structure of one response: real poles and complex pairs as logarithms of time constants, and angles."""
+
+    taus: tuple[float, ...]  # logarithms
+    pairs: tuple[tuple[float, float], ...]  # (logarithm of the time constant, angle)
+    lag: int
+    zeros: int  # coefficients of B after the first
+    integrates: bool = False
+
+    @classmethod
+    def of(cls, poles: Sequence[complex] | Poles, lag: int, zeros: int = 0) -> "_Term":
+        factors = np.asarray(poles, dtype=complex)
+        real = [_time(float(p.real)) for p in factors if p.imag == 0]
+        # equal time constants have the same derivative
+        spread = [tau + 0.03 * i for i, tau in enumerate(sorted(real))]
+        pairs = [(_time(abs(p)), float(abs(np.angle(p)))) for p in factors if p.imag > 0]
+        return cls(tuple(spread), tuple(pairs), lag, zeros)
+
+    @property
+    def z(self) -> Array:
+        return np.array([*self.taus, *(x for pair in self.pairs for x in pair)])
+
+    def at(self, z: Array) -> "_Term":
+        n = len(self.taus)
+        return replace(self, taus=tuple(z[:n].tolist()), pairs=tuple(map(tuple, z[n:].reshape(-1, 2).tolist())))
+
+    @property
+    def poles(self) -> Poles:
+        real = [np.exp(-np.exp(-tau)) for tau in self.taus]
+        pairs = [np.exp(-np.exp(-tau) + sign * 1j * angle) for tau, angle in self.pairs for sign in (1, -1)]
+        return np.array([*([1.0] * self.integrates), *real, *pairs], dtype=complex)
+
+    @property
+    def order(self) -> int:
+        return len(self.taus) + 2 * len(self.pairs) + self.integrates
+
+
+def _time(modulus: float) -> float:
+    """Logarithm of the time constant of a pole."""
+    return float(np.log(-1 / np.log(np.clip(modulus, 1e-6, 1 - 1e-7))))
+
+
+@dataclass(frozen=True, eq=False)
+class _Drive:
+    """What drives a response: f(u) per experiment, and what its bends cost in parameters."""
+
+    values: tuple[Array, ...]
+    nodes: Array | None = None
+    heights: Array | None = None
+
+    @property
+    def parameters(self) -> int:
+        return 0 if self.nodes is None else self.nodes.size - 2
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A response fitted beside what is projected out: sum of squares and coefficients, and the criterion."""
+
+    term: _Term
+    drive: _Drive
+    energy: float
+    theta: Array
+    criterion: float
+
+
+def processes(data: Data, least: int = 0) -> tuple[Process, ...]:
+    """Find low-order transfer functions with dead time, one `Process` per output; a record of any kind has some.
+
+    Args:
+        data: the record; of a long one the first 30,000 samples are read.
+        least: smallest lag of an input; 1 where the input answers the output without delay, in a loop.
+    """
+    signals = Signals.of(data)
+    return tuple(_process(signals, o, name, least) for o, name in enumerate(data.outputs))
+
+
+def _process(signals: Signals, o: int, name: str, least: int) -> Process:
+    regression = Regression(signals.outputs(o), tuple(there[:, o] for there in signals.present), np.ones(1))
+    inputs = range(len(signals.u_scale))
+    longest = max(int(LATEST * signals.longest), min(least, signals.longest - 1))
+    points: list[_Point | None] = [None for _ in inputs]
+    for turn in range(TURNS):
+        before = [None if p is None else (p.term.lag, p.term.order, p.term.zeros) for p in points]
+        for _ in range(SWEEPS if len(points) > 1 and turn == 0 else 1):
+            for c in inputs:
+                others = [p for i, p in enumerate(points) if p is not None and i != c]
+                rest = replace(regression, y=_without(regression.y, others))
+                points[c] = _found(rest, signals, c, least, longest, points[c])
+        known = [p for p in points if p is not None]
+        columns, theta, slowest = _joint(regression, known)
+        errors = regression.residuals(columns, theta, slowest)
+        noise = autoregression(errors, min(NOISE, regression.count // 30))
+        size = max(noise.size, regression.noise.size)
+        change = np.pad(noise, (0, size - noise.size)) - np.pad(regression.noise, (0, size - regression.noise.size))
+        same = before == [(p.term.lag, p.term.order, p.term.zeros) for p in known]
+        if np.max(np.abs(change)) < SETTLED and (same or turn == 0):
+            break
+        regression = regression.with_noise(noise)
+    spread = float(np.nanvar(np.concatenate(errors)))
+    whole = float(np.mean(np.concatenate([(y - y.mean()) ** 2 for y in regression.y])))
+    scale = float(signals.y_scale[o])
+    found = [_response(signals, c, o, p, _interval(replace(regression, y=_without(
+        regression.y, [q for q in known if q is not p])), p, least, longest)) for c, p in enumerate(known)]
+    return Process(name, tuple(found), noise, tuple(scale * e for e in errors), 1 - spread / max(whole, 1e-300),
+                   sum(p.criterion for p in known))
+
+
+def _found(regression: Regression, signals: Signals, c: int, least: int, longest: int, before: _Point | None) -> _Point:
+    """Return the best response to one input, whose f is bent where that pays."""
+    straight = _Drive(signals.inputs(c))
+    start = None if before is None else before.term
+    best = _searched(regression, straight, least, longest, start)
+    if signals.levels(c) <= LEVELS:
+        return best
+    whole = np.concatenate(straight.values)
+    nodes = np.unique(np.quantile(whole, np.linspace(0, 1, NODES)))
+    if nodes.size < 4:
+        return best
+    term = best.term
+    squares = _Drive(tuple((u - whole.mean()) ** 2 for u in straight.values))
+    even = scan(regression, squares.values, longest, 1)
+    if even and even[0].energy < 0.9 * best.energy and even[0].lag >= least:  # f is nearly even
+        term = _Term.of(even[0].poles, even[0].lag)
+    for _ in range(2):
+        bent = _bent(regression, straight, term, nodes)
+        if bent is None:
+            return best
+        found = _searched(regression, bent, least, longest, term, scanned=False)
+        term = found.term
+        if found.criterion < best.criterion:
+            best = found
+    return best
+
+
+def _searched(regression: Regression, drive: _Drive, least: int, longest: int, start: _Term | None,
+              scanned: bool = True) -> _Point:
+    """Refine the best of the scan, and then neighbouring structures as long as the criterion falls."""
+    tried: dict[tuple[int, ...], _Point] = {}
+
+    def fitted(term: _Term) -> _Point:
+        key = (len(term.taus), len(term.pairs), term.lag, term.zeros, term.integrates)
+        if key not in tried:
+            tried[key] = _refined(regression, drive, term)
+        return tried[key]
+
+    terms = [] if start is None else [start]
+    for order in (1, 2) if scanned or start is None else ():
+        lags = [one for one in scan(regression, drive.values, longest, order) if one.lag >= least]
+        terms += [_Term.of(one.poles, one.lag) for one in lags[: KEPT if start is None else 2]]
+    best = min(map(fitted, terms), key=lambda p: p.criterion)
+    oscillating = list(_oscillating(regression, drive, best.term)) if scanned else []
+    while True:
+        near = [fitted(term) for term in (*oscillating, *_neighbours(best.term, least, longest, drive))]
+        better = min(near, key=lambda p: p.criterion)
+        if not better.criterion < best.criterion - 1e-6:
+            return best
+        best, oscillating = better, []
+
+
+def _neighbours(term: _Term, least: int, longest: int, drive: _Drive) -> Iterator[_Term]:
+    """Yield the structures one step from a structure."""
+    for lag in (term.lag - 1, term.lag + 1):
+        if least <= lag <= longest:
+            yield replace(term, lag=lag)
+    if term.zeros < term.order:
+        yield replace(term, zeros=term.zeros + 1)
+        if term.lag > least:
+            yield replace(term, zeros=term.zeros + 1, lag=term.lag - 1)
+    if term.zeros:
+        yield replace(term, zeros=term.zeros - 1)
+    if 0 < term.order < LARGEST:
+        fastest = min(term.taus, default=term.pairs[0][0] if term.pairs else 0.0)
+        yield replace(term, taus=(*term.taus, fastest - 0.7))
+    slow = max(term.taus, default=-np.inf)
+    if not term.integrates and slow > np.log(UNIT * max(len(u) for u in drive.values)):
+        yield replace(term, taus=tuple(t for t in term.taus if t != slow), integrates=True)
+
+
+def _oscillating(regression: Regression, drive: _Drive, term: _Term) -> Iterator[_Term]:
+    """Yield structures with the complex pairs of a longer autoregression with the delayed input."""
+    n = 2 * LARGEST
+    rows, targets = [], []
+    for y, u in zip(regression.y, drive.values):
+        v = delayed(u - u[0], term.lag)
+        if len(y) > 3 * n:
+            rows.append(np.column_stack([x[n - j : len(x) - j] for x, first in ((y, 1), (v, 0)) for j in range(first, n)]))
+            targets.append(y[n:])
+    if not rows or sum(map(len, rows)) < 6 * n:
+        return
+    x, y = np.vstack(rows), np.concatenate(targets)
+    theta = np.linalg.lstsq(np.column_stack([x, np.ones(len(x))]), y, rcond=1e-9)[0]
+    found = roots_of(-theta[: n - 1])
+    pairs = sorted((p for p in found if p.imag > 0.02 and 0.6 < abs(p) < 1), key=lambda p: -abs(p))[:2]
+    for p in pairs:
+        alone = _Term.of([p, p.conjugate()], term.lag, 1)
+        yield alone
+        yield replace(alone, taus=(max(term.taus, default=1.0),))
+    if len(pairs) == 2:
+        yield replace(_Term.of([q for p in pairs for q in (p, p.conjugate())], term.lag, 2))
+
+
+def _columns(term: _Term, values: Sequence[Array]) -> list[Array]:
+    responses = [respond(term.poles, u) for u in values]
+    return [np.column_stack([delayed(v, term.lag + j) for j in range(term.zeros + 1)]) for v in responses]
+
+
+def _slowest(poles: Poles) -> complex:
+    return 1.0 if np.any(poles == 1) else complex(np.max(np.abs(poles), initial=0.0))
+
+
+def _refined(regression: Regression, drive: _Drive, term: _Term) -> _Point:
+    """Descend over the poles of one response by Gauss-Newton steps, each along coefficients and poles together."""
+    most = np.log(20 * max(len(u) for u in drive.values))
+    at = term
+    energy, theta, free = _solved(regression, drive, at)
+    for _ in range(STEPS if at.z.size and regression.count > at.z.size + at.zeros + 1 else 0):
+        columns, slowest = _columns(at, drive.values), _slowest(at.poles)
+        moved = []
+        for one in np.eye(at.z.size) * NUDGE:
+            there = _columns(at.at(at.z + one), drive.values)
+            moved.append([(x - here) @ theta / NUDGE for x, here in zip(there, columns)])
+        whole = [np.column_stack([x, *(m[i] for m in moved)]) for i, x in enumerate(columns)]
+        step = regression.solve(whole, slowest)[1][theta.size :]
+        step *= min(1.0, FARTHEST / max(float(np.max(np.abs(step), initial=0.0)), 1e-300))
+        for share in (1.0, 0.25, 0.05):
+            z = np.clip(at.z + share * step, -4, most)
+            found = _solved(regression, drive, at.at(z))
+            if found[0] < energy:
+                break
+        else:
+            break
+        fall, at = energy - found[0], at.at(z)
+        energy, theta, free = found
+        if regression.count * fall <= ENOUGH * energy:
+            break
+    rows = max(regression.count, 2)
+    spread = max(energy / rows, ROUNDING**2)
+    count = at.z.size + at.zeros + 2 + free + regression.noise.size - 1 + drive.parameters
+    chosen = PICKED * (max(at.order - 1, 0) + at.zeros)
+    return _Point(at, drive, energy, theta, float(rows * np.log(spread) + count * np.log(rows) + chosen))
+
+
+def _solved(regression: Regression, drive: _Drive, term: _Term) -> tuple[float, Array, int]:
+    energy, theta, _, free = regression.solve(_columns(term, drive.values), _slowest(term.poles))
+    return energy, theta, free
+
+
+def _bent(regression: Regression, drive: _Drive, term: _Term, nodes: Array) -> _Drive | None:
+    """Fit f, piecewise linear between nodes, through a response; with slope one on average."""
+    hats = [np.column_stack([np.interp(u, nodes, one) for one in np.eye(nodes.size)[1:]]) for u in drive.values]
+    columns = [np.column_stack([delayed(respond(term.poles, h), term.lag) for h in hat.T]) for hat in hats]
+    _, theta, _, _ = regression.solve(columns, _slowest(term.poles))
+    heights = np.concatenate([[0.0], theta])
+    values = [np.interp(u, nodes, heights) for u in drive.values]
+    spread = float(np.std(np.concatenate(values)))
+    if not np.isfinite(spread) or spread == 0:
+        return None
+    heights = heights / spread
+    return _Drive(tuple(np.interp(u, nodes, heights) for u in drive.values), nodes, heights)
+
+
+def _without(y: Sequence[Array], points: Sequence[_Point]) -> tuple[Array, ...]:
+    """Return the output less the responses to some inputs."""
+    rest = list(y)
+    for p in points:
+        rest = [r - x @ p.theta for r, x in zip(rest, _columns(p.term, p.drive.values))]
+    return tuple(rest)
+
+
+def _joint(regression: Regression, points: Sequence[_Point]) -> tuple[list[Array], Array, complex]:
+    """Return the columns of all responses, their coefficients together, and the slowest pole."""
+    each = [_columns(p.term, p.drive.values) for p in points]
+    columns = [np.hstack(several) for several in zip(*each)]
+    slowest = max((_slowest(p.term.poles) for p in points), key=abs)
+    return columns, regression.solve(columns, slowest)[1], slowest
+
+
+def _interval(regression: Regression, point: _Point, least: int, longest: int) -> tuple[int, int]:
+    """Return the delays that the likelihood does not exclude, poles and coefficients refitted at each."""
+    ends = []
+    for step in (-1, 1):
+        lag, term = point.term.lag, point.term
+        while least <= lag + step <= longest:
+            found = _refined(regression, point.drive, replace(term, lag=lag + step))
+            floor = ROUNDING**2 * regression.count
+            if regression.count * np.log(max(found.energy, floor) / max(point.energy, floor)) > LIKELY:
+                break
+            lag, term = lag + step, found.term
+        ends.append(lag)
+    return ends[0], ends[1]
+
+
+def _response(signals: Signals, c: int, o: int, point: _Point, interval: tuple[int, int]) -> Response:
+    """Write a response in the units of the record."""
+    term, drive = point.term, point.drive
+    poles = term.poles
+    unit = float(np.prod(np.abs(1 - poles[poles != 1])))
+    slope, nodes, heights = 1.0, None, None
+    if drive.nodes is not None and drive.heights is not None:
+        u = np.concatenate(signals.inputs(c))
+        v = np.concatenate(drive.values)
+        slope = float(np.polyfit(u, v, 1)[0]) or 1.0
+        nodes = drive.nodes * signals.u_scale[c]
+        heights = drive.heights / slope * signals.u_scale[c]
+    b = point.theta * unit * slope * signals.y_scale[o] / signals.u_scale[c]
+    return Response(poles, term.lag, b, interval, nodes, heights)

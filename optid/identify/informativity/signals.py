@@ -1,0 +1,173 @@
+"""The signals of a record as its tests read them, and the regressions of one output behind low-order dynamics.
+
+Every experiment has a level of its own. What is left of its state from before the first sample is a decay at the
+slowest pole; with a pole at 1 it is a slope. Both are projected out, with the level.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.data.stretches import interpolated
+from optid.models.recursions import lfilter
+
+SAMPLES, EXPERIMENTS = 30_000, 40  # that are read, from the beginning of a record
+DISTINCT = 1e-6  # share of its length that a decay must keep beside the level to count
+Poles = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Inputs and outputs of a record, each centred and over its spread, one array per experiment.
+
+    Attributes:
+        u: inputs (T, m), the last value held where one is missing.
+        y: outputs (T, l), interpolated where one is missing.
+        present: whether an output was measured, (T, l).
+        u_scale, y_scale: spread of every channel, (m,) and (l,).
+    """
+
+    u: tuple[Array, ...]
+    y: tuple[Array, ...]
+    present: tuple[NDArray[np.bool_], ...]
+    u_scale: Array
+    y_scale: Array
+
+    @classmethod
+    def of(cls, data: Data) -> "Signals":
+        """Read the beginning of a record."""
+        data = data.raw()
+        if data.n_samples > 1.1 * SAMPLES:
+            data = data.split(SAMPLES / data.n_samples)[0]
+        experiments = [e for e in data.experiments if e.n_samples > 1][:EXPERIMENTS]
+        u = [held(e.u) for e in experiments]
+        y = [interpolated(e.y) for e in experiments]
+        scales = []
+        for i, several in enumerate((u, y)):
+            whole = np.vstack(several)
+            middle, spread = whole.mean(axis=0), whole.std(axis=0)
+            spread = np.where(spread > 1e-14 * np.abs(middle), spread, 1.0)
+            (u, y)[i][:] = [(x - middle) / spread for x in several]
+            scales.append(spread)
+        return cls(tuple(u), tuple(y), tuple(np.isfinite(e.y) for e in experiments), *scales)
+
+    @cached_property
+    def samples(self) -> int:
+        """Number of samples."""
+        return sum(len(y) for y in self.y)
+
+    @property
+    def longest(self) -> int:
+        """Samples of the longest experiment."""
+        return max(len(y) for y in self.y)
+
+    def inputs(self, c: int) -> tuple[Array, ...]:
+        """Return input c, (T,) per experiment."""
+        return tuple(u[:, c] for u in self.u)
+
+    def outputs(self, o: int) -> tuple[Array, ...]:
+        """Return output o, (T,) per experiment."""
+        return tuple(y[:, o] for y in self.y)
+
+    def levels(self, c: int) -> int:
+        """Count the distinct values of an input."""
+        return np.unique(np.round(np.concatenate(self.inputs(c)), 9)).size
+
+
+def held(samples: Array) -> Array:
+    """Repeat the last value where samples (N, c) are missing, and the first one before it."""
+    filled = np.array(samples, dtype=float)
+    for column in filled.T:
+        present = np.isfinite(column)
+        if present.any() and not present.all():
+            places = np.maximum.accumulate(np.where(present, np.arange(column.size), -1))
+            column[:] = column[np.where(places < 0, int(np.argmax(present)), places)]
+    return np.nan_to_num(filled)
+
+
+def respond(poles: Sequence[complex] | Poles, drive: Array) -> Array:
+    """Return the response of 1 / A(q) to a drive (T,) from its first value, with unit static gain beside poles at 1."""
+    factors = np.asarray(poles, dtype=complex)
+    gain = float(np.prod(np.abs(1 - factors[factors != 1])))
+    x = (drive - drive[0]) * gain
+    return lfilter([1.0], np.real(np.poly(factors)), x) if factors.size else x
+
+
+def delayed(x: Array, lag: int) -> Array:
+    """Return x(k - lag), zero before the record."""
+    return np.concatenate([np.zeros(min(lag, len(x))), x[: max(len(x) - lag, 0)]])
+
+
+def whitened(noise: Array, x: Array) -> Array:
+    """Filter the rows of x, (T,) or (T, k), by the polynomial of a noise model, where it fits."""
+    past = noise.size - 1
+    return sum((a * x[past - j : len(x) - j] for j, a in enumerate(noise)), np.zeros((len(x) - past, *x.shape[1:])))
+
+
+@dataclass(frozen=True, eq=False)
+class Regression:
+    """Least squares of one output on columns, with a noise model and what is projected out of every experiment.
+
+    Attributes:
+        y: output, (T,) per experiment.
+        present: whether it was measured.
+        noise: polynomial [1, a1, ...] that whitens the errors.
+    """
+
+    y: tuple[Array, ...]
+    present: tuple[NDArray[np.bool_], ...]
+    noise: Array
+
+    def with_noise(self, noise: Array) -> "Regression":
+        """Return the regression with another noise model."""
+        return replace(self, noise=noise)
+
+    @cached_property
+    def rows(self) -> tuple[NDArray[np.bool_], ...]:
+        """Rows whose whitened error can be formed."""
+        past = self.noise.size - 1
+        return tuple(np.convolve(~there, np.ones(past + 1))[past : len(there)] < 0.5 for there in self.present)
+
+    @cached_property
+    def count(self) -> int:
+        """Number of rows."""
+        return sum(int(one.sum()) for one in self.rows)
+
+    @cached_property
+    def white(self) -> tuple[Array, ...]:
+        """The whitened output."""
+        return tuple(whitened(self.noise, y)[rows] for y, rows in zip(self.y, self.rows))
+
+    def projected(self, columns: Sequence[Array], slowest: complex) -> tuple[Array, Array]:
+        """Return [columns | output], (rows, k + 1), whitened and beside level and decay, and their free parameters."""
+        found, free = [], 0
+        for x, y, rows in zip(columns, self.white, self.rows):
+            both = np.column_stack([whitened(self.noise, x)[rows], y])
+            decay = np.arange(len(rows), dtype=float)[rows] if slowest == 1 else np.abs(slowest) ** np.arange(len(rows))[rows]
+            for one in (np.ones(len(both)), decay - decay.mean() if decay.size else decay):
+                size = float(one @ one)
+                if size > DISTINCT**2 * max(float(decay @ decay), 1.0):
+                    both -= np.outer(one, (one @ both) / size)
+                    free += 1
+            found.append(both)
+        return np.vstack(found), free
+
+    def solve(self, columns: Sequence[Array], slowest: complex) -> tuple[float, Array, Array, int]:
+        """Return sum of squares, coefficients, whitened errors, and the parameters that were projected out."""
+        both, free = self.projected(columns, slowest)
+        theta = np.linalg.lstsq(both[:, :-1], both[:, -1], rcond=1e-9)[0] if both.shape[1] > 1 else np.zeros(0)
+        errors = both[:, -1] - both[:, :-1] @ theta
+        return float(errors @ errors), theta, errors, free
+
+    def residuals(self, columns: Sequence[Array], theta: Array, slowest: complex) -> list[Array]:
+        """Return the errors before whitening, without level and decay, NaN where the output is missing."""
+        plain = replace(self, noise=np.ones(1), present=tuple(np.ones_like(there) for there in self.present))
+        both, _ = plain.projected(columns, slowest)
+        errors = both[:, -1] - both[:, :-1] @ theta
+        ends = np.cumsum([len(y) for y in self.y])[:-1]
+        return [np.where(there, e, np.nan) for e, there in zip(np.split(errors, ends), self.present)]
