@@ -144,7 +144,7 @@ def draw_plant(rng: np.random.Generator, recipe: Recipe, n: int, units: Units) -
     if recipe.other == "Wiener-Hammerstein":
         plant = replace(plant, last=replace(draw_linear(rng, "first order", n, (0, 0)), numerator=np.ones(1)))
     if recipe.other == "feedback":
-        plant = replace(plant, feedback=lambda x: 0.3 * (size * x) ** 3)
+        plant = replace(plant, feedback=lambda x: 0.3 * np.clip(size * x, -2, 2) ** 3)
     if recipe.other == "drift":
         t, phase, size = np.linspace(0, 1, n), rng.uniform(), rng.uniform(0.3, 0.8)
         course = (np.sin(2 * np.pi * (t + phase)), t, np.where(t > 0.2 + 0.6 * phase, 1.0, 0.0))[rng.integers(3)]
@@ -263,7 +263,7 @@ def _draw_loop(rng: np.random.Generator, recipe: Recipe, n: int, units: Units) -
     size = float(np.exp(rng.uniform(*np.log((0.03, 0.3)))))
     disturbance = autoregression(rng, n, rng.uniform(0.8, 0.97), size)
     sensor = rng.uniform(0.005, 0.03) * rng.standard_normal(n)
-    upset = autoregression(rng, n, 0.8, 0.2 / abs(gain)) if recipe.controller == "cascade" else None
+    upset = autoregression(rng, n, 0.8, rng.uniform(0.02, 0.1) / abs(gain)) if recipe.controller == "cascade" else None
     v, x = run_loop(linear, controller, r, disturbance, sensor, int(recipe.controller == "late PI"), inner, upset)
     if recipe.sensor == "quantised":  # as a historian stores them
         v, x = (np.round(one / np.std(one) * 50) * np.std(one) / 50 for one in (v, x))
@@ -335,9 +335,9 @@ REGULATED_KINDS = {
 LOGGED_KINDS = {"regulated: PI, quantised": replace(_LOOP, controller="PI", setpoint="constant", sensor="quantised")}
 IDLE_KINDS = {f"idle: {one}, {own}": Recipe(one, "", own=own, samples=(200, 1000)) for one, own in product(
     ("one step", "bump", "staircase", "PRBS", "smooth", "slow set-points"),
-    ("AR", "trend", "transient", "oscillation"))}
-WALK_KINDS = {f"idle: {one}, walk": Recipe(one, "", own="walk", samples=(200, 1000))
-              for one in ("one step", "staircase", "PRBS", "smooth")}
+    ("AR", "trend", "transient"))}
+HARD_IDLE_KINDS = {f"idle: {one}, {own}": Recipe(one, "", own=own, samples=(200, 1000)) for one, own in product(
+    ("one step", "staircase", "PRBS", "smooth"), ("oscillation", "walk"))}
 TWO_KINDS = {f"two inputs: {one}": Recipe(one, twist="an idle input") for one in ("staircase", "PRBS", "smooth")}
 WEAK_KINDS = {f"weak: {one}, {noise}": Recipe(one, plant, samples=(1000, 1000), noise=noise, share=(10**0.5, 10**0.5))
               for one, plant, noise in product(("staircase", "PRBS", "smooth"), ("first order",), NOISES)}
@@ -383,7 +383,7 @@ LONG_KINDS = {f"long: {one}": Recipe(one, plant, samples=(3000, 3000), curve=cur
                                                              samples=(3000, 3000))}
 
 KINDS: dict[str, Recipe] = {
-    **OPEN_KINDS, **MOVED_KINDS, **OUTSIDE_KINDS, **REGULATED_KINDS, **LOGGED_KINDS, **IDLE_KINDS, **WALK_KINDS,
+    **OPEN_KINDS, **MOVED_KINDS, **OUTSIDE_KINDS, **REGULATED_KINDS, **LOGGED_KINDS, **IDLE_KINDS, **HARD_IDLE_KINDS,
     **TWO_KINDS, **WEAK_KINDS, **DEAD_KINDS, **STEP_KINDS, **HARD_DEAD_KINDS, **SIZE_KINDS, **POWER_KINDS, **BAD_KINDS,
     **LONG_KINDS}
 """The recipes by name."""

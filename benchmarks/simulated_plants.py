@@ -192,7 +192,7 @@ class PID:
 
 @dataclass
 class Relay:
-    """On/off control with hysteresis, acting against the sign of the plant's gain."""
+    """On/off control with hysteresis; `size` is the input that raises the output."""
 
     size: float
     hysteresis: float
@@ -200,9 +200,8 @@ class Relay:
 
     def __call__(self, r: float, y: float) -> float:
         """Return the input at a sample."""
-        error = (r - y) * np.sign(self.size)
-        if abs(error) > self.hysteresis:
-            self.on = error > 0
+        if abs(r - y) > self.hysteresis:
+            self.on = r > y
         return self.size if self.on else -self.size
 
 
@@ -250,9 +249,7 @@ def response_error(model: Any, plants: tuple[Plant | None, ...], u: Array) -> fl
     n = max(p.memory for p in acting)
     middle, before, errors, sizes = np.nanmedian(u, axis=0), 6 * n, [], []
     for c, plant in enumerate(plants):
-        low, high = np.nanquantile(u[:, c], [0.1, 0.9])
-        if low == high:
-            low, high = np.nanmin(u[:, c]), np.nanmax(u[:, c])
+        low, high = levels_of(u[:, c])
 
         def run(one: Array, c: int = c) -> Array:
             inputs = np.tile(middle, (len(one), 1))
@@ -271,6 +268,12 @@ def response_error(model: Any, plants: tuple[Plant | None, ...], u: Array) -> fl
                           / (sizes[-1] or max(sizes)))
     worst = max(errors)
     return worst if np.isfinite(worst) else np.inf
+
+
+def levels_of(u: Array) -> tuple[float, float]:
+    """Return the levels between which the responses to an input (N,) are compared: the inner 80 % of its range."""
+    low, high = np.nanquantile(u, [0.1, 0.9])
+    return (low, high) if low < high else (np.nanmin(u), np.nanmax(u))
 
 
 def step_response(simulate: Callable[[Array], Array], low: float, high: float, before: int, n: int) -> Array:
