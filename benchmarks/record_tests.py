@@ -74,6 +74,20 @@ class Row:
     groups: tuple[Group, ...]
 
 
+class Failures(list[str]):
+    """Lines on the records that failed, written to a file, if there is one, as soon as they are known."""
+
+    def __init__(self, file: str | None, title: str) -> None:
+        self.file = file
+        self += [title]
+
+    def __iadd__(self, lines: Iterable[str]) -> "Failures":
+        self.extend(lines)
+        if self.file:
+            Path(self.file).write_text("\n".join(self) + "\n")
+        return self
+
+
 def timed(test: Callable[[], Any]) -> tuple[Any, float]:
     """Return what a test returns, or the refusal that it raises, and its CPU seconds."""
     clock = time.process_time()
@@ -219,7 +233,7 @@ def judge(row: str, kind: str, seed: int) -> Outcome:
             return Outcome(False, f"FAULT {type(fault).__name__}: {fault}", {}, np.nan)
 
 
-def run_row(row: str, pool: Executor, seeds: Sequence[int], failures: list[str]) -> list[tuple[str, str, str]]:
+def run_row(row: str, pool: Executor, seeds: Sequence[int], failures: Failures) -> list[tuple[str, str, str]]:
     """Judge all kinds of a row, print a line each, and return the lines of the final table."""
     groups = ROWS[row].groups
     found: dict[str, list[Outcome]] = {}
@@ -256,7 +270,7 @@ def _measured(group: Group, outcomes: Sequence[Outcome]) -> tuple[str, str, str]
     return group.what, share(right, len(outcomes)), required
 
 
-def run_verdicts(pool: Executor, seeds: Sequence[int], failures: list[str], file: str | None
+def run_verdicts(pool: Executor, seeds: Sequence[int], failures: Failures, file: str | None
                  ) -> list[tuple[str, str, str]]:
     """Judge the verdicts on right and wrong models; print the models by word and error, for every kind."""
     rows: list[model_verdicts.Row] = []
@@ -309,13 +323,11 @@ def main() -> None:
     options = parser.parse_args()
     seeds = range(options.seed, options.seed + options.records)
     lines: list[tuple[str, str, str]] = []
-    failures: list[str] = [f"# Failures, {options.records} records a kind from seed {options.seed}"]
+    failures = Failures(options.failures, f"# Failures, {options.records} records a kind from seed {options.seed}")
     with worker_pool(options.jobs) as pool:
         for row in options.only:
             lines += run_verdicts(pool, seeds, failures, options.write) if row == VERDICT else run_row(
                 row, pool, seeds, failures)
-            if options.failures:
-                Path(options.failures).write_text("\n".join(failures) + "\n")
     print(f"\n{'what':<66}{'measured':<28}required")
     for what, measured, required in lines:
         print(f"{what:<66}{measured:<28}{required}")
