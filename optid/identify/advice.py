@@ -14,7 +14,8 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
-from optid.identify.delays import LagSums, linear, shown_delays
+from optid.identify.lag_sums import LagSums, linear
+from optid.identify.informativity import informativity
 from optid.identify.validation.checks import shares_outside
 from optid.identify.validation.predictions import SIMULATION, fit_percent, prediction_fit, simulated_or_nan
 from optid.models.functions import has_feedback
@@ -26,6 +27,7 @@ JUMP = 4.0  # ratio of the sizes of a channel's steps before and after a sample 
 APART = 15.0  # points by which both halves of a record fit better alone, from which the plant counts as changed
 DRIVEN = 0.5  # log ratio by which past outputs reduce the error of the input, from which columns count as swapped
 TOO_FEW = 10  # samples per parameter at least
+SLOW = 0.9  # real poles from here on are compared with 1
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
 # formulations with a static function of the input, by those without
 STATIC = {"arx": "hammerstein_arx.exact", "oe.exact": "hammerstein_oe.exact", "ss.exact": "hammerstein_ss.exact"}
@@ -152,8 +154,10 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield structures as a phrase, as options, and as changes of the arguments of a fit."""
     name, arguments, data = fit.formulation, fit.arguments, fit.data
     if hasattr(fit.model, "nk") and "nb" in arguments:
-        sharp = [delay for delay in shown_delays(fit.model, data) if delay is not None]
-        found = [(0,) * data.m, *(k for delay in sharp for k in (delay, tuple(max(k - 1, 0) for k in delay)))]
+        told = informativity(data)
+        shown = [told.lags] if told.processes else []
+        found = [(told.least,) * data.m, *(k for lags in shown for k in (
+            lags, tuple(max(lag - 1, told.least) for lag in lags)))]
         for delay in dict.fromkeys(found):
             if delay != tuple(fit.model.nk):
                 words = _words(delay)
@@ -188,8 +192,7 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 def _on_model(fit: Any) -> Iterator[Advice]:
     model, data = fit.model, fit.data.raw()
-    if not model.is_stable and not has_feedback(model):
-        yield Advice("the model has a pole outside the unit circle", "--constraint stable:0.99")
+    yield from _on_poles(fit)
     for function, x, share in shares_outside(model, data):
         if share > 0.01:
             yield Advice(f"{100 * share:.0f} % of {function.name} lies outside the interval of its basis",
@@ -208,6 +211,28 @@ def _on_model(fit: Any) -> Iterator[Advice]:
     found = _try(fit, formulation=plain, replaced=kept)
     if found is not None and _score(found.model, fit.data) > _score(model, fit.data) - SPARED:
         yield Advice("a linear function of the input fits as well", f"--formulation {plain}")
+
+
+def _on_poles(fit: Any) -> Iterator[Advice]:
+    """Tell a pole that the record does not tell from 1, an integrator, from one outside the unit circle."""
+    model = fit.model
+    if has_feedback(model) or any("integrator" in getattr(rule, "about", ()) for rule in fit.arguments.get(
+            "constraints", ())):
+        return
+    slow = [pole.real for pole in model.poles if not pole.imag and pole.real > SLOW]
+    pole = min(slow, key=lambda one: abs(one - 1), default=0.0)
+    try:
+        nearest = fit.uncertainty.of(lambda model: model.poles[np.argmin(np.abs(model.poles - pole))].real)
+        reach, words = 2 * float(nearest.error), f"{pole:.6g} ± {2 * float(nearest.error):.2g}"
+    except (OptidError, np.linalg.LinAlgError):  # no intervals: what grows by less than e over the record
+        reach, words = 1 / max(e.n_samples for e in fit.data.experiments), f"{pole:.6g}"
+    if abs(pole - 1) <= reach and model.integrates_within(reach):
+        word = "--constraint integrator" if hasattr(model, "nk") else "--formulation oe.exact --constraint integrator"
+        word = word if model.l == 1 else f"data.select(outputs=...) and {word} for each output"
+        yield Advice(f"the record does not tell the pole {words} from 1: the plant may integrate, its output ramp while "
+                     "the inputs are held", word)
+    elif not model.is_stable:
+        yield Advice("the model has a pole outside the unit circle", "--constraint stable:0.99")
 
 
 def _try(fit: Any, **changes: Any) -> Any:

@@ -265,6 +265,10 @@ def _neighbours(term: _Term, least: int, longest: int, drive: _Drive) -> Iterato
     if 0 < term.order < LARGEST:
         fastest = min(term.taus, default=term.pairs[0][0] if term.pairs else 0.0)
         yield replace(term, taus=(*term.taus, fastest - 0.7))
+    if len(term.taus) + term.integrates > 1:
+        fewer = tuple(sorted(term.taus)[1:])
+        yield replace(term, taus=fewer)
+        yield replace(term, taus=fewer, lag=min(term.lag + 1, longest))
     slow = max(term.taus, default=-np.inf)
     if not term.integrates and slow > np.log(UNIT * max(len(u) for u in drive.values)):
         yield replace(term, taus=tuple(t for t in term.taus if t != slow), integrates=True)

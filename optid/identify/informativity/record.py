@@ -1,6 +1,7 @@
 """What a record can tell, put together: findings in sentences, and the reason where nothing can be identified."""
 
 from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -59,6 +60,16 @@ class Informativity(Rendered):
         """Lag of the first coefficient of every input, the earliest over the outputs."""
         return tuple(min(p.responses[c].nk for p in self.processes) for c in range(len(self.inputs)))
 
+    @property
+    def least(self) -> int:
+        """Smallest lag at which an input may act: 1 in a loop, where what acts at once is the controller."""
+        return int(self.loop.word != "open")
+
+    @property
+    def moves(self) -> int:
+        """Moves of the input that moves least."""
+        return min((one.moves for one in self.excitations), default=0)
+
     def without_effect(self, c: int) -> bool:
         """Whether input c has no visible effect on any output."""
         own = [one for one in self.effects if one.input == self.inputs[c]]
@@ -66,11 +77,21 @@ class Informativity(Rendered):
 
 
 def informativity(data: Data) -> Informativity:
-    """Examine a record: excitation, feedback, effects of the inputs, dead times and low-order dynamics.
+    """Examine a record, once: excitation, feedback, effects of the inputs, dead times and low-order dynamics.
 
     Args:
         data: the record; the first 30,000 samples of a longer one are read.
     """
+    if data not in _KNOWN:
+        with np.errstate(all="ignore"):
+            _KNOWN[data] = _examined(data)
+    return _KNOWN[data]
+
+
+_KNOWN: WeakKeyDictionary[Data, Informativity] = WeakKeyDictionary()
+
+
+def _examined(data: Data) -> Informativity:
     m, l = len(data.inputs), len(data.outputs)  # noqa: E741 - the field's letter
     if m * l > PAIRS:
         return _untested(data, f"{m} inputs by {l} outputs are more than {PAIRS} pairs")
@@ -89,7 +110,7 @@ def informativity(data: Data) -> Informativity:
         found = later if any(one.word != "open" for one in loops) else found  # what acts at once is a controller
     else:
         loops = tuple(loop(signals, c, found, data.outputs) for c in range(m))
-    least = 1 if any(one.word != "open" for one in loops) else 0
+    least = int(any(one.word != "open" for one in loops))
     effects = tuple(effect(signals, c, o, found[o], (u, y), least) for o, y in enumerate(data.outputs)
                     for c, u in enumerate(data.inputs))
     whole = Informativity(data.inputs, data.outputs, loops, effects, tuple(moves), found)
