@@ -133,7 +133,8 @@ def _wrong(one: PlantRecord, plant: Plant | None, rng: np.random.Generator) -> I
     y, n = one.data.experiments[0].y, one.data.n_samples
     form = orders(plant) if plant else {"na": 1, "nb": 1, "nk": 1}
     yield "too many, arx 8 8", data, "arx", {"na": 8, "nb": 8, "nk": 0}
-    yield "too many, hammerstein 4 8", data, "hammerstein_arx.exact", {"na": 4, "nb": 8, "nk": 0, "basis": "triangular:8"}
+    bent = {"na": 4, "nb": 8, "nk": 0, "basis": "triangular:8"}
+    yield "too many, hammerstein 4 8", data, "hammerstein_arx.exact", bent
     yield "dead time left out", data, "oe.exact", {**form, "nk": 0}
     if form["na"] > 1:
         yield "first order", data, "oe.exact", {"na": 1, "nb": 1, "nk": form["nk"]}

@@ -1,9 +1,9 @@
 """Ordinary plant records, simulated: steps, bumps, staircases with dead time, loops, inputs that act on nothing.
 
-`record(kind, seed)` returns a record and the plants behind it; `KINDS` are the recipes by name. Everything is a function
-of kind and seed. Noise is 1 to 10 % of the standard deviation of the output without noise, white or autoregressive with
-a pole of 0.9 unless the recipe says otherwise; levels and spans are those of engineering units, sampling times lie
-between 0.01 s and an hour.
+`record(kind, seed)` returns a record and the plants behind it; `KINDS` are the recipes by name. Everything is a
+function of kind and seed. Noise is 1 to 10 % of the standard deviation of the output without noise, white or
+autoregressive with a pole of 0.9 unless the recipe says otherwise; levels and spans are those of engineering units,
+sampling times lie between 0.01 s and an hour.
 
     python benchmarks/plant_records.py            # the kinds and what is drawn in each
 """
@@ -300,7 +300,8 @@ OPEN_KINDS = {
     **{f"open: {one}": Recipe(one) for one in ("staircase", "PRBS", "smooth", "several steps", "slow set-points",
                                               "sine", "few sines", "time")},
     **{f"open: {one}": Recipe(one, samples=(150, 400)) for one in ("one step", "bump")},
-    **{f"open: {one}": Recipe("staircase", one) for one in (*ORDERS[1:], "resonant", "inverse response", "integrating")},
+    **{f"open: {one}": Recipe("staircase", one) for one in (*ORDERS[1:], "resonant", "inverse response",
+                                                            "integrating")},
     "open: PRBS, dead time 30": Recipe("PRBS", dead=(25, 31)),
     "open: dead time 100": Recipe("staircase", dead=(100, 100), samples=(1500, 2500)),
     "open: saturation": Recipe("staircase", curve="saturation"), "open: any curve": Recipe("smooth", curve="any"),
@@ -327,7 +328,8 @@ OUTSIDE_KINDS = {  # the set-point is constant, yet a relay or the inner loop's 
     "constant: cascade": replace(_LOOP, controller="cascade", setpoint="constant"),
 }
 REGULATED_KINDS = {
-    **{f"regulated: {one}": replace(_LOOP, controller=one, setpoint="constant") for one in ("PI", "P", "PID", "late PI")},
+    **{f"regulated: {one}": replace(_LOOP, controller=one, setpoint="constant")
+       for one in ("PI", "P", "PID", "late PI")},
     "regulated: PI, second order": replace(_LOOP, controller="PI", setpoint="constant", plant="second order"),
     "regulated: PI, integrating": replace(_LOOP, controller="PI", setpoint="constant", plant="integrating"),
     "regulated: PI, 300 samples": replace(_LOOP, controller="PI", setpoint="constant", samples=(300, 300)),
@@ -347,20 +349,22 @@ DEAD_KINDS = {
     **{f"dead time 100: {one}, first order": Recipe(one, dead=(100, 100), samples=(1500, 2500))
        for one in ("staircase", "PRBS")},
     **{f"dead time: {one}, first order, fractional": Recipe(one, dead=(0.0, 30.0)) for one in ("staircase", "PRBS")},
-    **{f"dead time: {one}, saturation": Recipe(one, dead=(0, 30), curve="saturation") for one in ("staircase", "smooth")},
+    **{f"dead time: {one}, saturation": Recipe(one, dead=(0, 30), curve="saturation")
+       for one in ("staircase", "smooth")},
 }
 STEP_KINDS = {f"dead time: one step, first order, {noise}": Recipe("one step", dead=(0, 30), samples=(200, 400),
                                                                    noise=noise) for noise in NOISES}
 HARD_DEAD_KINDS = {f"dead time: {one}, {plant}": Recipe(one, plant, dead=(0, 30), samples=(400, 1000))
                    for one, plant in (("one step", "second order"), ("staircase", "third order"),
-                                      ("staircase", "fourth order"), ("staircase", "resonant"), ("PRBS", "integrating"))}
+                                      ("staircase", "fourth order"), ("staircase", "resonant"),
+                                      ("PRBS", "integrating"))}
 SIZE_KINDS = {
-    **{f"size: {one}, {plant}, {noise}": Recipe(one, plant, samples=SHORT, noise=noise) for one, plant, noise in product(
-        ("one step", "bump", "staircase", "PRBS"), ("first order", "second order"), NOISES)},
+    **{f"size: {one}, {plant}, {noise}": Recipe(one, plant, samples=SHORT, noise=noise)
+       for one, plant, noise in product(("one step", "bump", "staircase", "PRBS"), ORDERS[:2], NOISES)},
     **{f"size: {one}, {plant}": Recipe(one, plant, samples=SHORT) for one, plant in (
-        ("several steps", "third order"), ("staircase", "resonant"), ("PRBS", "resonant"), ("staircase", "fourth order"),
-        ("staircase", "inverse response"), ("PRBS", "integrating"), ("several steps", "first order"),
-        ("smooth", "second order"))},
+        ("several steps", "third order"), ("staircase", "resonant"), ("PRBS", "resonant"),
+        ("staircase", "fourth order"), ("staircase", "inverse response"), ("PRBS", "integrating"),
+        ("several steps", "first order"), ("smooth", "second order"))},
     **{f"size: {one}, any curve": Recipe(one, curve="any", samples=SHORT)
        for one in ("staircase", "several steps", "smooth", "bump")},
     "size: staircase, quantised": Recipe("staircase", sensor="quantised", samples=SHORT),

@@ -3,10 +3,11 @@
     python benchmarks/record_tests.py [--records 200] [--only feedback effect ...] [--jobs 2] [--seed 0]
                                       [--failures FILE] [--write FILE]
 
-Simulated records (`plant_records.py`), so many of every kind, are given to the tests; one line a kind is printed as soon
-as it is known: share with its 95 % interval (Clopper and Pearson), median CPU seconds of a record. The table at the end
-compares the groups of kinds with what is required of them; a group without a requirement is reported. --failures writes
-the seeds that failed and what came out, --write the models behind the verdicts with all figures, as CSV.
+Simulated records (`plant_records.py`), so many of every kind, are given to the tests; one line a kind is printed as
+soon as it is known: share with its 95 % interval (Clopper and Pearson), median CPU seconds of a record. The table at
+the end compares the groups of kinds with what is required of them; a group without a requirement is reported.
+--failures writes the seeds that failed and what came out, --write the models behind the verdicts with all figures, as
+CSV.
 """
 
 import argparse
@@ -32,8 +33,7 @@ from simulated_plants import levels_of, step_response
 
 import optid
 from optid.errors import OptidError
-from optid.identify.informativity.record import informativity
-from optid.identify.informativity.process import processes
+from optid.identify.informativity import informativity, processes
 from optid.identify.validation.structure import structure_test
 
 
@@ -130,8 +130,9 @@ def gain(one: PlantRecord) -> Outcome:
             continue
         simulate = partial(_run, model)
         figures[name] = float(step_response(simulate, low, high, 1, n)[-1] / truth)
-    said = ", ".join(f"{name} {value:.3f}" for name, value in figures.items()) + f"; nk {found.nk}, true {plant.linear.nk}"
-    return Outcome(abs(figures["scan"] - 1) < 0.1, said, figures, seconds)
+    said = ", ".join(f"{name} {value:.3f}" for name, value in figures.items())
+    return Outcome(abs(figures["scan"] - 1) < 0.1, f"{said}; nk {found.nk}, true {plant.linear.nk}; disturbance "
+                   f"{one.noise:.3f}", figures, seconds)
 
 
 def _run(model: Any, u: np.ndarray) -> np.ndarray:
@@ -198,8 +199,9 @@ ROWS: dict[str, Row] = {
         Group("feedback: relays and inner loops at constant set-point", tuple(kinds.OUTSIDE_KINDS)),
         Group("feedback: regulated loops, logged in coarse steps", tuple(kinds.LOGGED_KINDS)))),
     "gain": Row(gain, tuple(
-        Group(f"gain in informative loops, median, {name}", tuple(k for k in kinds.MOVED_KINDS if "integrating" not in k),
-              figure=name, within=(0.98, 1.02)) for name in ("scan", "armax", "bj"))),
+        Group(f"gain in informative loops, median, {name}",
+              tuple(k for k in kinds.MOVED_KINDS if "integrating" not in k), figure=name, within=(0.98, 1.02))
+        for name in ("scan", "armax", "bj"))),
     "effect": Row(effect, (
         Group("effect: idle inputs named", tuple(kinds.IDLE_KINDS), 0.98),
         Group("effect: weak inputs kept, white noise", tuple(k for k in kinds.WEAK_KINDS if "white" in k), 0.95),
@@ -277,7 +279,8 @@ def run_verdicts(pool: Executor, seeds: Sequence[int], failures: Failures, file:
     for kind in model_verdicts.KINDS:
         found = [one for several in pool.map(partial(model_verdicts.judge, kind), seeds) for one in several]
         rows += found
-        print(f"\nverdict   {kind}, {_median(r.seconds for r in found):.2f} s\n{model_verdicts.table(found)}", flush=True)
+        print(f"\nverdict   {kind}, {_median(r.seconds for r in found):.2f} s\n{model_verdicts.table(found)}",
+              flush=True)
         for name, wrong in (("wrong but good or fair", [r for r in found if r.is_false]),
                             ("right but poor or useless", [r for r in found if r.is_missed])):
             if wrong:
@@ -288,11 +291,12 @@ def run_verdicts(pool: Executor, seeds: Sequence[int], failures: Failures, file:
         if file:
             write(rows, file)
     print(f"\nverdict   all kinds\n{model_verdicts.table(rows)}")
-    praised, right = ([r for r in rows if r.word in ("good", "fair")],
-                      [r for r in rows if r.error < model_verdicts.RIGHT and r.word])
+    praised = [r for r in rows if r.word in ("good", "fair")]
+    right = [r for r in rows if r.error < model_verdicts.RIGHT and r.word]
     lines = []
     for what, of, wrong, most in (
-            ("verdict: good or fair, but the response off by more than 10 %", praised, [r.is_false for r in praised], 0.02),
+            ("verdict: good or fair, but the response off by more than 10 %", praised,
+             [r.is_false for r in praised], 0.02),
             ("verdict: right, but poor or useless", right, [r.is_missed for r in right], 0.05)):
         met = "met" if sum(wrong) <= most * len(of) else "missed"
         lines.append((what, share(sum(wrong), len(of)) if of else "none", f"at most {100 * most:g} %: {met}"))

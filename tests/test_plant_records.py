@@ -82,10 +82,8 @@ def test_moved_loops_are_not_a_function_of_the_output_alone():
 class Itself:
     """A plant as a model, with a gain that is off by a share."""
 
-    m, l = 1, 1
-
     def __init__(self, plant, off=0.0):
-        self.plant, self.off = plant, off
+        self.plant, self.off, self.m = plant, off, 1
 
     def simulate(self, u, x0="zero"):
         return (1 + self.off) * self.plant.respond(np.ravel(u))
