@@ -65,8 +65,13 @@ class Row:
 
     @property
     def is_missed(self) -> bool:
-        """Whether a right model is called poor or useless."""
+        """Whether a model with the right response is called poor or useless."""
         return self.word in ("poor", "useless") and self.error < RIGHT
+
+    @property
+    def is_right(self) -> bool:
+        """Whether structure and response are right."""
+        return self.structure.startswith("right") and self.error < RIGHT
 
 
 def judge(kind: str, seed: int) -> list[Row]:
