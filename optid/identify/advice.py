@@ -14,8 +14,8 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
+from optid.identify.informativity import Informativity, informativity
 from optid.identify.lag_sums import LagSums, linear
-from optid.identify.informativity import informativity
 from optid.identify.validation.checks import shares_outside
 from optid.identify.validation.predictions import SIMULATION, fit_percent, prediction_fit, simulated_or_nan
 from optid.models.functions import has_feedback
@@ -29,6 +29,7 @@ DRIVEN = 0.5  # log ratio by which past outputs reduce the error of the input, f
 TOO_FEW = 10  # samples per parameter at least
 SLOW = 0.9  # real poles from here on are compared with 1
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
+NOISE_MODELS = ("arx", "hammerstein_arx", "armax", "hammerstein_armax", "bj", "hammerstein_bj")
 # formulations with a static function of the input, by those without
 STATIC = {"arx": "hammerstein_arx.exact", "oe.exact": "hammerstein_oe.exact", "ss.exact": "hammerstein_ss.exact"}
 
@@ -55,8 +56,10 @@ def advise(fit: Any) -> tuple[Advice, ...]:
     """Return at most five steps for a fit of a record in memory, the most useful first."""
     if not isinstance(fit.data, Data) or fit.model is None:
         return ()
-    steps = list(_on_record(fit))
-    tried = list(_tried(fit)) if fit.data.n_samples <= LONG else []
+    told = informativity(fit.data)
+    steps = [*_hopeless(told), *_in_a_loop(fit, told), *_on_record(fit)]
+    # in a loop a free run says nothing about the plant, by which neighbours are compared
+    tried = list(_tried(fit)) if fit.data.n_samples <= LONG and told.loop.word == "open" else []
     while tried:  # of steps with nearly the same gain, the simplest, which was tried first
         best = max(one.gain for one in tried)
         tried.remove(first := next(one for one in tried if one.gain >= best - SPARED))
@@ -65,6 +68,28 @@ def advise(fit: Any) -> tuple[Advice, ...]:
     for one in (*steps, *_on_model(fit)):
         found.setdefault(one.step, one)
     return tuple(found.values())[:MOST]
+
+
+def _hopeless(told: Informativity) -> Iterator[Advice]:
+    """Repeat why nothing can be identified, and what to do."""
+    if told.reason:
+        what, _, step = told.reason.partition("; " if "; " in told.reason else ": ")
+        yield Advice(what, step or "choose other columns, or record more")
+
+
+def _in_a_loop(fit: Any, told: Informativity) -> Iterator[Advice]:
+    """Advise a noise model and lags from 1 on where an output acts on an input."""
+    if told.loop.word == "open" or not told.processes:
+        return
+    direct = hasattr(fit.model, "nk") and min(fit.model.nk) == 0
+    if direct or not fit.formulation.startswith(NOISE_MODELS):
+        na = max(r.poles.size for p in told.processes for r in p.responses)
+        nk = " ".join(str(max(lag, 1)) for lag in told.lags)
+        step = (f"--formulation bj.exact --na {na} --nb 1 --nk {nk} --set nc=1 --set nd=1" if fit.data.l == 1 else
+                "--formulation ss.exact --set criterion=prediction --set feedthrough=false")
+        what = "an input that acts at once is the controller's answer" if direct else (
+            f"{fit.formulation} assumes that the inputs do not depend on the noise")
+        yield Advice(f"the loop was closed, and {what}: use a noise model and lags from 1 on", step)
 
 
 def _on_record(fit: Any) -> Iterator[Advice]:

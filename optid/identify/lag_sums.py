@@ -5,7 +5,6 @@ its own samples and as many after it as there are lags. All structures are colum
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray

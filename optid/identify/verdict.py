@@ -6,6 +6,7 @@ gains over it; whether the residuals still depend on the inputs; and whether del
 functions suit the record. It speaks of this record only.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,7 +21,7 @@ from optid.identify.informativity import Informativity, informativity
 from optid.identify.validation.checks import record_structure, shares_outside
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.identify.validation.systematic import systematic
-from optid.models.functions import has_feedback
+from optid.models.functions import has_feedback, step_length
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
 GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
@@ -28,6 +29,8 @@ GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
 GAP = 15.0  # points that the one-step prediction may be better than the free run
 WRONG = 0.07  # error of the response that inputs explain, over the spread of the simulated output
+UNCERTAIN = 0.07  # standard error of the step response, over its size
+POINTS = 20  # of a step response, at which it is looked at
 APART = 0.12  # difference of the response from that of the low-order model, in a loop
 STRUCTURE = 0.1  # share of the residual variance that another structure may save in a model that is called good
 OUTSIDE = 0.01  # share of the samples that may lie outside the interval of a function
@@ -67,8 +70,8 @@ class Verdict:
             f"{part.name} {part.value}: {'PASS' if part.passed else 'FAIL'}" for part in self.parts)
 
 
-def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = None, pooled: float | None = None
-            ) -> Verdict:
+def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = None, pooled: float | None = None,
+            known: Any = None) -> Verdict:
     """Judge a model on a record.
 
     Args:
@@ -76,6 +79,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         data: the record that it was estimated from.
         cross_validated: fits in % of the blocks that were left out one after another, where there are some.
         pooled: the same over all blocks.
+        known: the `Uncertainty` of the model, where there is one.
     """
     raw, told = data.raw(), informativity(data)
     y = np.vstack([e.y for e in raw.experiments])
@@ -85,7 +89,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     if pooled is not None and closed:
         own = ahead  # blocks were compared one sample ahead
     score, lost = (own, 0.0) if pooled is None else (pooled, own - pooled)
-    parts = [Finding("record", told.reason or "informative", not told.reason)]
+    parts = [Finding("record", re.split(r"[:;(]", told.reason)[0].strip() or "informative", not told.reason)]
     parts.append(Finding("simulation fit" if pooled is None else "cross-validated fit", _points(score),
                          score >= POOR_FIT))
     by_block = _by_block(raw, runs) if cross_validated is None else np.asarray(cross_validated)
@@ -97,7 +101,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         parts.append(Finding("estimation minus cross-validated fit", _points(lost, " points"), lost <= OVERFIT))
     if np.isfinite(ahead) and np.isfinite(own) and not closed:
         parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
-    wrong = [*_response(model, raw, runs, told, closed), *_lags(model, told)]
+    wrong = [*_response(model, raw, runs, told, closed), *_lags(model, told), *_uncertain(model, raw, known)]
     # a pole nearer to 1 than the record is long grows by less than e over it: the record does not tell it from 1
     ramps = model.integrates or (not model.is_stable and model.integrates_within(
         1 / max(e.n_samples for e in raw.experiments)))
@@ -145,6 +149,32 @@ def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Infor
         value = "none" if not np.isfinite(share) else f"{100 * share:.2g} % of the response"
         parts.append(Finding("difference from a low-order model with noise model", value, share <= APART))
     return parts
+
+
+def _uncertain(model: Any, data: Data, known: Any) -> list[Finding]:
+    """Say how well the record determines the response to a step over the range of every input."""
+    if known is None or has_feedback(model) or getattr(model, "latent", ()):
+        return []
+    length = step_length(model)
+    points = np.unique(np.geomspace(1, length, POINTS).astype(int)) - 1
+    spans = []
+    for c, f in enumerate(model.nonlinearities):
+        u = np.concatenate([e.u[:, c] for e in data.experiments])
+        spans.append(np.array([np.nanmin(u), np.nanmax(u)]) if f.basis.interval is None else np.array(f.basis.interval))
+
+    def response(one: Any) -> Array:
+        moves = np.array([np.ptp(f(span)) for f, span in zip(one.nonlinearities, spans)])
+        return (one.step_response(length)[points] * moves).ravel()
+
+    try:
+        found = known.of(response)
+    except (OptidError, np.linalg.LinAlgError, ValueError):
+        return []
+    shape = (points.size, data.l, data.m)
+    size, error = np.abs(found.value).reshape(shape).max(axis=0), found.error.reshape(shape).max(axis=0)
+    with np.errstate(all="ignore"):
+        share = float(np.nanmax(np.where(size > 0, error / size, np.nan), initial=0.0))
+    return [Finding("standard error of the step response", f"{100 * share:.2g} %", share <= UNCERTAIN)]
 
 
 def _acts_at_once(model: Any) -> str:

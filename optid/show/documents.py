@@ -14,6 +14,7 @@ from optid.identify.validation import Validation
 from optid.identify.validation.predictions import SIMULATION, prediction_fit
 from optid.identify.verdict import POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
+from optid.show.record import informativity_table
 from optid.show.sections import (
     TONES,
     Banner,
@@ -29,7 +30,6 @@ from optid.show.sections import (
     Section,
     attempt,
 )
-from optid.show.record import informativity_table
 from optid.show.terminal import findings_lines, set_table, wrapped
 
 if TYPE_CHECKING:

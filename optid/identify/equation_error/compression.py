@@ -16,10 +16,10 @@ from optid.arrays import check_integer, check_weight, one_of
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform, model_meta
+from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
-from optid.data.levels import levelled
 from optid.identify.arguments import Offset, check_offset, per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
