@@ -91,7 +91,8 @@ def judge(kind: str, seed: int) -> list[Row]:
                 reason = f"{type(refusal).__name__}: {refusal}"
             seconds = time.process_time() - clock
             fair = structure not in ("swapped", "another input") and model is not None
-            error = response_error(model, one.plants, one.data.experiments[0].u) if fair else np.inf
+            (e,) = one.data.experiments
+            error = response_error(model, one.plants, e.u, e.y) if fair else np.inf
             rows.append(Row(kind, seed, structure, word, error, score, parts, reason, seconds))
     return rows
 

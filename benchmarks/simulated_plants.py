@@ -234,14 +234,15 @@ def run_loop(linear: Linear, controller: Controller, r: Array, disturbance: Arra
 # -- the response of a model -------------------------------------------------------------------------------------------
 
 
-def response_error(model: Any, plants: tuple[Plant | None, ...], u: Array) -> float:
+def response_error(model: Any, plants: tuple[Plant | None, ...], u: Array, y: Array) -> float:
     """Return how far the step responses of a model are from the plant's, relative to the plant's step response.
 
     Three steps of every input between two levels, the others held at their medians: over the inner 80 % of its range
     and over either half of it. Each response is the difference of two simulations from rest; the error is its RMS over
     four time constants, relative to the largest change of the plant's response to the whole step, for an idle input
     that of the other inputs. The largest of all is returned; infinite where no input acts, where the model takes other
-    inputs, or where it diverges.
+    inputs, or where it diverges. Around a plant that is no Hammerstein system the steps are made smaller until its
+    outputs move by no more than those of the record, y (N,).
     """
     acting = [p.steady() for p in plants if p is not None]
     if not acting or getattr(model, "m", 0) != len(plants) or getattr(model, "l", 1) != 1:
@@ -250,6 +251,8 @@ def response_error(model: Any, plants: tuple[Plant | None, ...], u: Array) -> fl
     middle, before, errors, sizes = np.nanmedian(u, axis=0), 6 * n, [], []
     for c, plant in enumerate(plants):
         low, high = levels_of(u[:, c])
+        if plant is not None and not plant.is_hammerstein:
+            low, high = _within(plant.steady(), low, high, before, y)
 
         def run(one: Array, c: int = c) -> Array:
             inputs = np.tile(middle, (len(one), 1))
@@ -268,6 +271,17 @@ def response_error(model: Any, plants: tuple[Plant | None, ...], u: Array) -> fl
                           / (sizes[-1] or max(sizes)))
     worst = max(errors)
     return worst if np.isfinite(worst) else np.inf
+
+
+def _within(plant: Plant, low: float, high: float, before: int, y: Array) -> tuple[float, float]:
+    """Return levels, within two others, between which a plant moves by at most 80 % of the range of its record."""
+    middle = (low + high) / 2
+    for share in np.linspace(1.0, 0.2, 17):
+        start, end = middle + share * (low - middle), middle + share * (high - middle)
+        moved = plant.respond(np.full(before, end))[-1] - plant.respond(np.full(before, start))[-1]
+        if abs(moved) <= 0.8 * np.ptp(y):
+            break
+    return start, end
 
 
 def levels_of(u: Array) -> tuple[float, float]:

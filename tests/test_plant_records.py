@@ -92,14 +92,15 @@ class Itself:
 @pytest.mark.parametrize("kind", ["open: staircase", "open: integrating", "open: saturation", "open: Wiener"])
 def test_the_error_of_a_response_is_relative_to_that_of_the_plant(kind):
     one = records.record(kind, 0)
-    u = one.data.experiments[0].u
-    assert plants.response_error(Itself(one.plants[0]), one.plants, u) < 1e-9
-    assert 0.03 < plants.response_error(Itself(one.plants[0], 0.1), one.plants, u) < 0.1
-    assert plants.response_error(Itself(one.plants[0]), (None,), u) == np.inf
+    (e,) = one.data.experiments
+    assert plants.response_error(Itself(one.plants[0]), one.plants, e.u, e.y) < 1e-9
+    assert 0.03 < plants.response_error(Itself(one.plants[0], 0.1), one.plants, e.u, e.y) < 0.1
+    assert plants.response_error(Itself(one.plants[0]), (None,), e.u, e.y) == np.inf
 
 
 def test_a_right_fit_has_a_small_error_and_a_wrong_gain_a_large_one():
     one = records.record("open: staircase", 0)
     orders = benchmark("model_verdicts").orders(one.plants[0])
     model = optid.fit(one.data, "oe.exact", prove=False, **orders).model
-    assert plants.response_error(model, one.plants, one.data.experiments[0].u) < 0.02
+    (e,) = one.data.experiments
+    assert plants.response_error(model, one.plants, e.u, e.y) < 0.02
