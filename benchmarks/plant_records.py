@@ -112,7 +112,7 @@ def draw_linear(rng: np.random.Generator, kind: str, n: int, dead: tuple[float, 
     gain = rng.choice([-1, 1]) * rng.uniform(0.5, 3.0)
     slowest = rng.uniform(5.0, min(30.0, max(n / 12, 6.0)))
     whole = all(isinstance(one, int) for one in dead)
-    delay = float(rng.integers(dead[0], dead[1] + 1)) if whole else float(rng.uniform(*dead))
+    delay = float(rng.integers(int(dead[0]), int(dead[1]) + 1)) if whole else float(rng.uniform(*dead))
     zero = [1.0]
     if kind == "resonant":
         damping, natural = rng.uniform(0.1, 0.6), 1.0 / rng.uniform(2.0, 6.0)
@@ -198,7 +198,7 @@ def autoregression(rng: np.random.Generator, n: int, pole: float, size: float) -
     """Draw stationary first-order autoregressive noise (N,) of a standard deviation."""
     e = rng.standard_normal(n)
     e[1:] *= np.sqrt(1 - pole**2)
-    return size * lfilter([1.0], [1.0, -pole], e)
+    return size * np.asarray(lfilter([1.0], [1.0, -pole], e))
 
 
 # -- records -----------------------------------------------------------------------------------------------------------
@@ -383,8 +383,9 @@ BAD_KINDS = {
 }
 LONG_KINDS = {f"long: {one}": Recipe(one, plant, samples=(3000, 3000), curve=curve) for one, plant, curve in (
     ("staircase", "second order", "saturation"), ("PRBS", "second order", ""), ("one step", "first order", ""),
-    ("smooth", "resonant", ""))} | {"long: PI loop": replace(_LOOP, controller="PI", setpoint="steps",
-                                                             samples=(3000, 3000))}
+    ("smooth", "resonant", ""))} | {f"long: PI loop, {one}": replace(_LOOP, controller="PI", setpoint=one,
+                                                                    samples=(3000, 3000))
+                                    for one in ("steps", "constant")}
 
 KINDS: dict[str, Recipe] = {
     **OPEN_KINDS, **MOVED_KINDS, **OUTSIDE_KINDS, **REGULATED_KINDS, **LOGGED_KINDS, **IDLE_KINDS, **HARD_IDLE_KINDS,

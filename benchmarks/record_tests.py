@@ -1,12 +1,12 @@
 """What the tests of a record find on ordinary plant records, and whether the verdict on a model is true.
 
-    python benchmarks/record_tests.py [--records 200] [--only feedback effect ...] [--jobs 2] [--seed 0]
-                                      [--failures FILE] [--write FILE]
+    python benchmarks/record_tests.py [--records 200] [--only feedback effect ...] [--kinds staircase ...] [--jobs 2]
+                                      [--seed 0] [--failures FILE] [--write FILE]
 
 Simulated records (`plant_records.py`), so many of every kind, are given to the tests; one line a kind is printed as
 soon as it is known: share with its 95 % interval (Clopper and Pearson), median CPU seconds of a record. The table at
-the end compares the groups of kinds with what is required of them; a group without a requirement is reported.
---failures writes the seeds that failed and what came out, --write the models behind the verdicts with all figures, as
+the end compares the groups of kinds with what is required of them; a group without a requirement is reported. --kinds
+takes the kinds whose names contain one of these words; --failures writes the seeds that failed and what came out, --write the models behind the verdicts with all figures, as
 CSV.
 """
 
@@ -18,7 +18,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -239,9 +239,16 @@ def judge(row: str, kind: str, seed: int) -> Outcome:
             return Outcome(False, f"FAULT {type(fault).__name__}: {fault}", {}, np.nan)
 
 
-def run_row(row: str, pool: Executor, seeds: Sequence[int], failures: Failures) -> list[tuple[str, str, str]]:
-    """Judge all kinds of a row, print a line each, and return the lines of the final table."""
-    groups = ROWS[row].groups
+def chosen(names: Iterable[str], words: Sequence[str]) -> tuple[str, ...]:
+    """Return the kinds whose names contain one of the words; all without words."""
+    return tuple(name for name in names if not words or any(word in name for word in words))
+
+
+def run_row(row: str, pool: Executor, seeds: Sequence[int], failures: Failures, words: Sequence[str] = ()
+            ) -> list[tuple[str, str, str]]:
+    """Judge the kinds of a row, print a line each, and return the lines of the final table."""
+    groups = [replace(group, kinds=chosen(group.kinds, words)) for group in ROWS[row].groups]
+    groups = [group for group in groups if group.kinds]
     found: dict[str, list[Outcome]] = {}
     for kind in dict.fromkeys(kind for group in groups for kind in group.kinds):
         found[kind] = list(pool.map(partial(judge, row, kind), seeds))
@@ -276,11 +283,11 @@ def _measured(group: Group, outcomes: Sequence[Outcome]) -> tuple[str, str, str]
     return group.what, share(right, len(outcomes)), required
 
 
-def run_verdicts(pool: Executor, seeds: Sequence[int], failures: Failures, file: str | None
+def run_verdicts(pool: Executor, seeds: Sequence[int], failures: Failures, file: str | None, words: Sequence[str] = ()
                  ) -> list[tuple[str, str, str]]:
     """Judge the verdicts on right and wrong models; print the models by word and error, for every kind."""
     rows: list[model_verdicts.Row] = []
-    for kind in model_verdicts.KINDS:
+    for kind in chosen(model_verdicts.KINDS, words):
         found = [one for several in pool.map(partial(model_verdicts.judge, kind), seeds) for one in several]
         rows += found
         print(f"\nverdict   {kind}, {_median(r.seconds for r in found):.2f} s\n{model_verdicts.table(found)}",
@@ -327,6 +334,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--records", type=int, default=200, help="of every kind")
     parser.add_argument("--only", nargs="+", choices=[*ROWS, VERDICT], default=[*ROWS, VERDICT])
+    parser.add_argument("--kinds", nargs="+", default=[], help="words of the names of kinds")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--failures", help="file of the records that failed")
@@ -337,8 +345,8 @@ def main() -> None:
     failures = Failures(options.failures, f"# Failures, {options.records} records a kind from seed {options.seed}")
     with worker_pool(options.jobs) as pool:
         for row in options.only:
-            lines += run_verdicts(pool, seeds, failures, options.write) if row == VERDICT else run_row(
-                row, pool, seeds, failures)
+            lines += run_verdicts(pool, seeds, failures, options.write, options.kinds) if row == VERDICT else (
+                run_row(row, pool, seeds, failures, options.kinds))
     print(f"\n{'what':<66}{'measured':<28}required")
     for what, measured, required in lines:
         print(f"{what:<66}{measured:<28}{required}")

@@ -68,7 +68,7 @@ class Linear:
 
     def respond(self, v: Array) -> Array:
         """Return the output (N,) to an input (N,), from rest."""
-        return lfilter(*self.discrete, v)
+        return np.asarray(lfilter(*self.discrete, v))
 
 
 @dataclass(frozen=True, eq=False)
