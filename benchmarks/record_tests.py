@@ -5,9 +5,9 @@
 
 Simulated records (`plant_records.py`), so many of every kind, are given to the tests; one line a kind is printed as
 soon as it is known: share with its 95 % interval (Clopper and Pearson), median CPU seconds of a record. The table at
-the end compares the groups of kinds with what is required of them; a group without a requirement is reported. --kinds
-takes the kinds whose names contain one of these words; --failures writes the seeds that failed and what came out, --write the models behind the verdicts with all figures, as
-CSV.
+the end compares the groups of kinds with what is required of them; a group without a requirement is reported.
+--kinds takes the kinds whose names contain one of these words, --failures writes the seeds that failed and what came
+out, --write the models behind the verdicts with all figures, as CSV.
 """
 
 import argparse
