@@ -18,7 +18,7 @@ from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.informativity import Informativity, informativity
-from optid.identify.validation.checks import record_structure, shares_outside
+from optid.identify.validation.checks import record_structure, shares_outside, tested_residuals
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
@@ -28,7 +28,8 @@ GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 """Fits in % from which on, and below which, a model is called so; the second is that of its worst block."""
 OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
 GAP = 15.0  # points that the one-step prediction may be better than the free run
-WRONG = 0.07  # error of the response that inputs explain, over the spread of the simulated output
+# errors of the response that inputs explain, over the spread of the simulated output: of a model that is not good, and
+NOTED, WRONG = 0.07, 0.10  # of one that is poor
 UNCERTAIN = 0.07  # standard error of the step response, over its size
 POINTS = 20  # of a step response, at which it is looked at
 APART = 0.12  # difference of the response from that of the low-order model, in a loop
@@ -101,7 +102,9 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         parts.append(Finding("estimation minus cross-validated fit", _points(lost, " points"), lost <= OVERFIT))
     if np.isfinite(ahead) and np.isfinite(own) and not closed:
         parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
-    wrong = [*_response(model, raw, runs, told, closed), *_lags(model, told), *_uncertain(model, raw, known)]
+    parts += _residuals(model, raw, predicted)
+    wrong = [*_response(model, raw, runs, told, closed), *_uncertain(model, raw, known)]
+    wrong += _lags(model, told, all(part.passed for part in wrong))
     # a pole nearer to 1 than the record is long grows by less than e over it: the record does not tell it from 1
     ramps = model.integrates or (not model.is_stable and model.integrates_within(
         1 / max(e.n_samples for e in raw.experiments)))
@@ -113,9 +116,23 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     elif score < POOR_FIT or lost > OVERFIT or any(part.counts and not part.passed for part in wrong):
         word = POOR
     else:
-        failed = any(part.counts and not part.passed for part in parts)
+        failed = any(not part.passed for part in wrong) or any(part.counts and not part.passed for part in parts)
         word = GOOD if score >= GOOD_FIT and not worst < GOOD_BLOCK and not failed else FAIR
     return Verdict(word, tuple(parts), score)
+
+
+def _residuals(model: Any, data: Data, predicted: Sequence[Array]) -> list[Finding]:
+    """Say what the residual tests find, those of a page too."""
+    if all(np.isnan(p).all() for p in predicted):
+        return [Finding("residuals", "not available: no one-step prediction", True, counts=False)]
+    tests = tested_residuals(model, data, predicted)
+    found = []
+    for name, kind in (("independence of the inputs", "cross_correlations"), ("whiteness", "autocorrelations")):
+        failed = [test for test in tests[kind].values() if not test.passed]
+        known = any(np.isfinite(test.p_value) for test in tests[kind].values())
+        words = ", ".join(f"{test.output} {'on ' + test.input if kind[0] == 'c' else 'on its past'}" for test in failed)
+        found.append(Finding(name, words or ("kept" if known else "not available"), not failed, known))
+    return found
 
 
 def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity, closed: bool) -> list[Finding]:
@@ -130,7 +147,7 @@ def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity
     where = f" ({found.output})" if data.l > 1 else ""
     size = f"{100 * found.share:.2g} % of the response{where}" if found.found else f"none visible{where}"
     return [Finding("error that the inputs explain", f"{size} (p = {found.p_value:.2g})",
-                    not (found.found and found.share > WRONG))]
+                    not (found.found and found.share > NOTED), found.found and found.share > WRONG)]
 
 
 def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Informativity) -> list[Finding]:
@@ -186,8 +203,11 @@ def _acts_at_once(model: Any) -> str:
     return next((name for c, name in enumerate(model.inputs) if np.any(first[:, c])), "")
 
 
-def _lags(model: Any, told: Informativity) -> list[Finding]:
-    """Say where inputs act later, or earlier, than the lags that the model has."""
+def _lags(model: Any, told: Informativity, harmless: bool) -> list[Finding]:
+    """Say where inputs act later, or earlier, than the lags that the model has.
+
+    Poles cover a delay as well: it is harmless where nothing else is wrong with the response.
+    """
     if not hasattr(model, "nk") or not told.processes or told.reason:
         return []
     wrong = []
@@ -201,6 +221,8 @@ def _lags(model: Any, told: Informativity) -> list[Finding]:
         elif max(highs) < first and all(p.responses[c].poles.size <= 2 for p in told.processes):
             wrong.append(f"{name} acts from lag {min(p.responses[c].nk for p in told.processes)} on, the model from "
                          f"lag {first} on")
+    if wrong and harmless:
+        return [Finding("delay", "covered by the dynamics", True)]
     return [Finding("delay", ", ".join(wrong) or "covered by the lags", not wrong)]
 
 

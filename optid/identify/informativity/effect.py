@@ -23,6 +23,7 @@ DELAYS = (0, 4, 16, 64)
 LATEST = 0.25  # longest of them as a share of the longest experiment
 CLEAR, DOUBTFUL = 1e-9, 0.05  # p values between which the law is simulated
 DRAWS, WARMING = 199, 200  # simulations, and samples before each
+SAMPLES = 30  # per coefficient of the noise model: a longer one takes a slow response for noise
 LAGS = 12  # of the other inputs
 DECAYS = 30  # time constants of the decay that are compared
 
@@ -101,7 +102,7 @@ def _without_effect(signals: Signals, o: int, outputs: tuple[Array, ...], others
         _, pole, theta = min(found, key=lambda one: one[0])
         errors = regression.residuals([x[:, 1:] for x in others], theta, pole)
         smooth = [y - np.nan_to_num(e) for y, e in zip(outputs, errors)]
-        regression = regression.with_noise(autoregression(errors, min(12, signals.samples // 15)))
+        regression = regression.with_noise(autoregression(errors, min(12, signals.samples // SAMPLES)))
     _, _, white, _ = regression.solve([x[:, 1:] for x in others], pole)
     return smooth, regression.noise, float(np.std(white))
 
