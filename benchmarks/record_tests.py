@@ -322,7 +322,7 @@ def write(rows: Sequence[model_verdicts.Row], file: str) -> None:
     names = list(dict.fromkeys(part[0] for row in rows for part in row.parts))
     with Path(file).open("w", newline="") as stream:
         table = csv.writer(stream)
-        table.writerow(["kind", "seed", "structure", "word", "error", "score", "seconds", "reason",
+        table.writerow(["kind", "seed", "model", "word", "error", "score", "seconds", "reason",
                         *(f"{name}{end}" for name in names for end in ("", ": passed"))])
         for row in rows:
             parts = {name: (value, passed) for name, value, passed, _ in row.parts}
