@@ -4,6 +4,7 @@ Neighbouring samples are not independent, so that leaving out single samples wou
 of a block become experiments of their own; the model fitted to them is simulated over the block.
 """
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -66,6 +67,17 @@ class Blocks:
 
     def __len__(self) -> int:
         return len(self.parts)
+
+    @cached_property
+    def moving(self) -> tuple[int, ...]:
+        """The blocks in which an input moves: the others tell little about a model."""
+        def moves(part: Part) -> bool:
+            u = self.data.experiments[part.experiment].u[part.first : part.last]
+            return bool(np.any(np.nanmax(u, axis=0) > np.nanmin(u, axis=0)))
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # of an input that is missing throughout
+            return tuple(b for b, parts in enumerate(self.parts) if any(map(moves, parts)))
 
     def without(self, block: int) -> Data:
         """Return the record without a block; the parts on its two sides are experiments of their own."""

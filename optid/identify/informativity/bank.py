@@ -36,20 +36,19 @@ def bank(longest: int) -> Array:
 def scan(regression: Regression, drive: Sequence[Array], longest: int, order: int) -> list[Start]:
     """Return for every delay up to `longest` the best one or two poles of the bank, the best delay first."""
     poles = bank(max(len(u) for u in drive))
-    first, second = np.arange(poles.size), np.arange(poles.size)
     if order == 2:
         first, second = np.triu_indices(poles.size, 1)
-    weights = _weights(poles[first], poles[second]) if order == 2 else np.stack([np.ones(poles.size), np.zeros(poles.size)])
-    inner, sums, squares, whole, count = (np.zeros(1),) * 5
-    inner, squares = np.zeros((first.size, longest + 1)), np.zeros((first.size, longest + 1))
-    whole, count = 0.0, 0
+        weights = _weights(poles[first], poles[second])
+    else:
+        first = second = np.arange(poles.size)
+        weights = np.array([[1.0], [0.0]])
+    inner, squares, whole = np.zeros((first.size, longest + 1)), np.zeros((first.size, longest + 1)), 0.0
     for u, y in zip(drive, regression.y):
         white = whitened(regression.noise, y)
         if len(white) < 2:
             continue
         white = white - white.mean()
         whole += float(white @ white)
-        count += len(white)
         single = np.array([whitened(regression.noise, respond((p,), u)) for p in poles])
         found, energy = _products(white, single, first, second, weights, longest)
         inner += found

@@ -9,7 +9,6 @@ straight. The scan is repeated after the errors are whitened: coloured noise hid
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -25,7 +24,6 @@ KEPT = 4  # delays of the scan that are refined
 NOISE = 4  # order of the noise model, at most
 TURNS, SETTLED = 5, 0.01  # scans with a better noise model; largest change of its coefficients that is none
 LARGEST = 4  # poles, at most
-PICKED = 4.0  # cost, beside that of a parameter, of a pole or zero more: each is the best of many delays
 SWEEPS = 3  # over several inputs, each fitted beside the others
 LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
 LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice the log likelihood ratio
@@ -267,6 +265,10 @@ def _neighbours(term: _Term, least: int, longest: int, drive: _Drive) -> Iterato
     if 0 < term.order < LARGEST:
         fastest = min(term.taus, default=term.pairs[0][0] if term.pairs else 0.0)
         yield replace(term, taus=(*term.taus, fastest - 0.7))
+    if len(term.taus) + term.integrates > 1:
+        fewer = tuple(sorted(term.taus)[1:])
+        yield replace(term, taus=fewer)
+        yield replace(term, taus=fewer, lag=min(term.lag + 1, longest))
     slow = max(term.taus, default=-np.inf)
     if not term.integrates and slow > np.log(UNIT * max(len(u) for u in drive.values)):
         yield replace(term, taus=tuple(t for t in term.taus if t != slow), integrates=True)
@@ -279,7 +281,8 @@ def _oscillating(regression: Regression, drive: _Drive, term: _Term) -> Iterator
     for y, u in zip(regression.y, drive.values):
         v = delayed(u - u[0], term.lag)
         if len(y) > 3 * n:
-            rows.append(np.column_stack([x[n - j : len(x) - j] for x, first in ((y, 1), (v, 0)) for j in range(first, n)]))
+            lags = ((x, j) for x, first in ((y, 1), (v, 0)) for j in range(first, n))
+            rows.append(np.column_stack([x[n - j : len(x) - j] for x, j in lags]))
             targets.append(y[n:])
     if not rows or sum(map(len, rows)) < 6 * n:
         return
@@ -332,8 +335,7 @@ def _refined(regression: Regression, drive: _Drive, term: _Term) -> _Point:
     rows = max(regression.count, 2)
     spread = max(energy / rows, ROUNDING**2)
     count = at.z.size + at.zeros + 2 + free + regression.noise.size - 1 + drive.parameters
-    chosen = PICKED * (max(at.order - 1, 0) + at.zeros)
-    return _Point(at, drive, energy, theta, float(rows * np.log(spread) + count * np.log(rows) + chosen))
+    return _Point(at, drive, energy, theta, float(rows * np.log(spread) + count * np.log(rows)))
 
 
 def _solved(regression: Regression, drive: _Drive, term: _Term) -> tuple[float, Array, int]:

@@ -148,7 +148,8 @@ class Regression:
         found, free = [], 0
         for x, y, rows in zip(columns, self.white, self.rows):
             both = np.column_stack([whitened(self.noise, x)[rows], y])
-            decay = np.arange(len(rows), dtype=float)[rows] if slowest == 1 else np.abs(slowest) ** np.arange(len(rows))[rows]
+            k = np.arange(len(rows), dtype=float)[rows]
+            decay = k if slowest == 1 else np.abs(slowest) ** k
             for one in (np.ones(len(both)), decay - decay.mean() if decay.size else decay):
                 size = float(one @ one)
                 if size > DISTINCT**2 * max(float(decay @ decay), 1.0):

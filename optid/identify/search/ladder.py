@@ -4,18 +4,17 @@ Every rung is a generator: it yields independent candidates together and receive
 orders only as long as the fit improves. Later rungs start from the best structures of earlier ones.
 """
 
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from optid.bases import fitted_bases
 from optid.data.record import Data
-from optid.errors import OptidError
 from optid.identify.blocks import Blocks
-from optid.identify.delays import LagSums, linear, scan, sharp_delays
+from optid.identify.delays import LagSums, linear, scan
+from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.search.trial import Candidate, Trial
 
 Rung = Generator[list[Candidate], list[Trial], None]
@@ -31,6 +30,8 @@ PATIENT = 12.0  # the same where the class fits the estimation data much better
 PROMISING = 0.7  # how much better: the ratio of the errors on the estimation data
 EQUAL = 0.02
 """Relative difference of errors within which structures of a class count as equal: the smaller one is chosen."""
+FEW_MOVES = 8
+"""Moves of an input below which order and dead time are chosen by the likelihood: blocks without moves say little."""
 FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
 
 
@@ -40,12 +41,14 @@ class Ladder:
 
     Attributes:
         data: the record.
-        delays: combinations of delays of the inputs; all zero first.
+        told: what it can tell.
+        delays: combinations of delays of the inputs: none, and those found.
         regressions: orders (na, nb, nk) of the best autoregressions.
         trials: all trials so far, by key.
     """
 
     data: Data
+    told: Informativity
     delays: list[tuple[int, ...]]
     regressions: list[tuple[int, int, tuple[int, ...]]]
     trials: dict[Any, Trial]
@@ -53,17 +56,23 @@ class Ladder:
     @classmethod
     def of(cls, blocks: Blocks) -> "Ladder":
         """Look for delays and orders of autoregressions in the sums of the record."""
-        data = blocks.data
+        data, told = blocks.data, informativity(blocks.data)
         sums = LagSums(blocks, linear(data))
-        found = [(0,) * data.m, sharp_delays(sums)]
-        if not few_levels(data):
-            try:  # an even function has no effect in a linear model
-                found.append(sharp_delays(LagSums(blocks, fitted_bases(data, "polynomial:3"), na=4, lags=12)))
-            except OptidError:
-                pass
-        delays = list(dict.fromkeys(found))
+        delays = [(told.least,) * data.m]
+        if told.processes:
+            delays = list(dict.fromkeys([*delays, told.lags]))
         best = [one for delay in delays for one in scan(sums, [delay])[:1]]
-        return cls(data, delays, [(one.na, one.nb, one.nk) for one in best], {})
+        return cls(data, told, delays, [(one.na, one.nb, one.nk) for one in best], {})
+
+    @property
+    def few_moves(self) -> bool:
+        """Whether an input moves so rarely, or the record tells so little, that only low orders can be told apart."""
+        return bool(self.told.reason) or (bool(self.told.processes) and self.told.moves < FEW_MOVES)
+
+    @property
+    def open(self) -> bool:
+        """Whether the outputs do not act on the inputs."""
+        return self.told.loop.word == "open"
 
     @property
     def single(self) -> bool:
@@ -82,7 +91,7 @@ class Ladder:
         """Return the choice so far: a richer class must be clearly better."""
         chosen = None
         for best in filter(None, map(self.best, KINDS)):
-            if chosen is None or (best.score > chosen.score and gain(chosen, best) > CLEAR):
+            if chosen is None or (best.score > chosen.score and chosen.gain(best) > CLEAR):
                 chosen = best
         return chosen
 
@@ -109,11 +118,6 @@ class Ladder:
         return int(self.arguments(LINEAR, "ss.exact", "hammerstein_ss.sid").get("nx", 2))
 
 
-def gain(simple: Trial, rich: Trial) -> float:
-    """Return the median over the blocks of the logarithm of the ratio of two models' error energies."""
-    return float(np.median(np.log(np.maximum(simple.losses, 1e-300) / np.maximum(rich.losses, 1e-300))))
-
-
 def few_levels(data: Data) -> bool:
     """Whether no input has more than a few levels: only linear models are tried then."""
     return all(_levels(data, c) <= FEW_LEVELS for c in range(data.m))
@@ -138,9 +142,16 @@ def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
 
 
 def linear_models(ladder: Ladder) -> Rung:
-    """Autoregressions, subspace models of 1, 2, ... states, output-error models, and refinements of the best."""
+    """The low-order model found in the record, autoregressions, subspace and output-error models, and refinements."""
     model = partial(structure, LINEAR)
+    if ladder.single and ladder.told.processes:
+        yield list(low_order(ladder))
+        if ladder.few_moves:
+            return
     yield [model("arx", na=na, nb=nb, nk=list(nk)) for na, nb, nk in ladder.regressions]
+    if not ladder.open:  # others assume that the input does not depend on the noise
+        yield from _in_a_loop(ladder)
+        return
     if ladder.single:
         for delay in ladder.delays:
             yield from climbed([model("oe.exact", na=n, nb=n, nk=list(delay))] for n in range(1, 8))
@@ -154,6 +165,40 @@ def linear_models(ladder: Ladder) -> Rung:
                for nb in dict.fromkeys([1, max(a["na"] - 1, 1), a["na"] + 2])]
 
 
+def low_order(ladder: Ladder) -> Iterator[Candidate]:
+    """Yield the model of the dead times and poles that were found in a record of one output."""
+    process = ladder.told.processes[0]
+    orders = _orders(process)
+    if ladder.open:
+        yield structure(LINEAR, "oe.exact", **orders)
+        return
+    nd = max(process.noise.size - 1, 1)
+    for nc, d in dict.fromkeys([(0, nd), (0, 1), (1, 1)]):
+        yield structure(LINEAR, "bj.exact", **orders, nc=nc, nd=d)
+
+
+def _orders(process: Process) -> dict[str, Any]:
+    """Return the arguments of a transfer function with the poles and lags of a process."""
+    several = process.responses
+    found: dict[str, Any] = {"na": max(r.poles.size for r in several), "nb": [r.b.size for r in several],
+                             "nk": [r.nk for r in several]}
+    if all(r.integrates for r in several):
+        found["constraints"] = ("integrator",)
+    return found
+
+
+def _in_a_loop(ladder: Ladder) -> Rung:
+    """Yield models with a noise model, whose inputs act one sample later at the earliest."""
+    model = partial(structure, LINEAR)
+    if ladder.single:
+        delay = list(ladder.delays[-1])
+        yield from climbed([model("bj.exact", na=n, nb=n, nk=delay, nc=1, nd=1),
+                            model("armax.exact", na=n, nb=n, nk=delay, nc=n)] for n in range(1, 5))
+    else:
+        yield from climbed([model("ss.exact", nx=n, criterion="prediction", feedthrough=False)]
+                           for n in range(1, LARGEST + 1))
+
+
 def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
     words = [bases(ladder.data, word) for word in ("polynomial:3", "triangular:6")]
@@ -164,10 +209,17 @@ def input_functions(ladder: Ladder) -> Rung:
             a = ladder.arguments(INPUTS)
             yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
         return
+    if not ladder.open:
+        a = ladder.arguments(LINEAR, "bj.exact") or {"na": 2, "nb": 2, "nk": list(ladder.delays[-1]), "nc": 0, "nd": 1}
+        yield [structure(INPUTS, "hammerstein_bj.exact", **a, basis=word) for word in words]
+        return
 
     def model(n: int, nk: Sequence[int], basis: Any) -> Candidate:
         return structure(INPUTS, "hammerstein_oe.exact", na=n, nb=n, nk=list(nk), basis=basis)
 
+    if ladder.told.processes:
+        found = _orders(ladder.told.processes[0])
+        yield [structure(INPUTS, "hammerstein_oe.exact", **found, basis=word) for word in words]
     a = ladder.arguments(LINEAR, "oe.exact") or {"na": 2, "nk": ladder.delays[-1]}
     delays = list(dict.fromkeys([tuple(a["nk"]), *ladder.delays]))
     yield [model(k, nk, word) for k in dict.fromkeys([min(int(a["na"]), 3), 2]) for nk in delays for word in words]

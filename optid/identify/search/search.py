@@ -1,7 +1,7 @@
 """From a record to a model: structures of every class are compared by cross-validation, and the choice is explained."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -16,7 +16,7 @@ from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
-from optid.identify.search.ladder import CLEAR, EQUAL, KINDS, LINEAR, RUNGS, Ladder, few_levels, gain
+from optid.identify.search.ladder import CLEAR, EQUAL, FEEDBACK, KINDS, LATENT, LINEAR, RUNGS, Ladder, few_levels
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, spared, tried
 from optid.identify.verdict import Verdict, verdict
@@ -104,15 +104,17 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     Settings(accuracy)  # every trial would refuse it
     for word in classes:
         one_of("classes", word, KINDS)
-    possible = [kind for kind in KINDS if kind in classes and (kind == LINEAR or not few_levels(data))]
-    if not possible:
-        raise StructureError("no input has more than five levels: only linear models can be distinguished, add "
-                             "'linear' to the classes")
     if horizon is not None:
         check_integer(horizon, "horizon")
     rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
     cut = Blocks.of(data, blocks)
     ladder, stopped = Ladder.of(cut), ""
+    limits = dict(_limits(ladder))
+    possible = [kind for kind in KINDS if kind in classes and kind not in limits]
+    if not possible:
+        raise StructureError(f"{next(limits[kind] for kind in classes)}: add 'linear' to the classes")
+    if horizon is None and not ladder.open:
+        horizon = 1  # a free run says nothing about the plant where the input answers the noise
     end = clock + (1 - RESERVED) * budget
 
     pool = Pool(partial(_attempt, cut, {"solver": solver, "accuracy": accuracy}, rules, horizon),
@@ -134,13 +136,31 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         raise _nothing(list(ladder.trials.values()))
     found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
     why = reasons(ladder, best)
-    if len(possible) < len(classes):
-        why.append("no input has more than five levels: static functions cannot be distinguished from straight lines, "
-                   "and only linear models were tried")
+    why += dict.fromkeys(limits[kind] for kind in classes if kind in limits)
     if alone:
         why.append(f"the search worked in one process: {alone}")
     return Identification(found, chosen, best, tuple(ladder.trials.values()), tuple(why), horizon, blocks,
                           stopped, time.monotonic() - clock)
+
+
+def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
+    """Yield the classes that the record cannot tell from others, with the reason."""
+    if ladder.told.reason:
+        reason = "nothing can be identified from this record: only the simplest model was fitted"
+    elif ladder.few_moves:
+        moves = ladder.told.moves
+        reason = (f"an input moves {'once' if moves == 1 else f'{moves} times'}: only linear models can be "
+                  "distinguished, order and dead time were chosen by the Bayesian information criterion")
+    elif few_levels(ladder.data):
+        reason = ("no input has more than five levels: static functions cannot be distinguished from straight lines, "
+                  "and only linear models can be compared")
+    elif not ladder.open:
+        reason = "closed loop: only models with a noise model were compared, one sample ahead"
+        yield from ((kind, reason) for kind in (FEEDBACK, LATENT))
+        return
+    else:
+        return
+    yield from ((kind, reason) for kind in KINDS if kind != LINEAR)
 
 
 def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: float, told: Callable[[Trial], None]
@@ -200,7 +220,7 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
             found.append(f"{kind}: {trial.score:.1f} % by cross-validation")
             current = trial
             continue
-        saved = gain(current, trial)
+        saved = current.gain(trial)
         sentence = f"{kind}: {trial.score:.1f} % against {current.score:.1f} %"
         median = f"{100 * (1 - np.exp(-saved)):.0f} % less error energy in the median block"
         if trial.score > current.score and saved > CLEAR:
@@ -218,13 +238,14 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
     return found
 
 
-def _refitted(chosen: Trial, blocks: Blocks, horizon: int | None, settings: Mapping[str, Any]) -> Fit:
+def _refitted(chosen: Trial, blocks: Blocks, horizon: int | None, settings: dict[str, Any]) -> Fit:
     """Fit a structure to the whole record with all its starts; as on trial where that follows the record better."""
     candidate = chosen.candidate
-    found = fit(blocks.data, candidate.formulation, **settings, **candidate.arguments)
+    arguments = candidate.under(settings.pop("constraints"))
+    found = fit(blocks.data, candidate.formulation, **settings, **arguments)
     if 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation):
         return found
-    return fit(blocks.data, candidate.formulation, **settings, **candidate.arguments, **spared(candidate))
+    return fit(blocks.data, candidate.formulation, **settings, **arguments, **spared(candidate))
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None], clock: float, budget: float, trial: Trial) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.errors import OptidError
+from optid.errors import DataError, OptidError, RankError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.fitting import fit
 from optid.models.functions import free_parameters
@@ -17,6 +17,7 @@ from optid.models.functions import free_parameters
 WORSE = 1.3
 """Ratio of its error energy on the first half of the blocks to that of the best, above which a structure is dropped."""
 STARTS = 3  # starts of output-error models in a trial
+OPTIONS = {"constraints": "constraint"}  # options of the command line by arguments with another name
 STEPS = 30  # iterations of state-space models in a trial
 
 Key = tuple[str, tuple[tuple[str, Any], ...]]
@@ -40,7 +41,12 @@ class Candidate:
         """The arguments as command-line options."""
         texts = {name: " ".join(map(str, value)) if isinstance(value, list | tuple) else value
                  for name, value in self.arguments.items()}
-        return " ".join(f"--{name.replace('_', '-')} {text}" for name, text in texts.items())
+        return " ".join(f"--{OPTIONS.get(name, name.replace('_', '-'))} {text}" for name, text in texts.items())
+
+    def under(self, constraints: Sequence[Any]) -> dict[str, Any]:
+        """Return its arguments with further constraints."""
+        whole = (*self.arguments.get("constraints", ()), *constraints)
+        return {**self.arguments, **({"constraints": whole} if whole else {})}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +84,10 @@ class Trial:
 
         It is at most the fit of the estimation data, which a poor local optimum of the whole record lowers.
         """
-        if not self.complete or not len(self.energy):
+        if not self.complete:
             return -np.inf
+        if not len(self.energy):  # no block could be left out
+            return self.estimation
         return min(pooled_fit(self.energy, self.measure), self.estimation)
 
     @property
@@ -93,6 +101,12 @@ class Trial:
         """Relative energy of the errors on the blocks (b,), summed over the outputs, in their order in the record."""
         return np.sum(self.energy / np.maximum(self.measure, 1e-300), axis=1)[np.argsort(self.order)]
 
+    def gain(self, rich: "Trial") -> float:
+        """Return the median over the blocks of both of the log ratio of error energies; minus infinity without any."""
+        common = sorted(set(self.order) & set(rich.order))
+        mine, other = (np.array([trial.losses[sorted(trial.order).index(b)] for b in common]) for trial in (self, rich))
+        return float(np.median(np.log(np.maximum(mine, 1e-300) / np.maximum(other, 1e-300)))) if common else -np.inf
+
 
 def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
           constraints: Sequence[Any], horizon: int | None, deadline: float) -> Trial:
@@ -102,8 +116,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     there is no rival, it takes the time it needs.
     """
     clock, found = time.process_time(), Trial(candidate)
-    arguments = {**candidate.arguments, **spared(candidate),
-                 **({"constraints": tuple(constraints)} if constraints else {})}
+    arguments = {**candidate.under(constraints), **spared(candidate)}
 
     def fitted(data: Any) -> Any:
         return fit(data, candidate.formulation, prove=False, **settings, **arguments)
@@ -128,24 +141,30 @@ def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Tr
                     estimation=blocks.fit(whole.model, horizon))
     if rival is not None and known.estimation < rival.score:
         yield replace(known, reason="its fit of the estimation data is below the cross-validated fit of the best")
-    order: tuple[int, ...] = (*range(0, len(blocks), 2), *range(1, len(blocks), 2))  # every other one first
+    order = (*blocks.moving[::2], *blocks.moving[1::2])  # every other one first
     known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
     for done, b in enumerate(order, start=1):
         if rival is not None and time.monotonic() > deadline:  # without a rival there is nothing to fall back to
             yield replace(known, reason="out of time")
-        energy, measure = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
+        try:
+            energy, measure = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
+        except (RankError, DataError):  # what is left of the record does not determine the structure
+            continue
         known = replace(known, energy=np.vstack([known.energy, energy]), measure=np.vstack([known.measure, measure]),
-                        order=order[:done])
+                        order=(*known.order, b))
         if not np.isfinite(energy).all():
             yield replace(known, reason=f"its simulation diverges in block {b + 1}")
         if rival is not None and 2 * done == len(order):
-            places = [rival.order.index(one) for one in known.order]
-            if _loss(known.energy, known.measure) > WORSE * _loss(rival.energy[places], rival.measure[places]):
+            both = [one for one in known.order if one in rival.order]
+            if both and _on(known, both) > WORSE * _on(rival, both):
                 yield replace(known, reason="worse than the best on the first half of the blocks")
     yield known
 
 
-def _loss(energy: Array, measure: Array) -> float:
+def _on(trial: Trial, blocks: Sequence[int]) -> float:
+    """Return the error energy of a trial on some blocks, over what it is measured by."""
+    places = [trial.order.index(one) for one in blocks]
+    energy, measure = trial.energy[places], trial.measure[places]
     return float(np.sum(energy.sum(axis=0) / np.maximum(measure.sum(axis=0), 1e-300)))
 
 

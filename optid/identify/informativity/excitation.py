@@ -1,0 +1,123 @@
+"""How much every input excites: moves, levels and sinusoids, and inputs from which nothing can be learned.
+
+n sinusoids determine 2 n numbers of a linear response. One move from rest determines a gain, time constants and a dead
+time, four numbers; what a record holds beyond that is noise.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.identify.design.rules import LONGEST, many_lines, remaining_shares
+from optid.identify.informativity.signals import Signals
+
+FEW_MOVES = 3  # up to which the moves are counted in words
+ONE_MOVE = 4  # numbers that one move determines
+MOST_LINES, LINES = 3, 1e-4  # sinusoids that are looked for; share of the variance that they must leave at most
+TOGETHER = 1e-8  # share of an input's energy that another leaves, below which they move together
+COPY = 1e-8  # the same for an output, earlier or later
+AFTER = 3  # samples that must follow the first move
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """How an input moves.
+
+    Attributes:
+        input: its name.
+        levels: distinct values.
+        moves: samples at which it changes, all experiments together.
+        lines: sinusoids that it consists of; None where they are many.
+        ramp: whether it rises evenly with time.
+    """
+
+    input: str
+    levels: int
+    moves: int
+    lines: int | None
+    ramp: bool
+
+    @property
+    def numbers(self) -> int | None:
+        """How many numbers of a linear response it determines; None for many."""
+        if self.moves <= 1:
+            return ONE_MOVE if self.moves else 0
+        return None if self.lines is None else 2 * self.lines
+
+    @property
+    def finding(self) -> str:
+        """What it determines, where that is little; else ""."""
+        if self.moves == 1:
+            return (f"input {self.input!r} moves once: a step determines gain, time constants and dead time, "
+                    f"{ONE_MOVE} numbers and no static curve")
+        if self.lines is not None:
+            waves = "is a sinusoid" if self.lines == 1 else f"consists of {self.lines} sinusoids"
+            return f"input {self.input!r} {waves}: it determines {self.numbers} numbers of a linear response"
+        return ""
+
+
+def excitation(signals: Signals, c: int, name: str) -> Excitation:
+    """Describe how input c moves."""
+    records = signals.inputs(c)
+    moves = sum(int(np.count_nonzero(np.diff(u))) for u in records)
+    x = max(records, key=len)[:LONGEST]
+    return Excitation(name, signals.levels(c), moves, _lines(x), moves > 1 and all(map(_even, records)))
+
+
+def _lines(x: Array) -> int | None:
+    if x.size < 8 * MOST_LINES or np.ptp(x) == 0 or many_lines(x, MOST_LINES, LINES):
+        return None
+    shares = remaining_shares(x[:, None], MOST_LINES, LINES)
+    periods_seen = np.mean(np.diff(np.sign(x - x.mean())) != 0) * x.size >= 4
+    return int(shares.size - 1) if shares[-1] <= LINES and periods_seen else None
+
+
+def _even(x: Array) -> bool:
+    """Whether samples (T,) follow a straight line."""
+    k = np.arange(len(x)) - (len(x) - 1) / 2
+    rest = x - x.mean() - k * (k @ x) / max(float(k @ k), 1.0)
+    return len(x) > 2 and bool(rest @ rest <= 1e-8 * float((x - x.mean()) @ (x - x.mean()))) and bool(np.ptp(x) > 0)
+
+
+def hopeless(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...], found: list[Excitation]) -> str:
+    """Return why nothing can be learned from an input, "" where something can."""
+    for c, one in enumerate(found):
+        if not one.moves:
+            return f"input {one.input!r} does not move"
+        if one.ramp:
+            return (f"input {one.input!r} rises evenly with time, as a clock does: its effect cannot be told from a "
+                    "drift of the output")
+        left = max((len(u) - 1 - int(np.flatnonzero(np.diff(u))[0]) for u in signals.inputs(c) if np.ptp(u)), default=0)
+        if left <= AFTER:
+            return (f"input {one.input!r} moves for the first time {left} sample{'s' * (left > 1)} before the end: its "
+                    "effect is not in the record")
+        for o, output in enumerate(outputs):
+            if (late := _copied(signals, c, o)) is not None:
+                when = "the same sample" if late == 0 else f"{abs(late)} sample{'s' * (abs(late) > 1)} "
+                when += "" if late == 0 else "later" if late > 0 else "before"
+                return (f"input {one.input!r} is output {output!r}, {when}: it says nothing about a plant; choose the "
+                        "column of the actuator")
+    for first, second in combinations(range(len(inputs)), 2):
+        x, y = (np.concatenate(signals.inputs(c)) for c in (first, second))
+        if 1 - (x @ y) ** 2 / max(float((x @ x) * (y @ y)), 1e-300) < TOGETHER:
+            ratio = float(x @ y) / float(x @ x) * signals.u_scale[second] / signals.u_scale[first]
+            return (f"inputs {inputs[first]!r} and {inputs[second]!r} always move together (the second is {ratio:.4g} "
+                    "times the first, but for a constant): the record determines the sum of their effects; leave one "
+                    "out")
+    return ""
+
+
+def _copied(signals: Signals, c: int, o: int) -> int | None:
+    """Return how many samples after output o an equal input c comes, None where it does not."""
+    i = int(np.argmax([len(u) for u in signals.u]))
+    u, y = signals.u[i][:, c], signals.y[i][:, o]
+    n, half = 2 * len(u), len(u) // 2
+    du, dy = np.sign(np.diff(u)), np.sign(np.diff(y))  # a jump at the end of a column that was shifted counts little
+    correlation = np.abs(np.fft.irfft(np.fft.rfft(du, n) * np.conj(np.fft.rfft(dy, n)), n))
+    late = int(np.argmax(np.concatenate([correlation[-half:], correlation[: half + 1]]))) - half
+    a, b = u[max(late, 0) : len(u) + min(late, 0)], y[max(-late, 0) : len(y) - max(late, 0)]
+    a, b = a - a.mean(), b - b.mean()
+    rest = 1 - (a @ b) ** 2 / max(float((a @ a) * (b @ b)), 1e-300)
+    return late if rest < COPY else None

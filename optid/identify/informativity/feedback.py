@@ -1,0 +1,116 @@
+"""Whether a record comes from a closed loop: does the past of an output act on an input?
+
+Sims' test: in open loop the future of an input says nothing about an output beyond the past of both, for any input.
+The past is the first lags of the input and its response through the dead time and the poles of a low-order model, so
+that neither is missed. An input that answers without delay shows at the same sample: with a sign opposite to that of
+the gain it is the answer of a controller (Sims 1972; Gustavsson, Ljung and Söderström 1977).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
+from optid.identify.informativity.process import Process
+from optid.identify.informativity.signals import Signals, delayed, respond
+
+LEVEL = 1e-3  # of the test of one input, shared by the outputs
+LEADS, LAGS, SHAPED = 6, 12, 4  # future and past samples of an input; samples of its response
+TIED = 1e-3  # share of the innovations of an input that outputs do not explain, below which nothing else moved it
+EXACT = 1e-6  # the same for an input that answers at once
+MOVING = 0.5  # share of the samples at which an input must change to be such an answer
+
+Word = Literal["open", "closed", "regulated"]
+
+
+@dataclass(frozen=True)
+class Loop:
+    """How an input depends on the outputs.
+
+    Attributes:
+        word: "open"; "closed" where outputs act on it; "regulated" where nothing else moved it.
+        p_value: of the future of the input, the smallest over the outputs.
+        outside: share of the innovations of the input that past and present outputs do not explain.
+        output: the output that acts on it.
+    """
+
+    word: Word
+    p_value: float = 1.0
+    outside: float = 1.0
+    output: str = ""
+
+
+def loop(signals: Signals, c: int, processes: tuple[Process, ...], names: tuple[str, ...]) -> Loop:
+    """Test whether outputs act on input c; the processes have an input act at the next sample at the earliest."""
+    found = [_tested(signals, c, o, process) for o, process in enumerate(processes)]
+    level = LEVEL / len(found)
+    free = outside(signals, c)
+    for o, (future, now, same) in enumerate(found):
+        answered = now < level and (not same or (free < EXACT and _moving(signals, c) > MOVING))
+        if future < level or answered:
+            return Loop("regulated" if free < TIED else "closed", min(future, now) if answered else future, free,
+                        names[o])
+    return Loop("open", min(p for p, _, _ in found), free)
+
+
+def _tested(signals: Signals, c: int, o: int, process: Process) -> tuple[float, float, bool]:
+    """Return p values of the future of input c and of its present, and whether the latter has the sign of the gain."""
+    lags, leads = min(LAGS, signals.longest // 12), min(LEADS, signals.longest // 25)
+    if leads < 1 or lags < 1:
+        return 1.0, 1.0, True
+    na = memory(signals, o) + 2
+    levels = signals.levels(c)
+
+    def build(i: int, first: int, last: int) -> list[Array]:
+        u, y = signals.u[i], signals.y[i][:, o]
+        past = [np.ones((last - first, 1)), lagged(y, range(1, na + 1), first, last)]
+        for other in range(u.shape[1]):
+            response = process.responses[other]
+            for x in powers(u[:, other], signals.levels(other)):
+                shaped = respond(response.poles, x)
+                past += [lagged(x, range(1, lags + 1), first, last),
+                         np.column_stack([delayed(shaped, max(response.nk, 1) + j)[first:last] for j in range(SHAPED)])]
+        now = np.column_stack([x[first:last] for x in powers(u[:, c], levels)])
+        there = signals.present[i][first:last, o]
+        return [part[there] for part in (np.hstack(past), now, lagged(u[:, c], range(-leads, 0), first, last),
+                                         y[first:last])]
+
+    columns = stacked(signals, max(na, lags), leads, build)
+    if not columns or len(columns[3]) < 2 * columns[0].shape[1]:
+        return 1.0, 1.0, True
+    past, now, future, y = columns
+    ahead = added(y, np.hstack([past, now]), future)
+    present = added(y, past, now)
+    slope = float(np.linalg.lstsq(np.hstack([past, now[:, :1]]), y, rcond=1e-10)[0][-1])
+    response = process.responses[c]
+    sign = float(response.b.sum()) * (-1.0 if np.count_nonzero(response.poles.real > 1) % 2 else 1.0)
+    return ahead.p_value, present.p_value, slope * sign > 0
+
+
+def setpoint(signals: Signals, c: int) -> int | None:
+    """Return another input that, with the outputs, determines input c: the set-point of its controller, if any."""
+    others = [other for other in range(len(signals.u_scale)) if other != c]
+    return next((other for other in others if outside(signals, c, beside=(other,)) < TIED), None)
+
+
+def outside(signals: Signals, c: int, order: int = 12, beside: tuple[int, ...] = ()) -> float:
+    """Return the share of the innovations of input c, beyond its own past, that past and present outputs leave.
+
+    The outputs, and the inputs `beside` them.
+    """
+    order = max(min(order, signals.longest // 12), 1)
+    columns = stacked(signals, order, 0, lambda i, first, last: (
+        np.hstack([np.ones((last - first, 1)), lagged(signals.u[i][:, c], range(1, order + 1), first, last)]),
+        np.hstack([lagged(x, range(order + 1), first, last)
+                   for x in (*signals.y[i].T, *(signals.u[i][:, other] for other in beside))]),
+        signals.u[i][first:last, c]))
+    if not columns:
+        return 1.0
+    own, outputs, u = columns
+    return 1.0 - added(u, own, outputs).share
+
+
+def _moving(signals: Signals, c: int) -> float:
+    return float(np.mean(np.concatenate([np.diff(u) != 0 for u in signals.inputs(c)])))
