@@ -18,6 +18,7 @@ from optid.identify.informativity.signals import whitened
 from optid.statistics.factors import ROUNDING
 
 DEPENDENT = 1e-7  # singular value, over the largest, below which a direction is a combination of the others
+LEAST = 1e-2  # share of its length that a column must keep beside the tangent space, to be more than its own error
 DISTINCT = 1e-2  # the same among the columns of one alternative, all of length one
 
 
@@ -91,8 +92,7 @@ def orthonormal(columns: Array) -> Array:
     return basis[:, sizes > DEPENDENT * sizes[0]]
 
 
-def score_test(error: Array, tangent: Array, columns: Array, spare: int, least: float, negligible: float
-               ) -> FTest | None:
+def score_test(error: Array, tangent: Array, columns: Array, spare: int, negligible: float) -> FTest | None:
     """Test whether columns reduce the error beside the tangent space of the hypothesis; None if they add nothing to it.
 
     Args:
@@ -100,7 +100,6 @@ def score_test(error: Array, tangent: Array, columns: Array, spare: int, least: 
         tangent: (R, n) orthonormal basis of the directions in which the hypothesis can still move.
         columns: (R, k) of the alternative.
         spare: rows less what was projected out of them.
-        least: share of its length that a column must keep beside the tangent space, to be more than its own error.
         negligible: see `FTest.of`.
     """
     error = error - tangent @ (tangent.T @ error)
@@ -108,7 +107,7 @@ def score_test(error: Array, tangent: Array, columns: Array, spare: int, least: 
     unit = columns[:, sizes > 0] / sizes[sizes > 0]
     left = unit - tangent @ (tangent.T @ unit)
     lengths = np.linalg.norm(left, axis=0)
-    left = left[:, lengths > least] / lengths[lengths > least]
+    left = left[:, lengths > LEAST] / lengths[lengths > LEAST]
     if not left.size:
         return None
     basis, values, _ = np.linalg.svd(left, full_matrices=False)

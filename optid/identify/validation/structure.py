@@ -5,9 +5,9 @@ A Hammerstein system with additive output noise of any colour obeys
     y(k) = c + sum_c sum_i h_c(i) f_c(u_c(k - i)) + v(k).
 
 Functions of inputs, of the predicted output and of time then explain nothing of v. Every row of a table
-(`structure_alternatives`) makes such functions, as products of samples at different lags, which a Wiener system has, and
-is judged by one score test (`score_tests`). Finer functions and further lags complete the hypothesis; a negligible
-share of the variance is allowed in every test.
+(`structure_alternatives`) makes some, as products of samples at different lags, which a Wiener system has, and is
+judged by one score test (`score_tests`). Finer functions and further lags complete the hypothesis; a negligible share
+of the variance is allowed in every test.
 """
 
 from collections.abc import Sequence
@@ -25,8 +25,11 @@ from optid.identify.validation.structure_design import Design
 from optid.identify.validation.structure_hypothesis import Hypothesis, fit_hammerstein, given_model
 
 SIGNIFICANT = 5e-3
-NEGLIGIBLE = 0.003  # share of the residual variance within which functions and filters follow any Hammerstein system
+# share of the residual variance within which functions and filters follow any Hammerstein system, and noise models any
+# noise, but for so many rows
+NEGLIGIBLE, ROWS = 0.003, 2.0
 SAMPLES = 30_000  # samples read, from the beginning of every experiment
+SHORTEST = 24  # samples of an experiment that is read
 
 
 @dataclass(frozen=True)
@@ -79,14 +82,20 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None, found: 
     found = processes(data) if found is None else found
     if data.n_samples > 1.1 * SAMPLES:
         data = data.split(SAMPLES / data.n_samples)[0]
+    kept = [i for i, e in enumerate(data.experiments) if e.n_samples >= SHORTEST]
+    if not kept:
+        raise RankError(f"no experiment has {SHORTEST} samples: use longer ones")
+    data = data.select(experiments=kept)
     tests, ratios = {}, []
     for o, (name, process) in enumerate(zip(data.outputs, found)):
         design = Design.of(data, o, process)
-        runs = None if simulated is None else [y[: e.n_samples, o] for y, e in zip(simulated, data.experiments)]
-        hypothesis = fit_hammerstein(design, process.noise) if runs is None else given_model(design, runs)
+        runs = simulated and [simulated[i][: e.n_samples, o] for i, e in zip(kept, data.experiments)]
+        hypothesis = given_model(design, runs) if runs else fit_hammerstein(design, process.noise)
         tests[name] = _test(hypothesis)
         ratios.append(hypothesis.ratios)
     every = [(test, words) for each in tests.values() for words, test in each.items()]
+    if not all(np.isfinite(test.p_value) for test, _ in every):
+        raise RankError("the test is not available: a simulated output or a function of the inputs is not finite")
     best, words = min(every, key=lambda pair: (pair[0].p_value, -pair[0].saving))
     return Structure(dict(zip(data.inputs, np.max(ratios, axis=0).tolist())), min(1.0, len(every) * best.p_value),
                      best.saving, words,
@@ -98,10 +107,10 @@ def _test(hypothesis: Hypothesis) -> dict[str, FTest]:
     table = alternatives(hypothesis)
     if hypothesis.rounding:
         return {next(iter(table)): FTest()}
-    regression, found = hypothesis.regression, {}
+    regression, error, found = hypothesis.regression, hypothesis.error, {}
     for name, columns in table.items():
-        test = score_test(hypothesis.error, hypothesis.tangent, regression.reduce(columns(hypothesis)),
-                          regression.spare, hypothesis.least, NEGLIGIBLE)
+        test = score_test(error, hypothesis.tangent, regression.reduce(columns(hypothesis)), regression.spare,
+                          NEGLIGIBLE + ROWS / max(regression.spare, 1))
         if test is not None:
             found[name] = test
     if not found:

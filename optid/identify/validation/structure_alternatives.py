@@ -5,14 +5,14 @@ independent of the noise. Sources: higher-order correlations as structure tests 
 nonlinearities at different lags as a matrix of coefficients, lags times functions, of rank above one (Bai 1998).
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import combinations_with_replacement
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.identify.validation.structure_design import denominators, filtered
+from optid.identify.validation.structure_design import Poles, denominators, filtered
 from optid.identify.validation.structure_hypothesis import Hypothesis
 from optid.models.recursions import lfilter
 
@@ -105,12 +105,12 @@ def _bent(x: Array) -> Array:
     return np.column_stack([bent**2, bent**3, np.abs(bent)])
 
 
-def _through(values: Array, poles: Array, lag: int) -> Array:
+def _through(values: Array, poles: Poles, lag: int) -> Array:
     found = filtered(values - values[:1], poles, lag, pulses=2, twice=False)
     return found.reshape(len(found), -1)
 
 
-def _standardised(signals: list[Array]) -> list[Array]:
+def _standardised(signals: Sequence[Array]) -> list[Array]:
     """Return signals, (N,) or (N, q) per experiment, with mean zero and variance one over all experiments."""
     whole = np.concatenate(signals)
     middle, spread = whole.mean(axis=0), np.maximum(whole.std(axis=0), 1e-300)

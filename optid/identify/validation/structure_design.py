@@ -88,7 +88,7 @@ class Design:
 
     data: Data
     inputs: list[Array]
-    output: list[Array]
+    output: Sequence[Array]
     centre: float
     spread: float
     families: tuple[Family, ...]
@@ -105,7 +105,7 @@ class Design:
         _refuse_still_inputs(data, inputs)
         measured = [e.y[:, o] for e in data.experiments]
         whole = np.concatenate(measured)
-        centre, spread = float(np.nanmean(whole)), float(np.nanstd(whole))
+        centre, spread = float(np.nanmean(whole)), float(np.nanstd(whole)) or 1.0
         longest = max(e.n_samples for e in data.experiments)
         poles = tuple(_within(r.poles, longest) for r in process.responses)
         lags = tuple(max(r.nk - 1, 0) for r in process.responses)  # one too short costs a column, one too long is wrong
@@ -123,13 +123,9 @@ class Design:
             columns = np.hstack(decays)[: len(y) - first, : max(len(y) // DECAYS, 1)]
             present.append(here)
             nuisance.append(np.column_stack([np.ones(len(y)), np.pad(columns, ((first, 0), (0, 0)))]))
-        output = [np.nan_to_num((y - centre) / (spread or 1.0)) for y in measured]
+        output = [np.nan_to_num((y - centre) / spread) for y in measured]
         return cls(data, inputs, output, centre, spread, families, poles, lags, banks,
                    Regression(tuple(present), tuple(nuisance), np.ones(1)))
-
-    def scaled(self, y: Array) -> Array:
-        """Return an output in the units of `output`."""
-        return (y - self.centre) / (self.spread or 1.0)
 
 
 def filtered(x: Array, poles: Poles, lag: int, pulses: int = PULSES, twice: bool = True) -> Array:
