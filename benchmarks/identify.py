@@ -30,7 +30,7 @@ import numpy as np
 import optid
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
-from optid.identify.delays import LagSums, linear, scan
+from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
 from optid.identify.validation.predictions import prediction_fit
 

@@ -17,8 +17,8 @@ from optid.structures.least_squares import LinearStructure
 
 
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
-        constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none"
-        ) -> Program | Procedure:
+        constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none",
+        offset: bool | str = True) -> Program | Procedure:
     """Minimise ``‖Y - Phi_y a - Phi_u b - d‖²``.
 
     Named variables: ``a``, ``b``, ``offset``.
@@ -33,22 +33,24 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         ridge: weight of ``‖b‖²``.
         prior: on the impulse responses: "none", "tc" (decaying, rough), "dc" (with a correlation of neighbours) or "ss"
             (smooth); its hyperparameters maximise the marginal likelihood of the record.
+        offset: True for one constant of the equation, "each" for one for every experiment, as of sensors with other
+            zeros; see `optid.models.model.Model.levels`.
 
     Raises:
         StructureError: impossible orders or nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
     return pose_with_loss(loss, data, lambda problem: _programme(problem).subject_to(*constraints), convex=True,
-                          na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge, prior=prior)
+                          na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge, prior=prior, offset=offset)
 
 
 def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence[int] = 0, prior: str = "dc",
-        constraints: Sequence[Any] = ()) -> Program | Procedure:
+        constraints: Sequence[Any] = (), offset: bool | str = True) -> Program | Procedure:
     """Minimise ``‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.
 
     Named variables: ``b``, ``offset``. Arguments as in `arx`, as are the errors raised.
     """
-    return arx(data, na=0, nb=nb, nk=nk, prior=prior, constraints=constraints)
+    return arx(data, na=0, nb=nb, nk=nk, prior=prior, constraints=constraints, offset=offset)
 
 
 def _programme(problem: EquationError) -> Program:

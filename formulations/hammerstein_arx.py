@@ -35,7 +35,8 @@ from optid.structures.lifted_regression import leading_pairs
 
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
-          curvature: float = 0.0, prior: str = "none", gauge: str = "norm") -> Program | Procedure:
+          curvature: float = 0.0, prior: str = "none", gauge: str = "norm", offset: bool | str = True
+          ) -> Program | Procedure:
     """Minimise the bilinear least squares ``‖Y - Phi_y a - Phi_eta vec(mu bᵀ) - d‖²``.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``.
@@ -53,6 +54,8 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         prior: on A and on every row of Theta along the lags: "none", "tc" (decaying, rough), "dc" (with a correlation
             of neighbours) or "ss" (smooth); its hyperparameters maximise the marginal likelihood of the record.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
+        offset: True for one constant of the equation, "each" for one for every experiment, as of sensors with other
+            zeros; see `optid.models.model.Model.levels`.
 
     Raises:
         StructureError: impossible orders, unknown gauge, constraints that do not fit.
@@ -60,7 +63,8 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
     """
     one_of("gauge", gauge, FIXED)
     return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge), convex=False, na=na,
-                          nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
+                          nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior,
+                          offset=offset)
 
 
 def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> Program:
@@ -137,8 +141,8 @@ def _signed_start(program: Program, pairs: Sequence[tuple[str, str]]) -> Mapping
 
 def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
             nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
-            ridge: float = 0.0, curvature: float = 0.0, prior: str = "none",
-            gauge: str = "norm") -> Program | Procedure:
+            ridge: float = 0.0, curvature: float = 0.0, prior: str = "none", gauge: str = "norm",
+            offset: bool | str = True) -> Program | Procedure:
     """Minimise ``‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
 
     The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
@@ -161,13 +165,14 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
     one_of("gauge", gauge, FIXED)
     check_weight(weight, "weight (of the nuclear norm)")
     return pose_with_loss(loss, data, partial(_relaxed, builders=constraints, gauge=gauge, weight=float(weight)),
-                          convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
+                          convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior,
+                          offset=offset)
 
 
 def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
                      basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
                      constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, curvature: float = 0.0,
-                     prior: str = "none", gauge: str = "norm") -> Program | Procedure:
+                     prior: str = "none", gauge: str = "norm", offset: bool | str = True) -> Program | Procedure:
     """Minimise the least squares in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
 
     Named variables: ``Theta``, ``a``, ``offset``. Other arguments as in `nuclear`.
@@ -183,7 +188,8 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
     if svd not in ("whitened", "plain"):
         raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
     return pose_with_loss(loss, data, partial(_relaxed, builders=constraints, gauge=gauge, svd=svd), convex=True,
-                          na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior)
+                          na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior,
+                          offset=offset)
 
 
 def _relaxed(problem: EquationError, builders: Sequence[Any], gauge: str, weight: float | None = None,

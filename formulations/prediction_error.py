@@ -30,6 +30,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.constraints.poles import asks_for_integrator
 from optid.arrays import LARGEST_INTEGER, check_integer, one_of
 from optid.bases import Bases
 from optid.data.channels import model_meta
@@ -54,7 +55,7 @@ Orders = int | Sequence[int]
 
 
 def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: Bases = "polynomial:3", nk: Orders = 0,
-                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 4,
+                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 4,
                    seed: int = 0) -> Procedure:
     """Minimise the innovations of a Hammerstein Box-Jenkins model.
 
@@ -70,7 +71,8 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
         nk: delay of the first coefficient of B in samples, one per input or one for all.
         constraints: builders such as ``formulations.constraints.shape.monotone("increasing")`` or ``lambda v: {...}``.
         gauge: "norm" (‖b‖ = 1), "gain" (unit static gain of the linear part) or "b0" (first coefficient one).
-        offset: estimate the constant of the equation; False holds it at zero, for centred data.
+        offset: True for one constant of the equation, "each" for one for every experiment (and stretch between missing
+            inputs), as of sensors with other zeros; False holds it at zero, for centred data.
         starts: number of starts that are compared. Of output error at most: three suffice where they agree on a model
             that explains nine tenths of the output.
         seed: of the random starts.
@@ -87,7 +89,7 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
 
 
 def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, constraints: Sequence[Any] = (),
-       offset: bool = True, starts: int = 4, seed: int = 0) -> Procedure:
+       offset: bool | str = True, starts: int = 4, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear Box-Jenkins model.
 
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``d``, ``offset``, ``x0``. Arguments as in `hammerstein_bj`, as are
@@ -98,7 +100,7 @@ def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, con
 
 
 def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
-                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 6,
+                   constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 6,
                    seed: int = 0) -> Procedure:
     """Minimise the simulation error of a Hammerstein model.
 
@@ -109,7 +111,7 @@ def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomia
     return _procedure("hammerstein_oe.exact", data, na, nb, nk, basis, 0, 0, constraints, gauge, offset, starts, seed)
 
 
-def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence[Any] = (), offset: bool = True,
+def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence[Any] = (), offset: bool | str = True,
        starts: int = 6, seed: int = 0) -> Procedure:
     """Minimise the simulation error of a linear model.
 
@@ -120,7 +122,7 @@ def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence
 
 
 def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases = "polynomial:3", nk: Orders = 0,
-                      constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True, starts: int = 3,
+                      constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 3,
                       seed: int = 0) -> Procedure:
     """Minimise the innovations of a Hammerstein ARMAX model; the record is not cut where inputs are missing.
 
@@ -133,7 +135,7 @@ def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases 
 
 
 def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constraints: Sequence[Any] = (),
-          offset: bool = True, starts: int = 3, seed: int = 0) -> Procedure:
+          offset: bool | str = True, starts: int = 3, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear ARMAX model; the record is not cut where inputs are missing.
 
     Named variables: ``Theta``, ``a``, ``b``, ``c``, ``offset``. Arguments as in `hammerstein_armax`, as are the errors
@@ -143,11 +145,12 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
 
 
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
-               constraints: Sequence[Any], gauge: str | None, offset: bool, starts: Any, seed: int) -> Procedure:
+               constraints: Sequence[Any], gauge: str | None, offset: Any, starts: Any, seed: int) -> Procedure:
     """Search for the best optimum in a gauge that is always reached, and continue from there in the requested one."""
     count = check_integer(starts, "starts")
     check_integer(seed, "seed", 0, LARGEST_INTEGER)
     criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
+    criterion = replace(criterion, integrates=asks_for_integrator(constraints))
     free = replace(criterion, gauge="none" if gauge is None else "norm")
     best, others, figures = search(free, lambda part: starts_of(part, count, seed))
     enough_rows(best.at.rows, criterion.errors, criterion.unknowns.size, "lags")
@@ -186,9 +189,16 @@ class _Fit(TangentFit):
                 named[theta] = cp.reshape(variables[b], (1, variables[b].size), order="F")
         structural |= {"gauge": tuple(fixed)} if fixed else {}
 
-        if unknowns.memory:
+        if unknowns.levels:
+            states = variables["x0"] if variables["x0"].ndim == 2 else cp.reshape(
+                variables["x0"], (unknowns.memory, 1), order="F")
+            named |= {"offset": cp.reshape(cp.sum(states[-1]) / unknowns.experiments, (1,), order="F"),
+                      "x0": states[:-1]}
+        if unknowns.fading:
             thetas = [named[self.criterion.key("Theta", c)] for c in range(unknowns.layout.m)]
-            named["x0"] = variables["x0"] + self.criterion.levels_before(variables.get("a"), thetas)
+            named["x0"] = named["x0"] + self.criterion.levels_before(variables.get("a"), thetas)
+        else:
+            named.pop("x0", None)
         view = View(named, iterate=True, channels=unknowns.layout.inputs, gauge=gauge, reference=values, units=units,
                     bases=dict(zip(unknowns.layout.inputs, outer_bases(unknowns.layout.bases, units))))
         usual = self.places.values(self.criterion.normalised(self.optimum))
@@ -209,10 +219,15 @@ def transfer_model(criterion: TransferErrors, values: Values) -> HammersteinTF:
     """Return the model of named values in the units of the record: the plant, and C/D where there is a noise filter."""
     layout, part = criterion.unknowns.layout, {name: np.asarray(value, dtype=float) for name, value in values.items()}
     mus = [part.get(criterion.key("mu", c), np.ones(1)) for c in range(layout.m)]
-    a = part.get("a", np.zeros(0))
-    return HammersteinTF(
+    a, levels = part.get("a", np.zeros(0)), None
+    if criterion.unknowns.levels:
+        levels = part["x0"].reshape(criterion.unknowns.memory, -1)[-1:].T
+        part["offset"] = levels.mean(axis=0)
+    model = HammersteinTF(
         a=a, b=tuple(part[criterion.key("b", c)] for c in range(layout.m)),
         nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(layout.bases, mus)), nk=layout.nk,
-        offset=part.get("offset", np.zeros(1)), gauge=criterion.gauge, c=part.get("c", np.zeros(0)),
-        d=part.get("d", np.zeros(0)) if criterion.unknowns.apart else None, **model_meta(criterion.data)
-    ).with_transform(criterion.units)
+        offset=part.get("offset", np.zeros(1)), levels=levels, gauge=criterion.gauge, c=part.get("c", np.zeros(0)),
+        d=part.get("d", np.zeros(0)) if criterion.unknowns.apart else None, **model_meta(criterion.data))
+    if criterion.shifts is not None:
+        model = model.with_output_levels(criterion.shifts)
+    return model.with_transform(criterion.units)

@@ -26,11 +26,13 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.constraints.poles import asks_for_integrator
 from formulations.prediction_error import Orders, transfer_model
 from optid.arrays import one_of
 from optid.bases import Bases
 from optid.data.record import Data
 from optid.errors import StructureError
+from optid.identify.arguments import check_offset
 from optid.identify.gauges import FIXED, scale_fixed
 from optid.identify.prediction_error.search import arx_start, iterated
 from optid.identify.prediction_error.tangent_fit import Places
@@ -58,6 +60,12 @@ def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk:
     smooth ones in the named variables. A record that is too long is refused (`StructureError`).
     """
     one_of("gauge", gauge, FIXED)
+    if check_offset(offset, data) == "each":
+        raise StructureError("this programme has one constant for all experiments; 'hammerstein_oe.exact' takes "
+                             "offset='each'")
+    if asks_for_integrator(constraints):
+        raise StructureError("this programme keeps all poles inside the unit circle: use 'hammerstein_oe.exact' with "
+                             "'integrator'")
     criterion = transfer_errors(data, na, nb, nk, basis, 0, 0, gauge, offset)
     if criterion.data.n_samples > LIMIT:
         raise StructureError(

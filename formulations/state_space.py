@@ -30,14 +30,16 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from formulations.constraints.poles import NO_EQUATION, asks_for_integrator
 from formulations.subspace_procedure import identified
 from optid.arrays import check_integer, one_of
 from optid.bases import Bases
 from optid.data.channels import Transform
+from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
-from optid.identify.arguments import enough_rows, in_memory, outputs_present
+from optid.identify.arguments import check_offset, enough_rows, in_memory, outputs_present
 from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.latent_search import STAGES, first_samples
@@ -50,7 +52,7 @@ from optid.models.roots import modal_weight
 from optid.program.expressions import tangent_product
 from optid.program.program import Program, Values
 from optid.program.solution import Status
-from optid.program.units import energy_unit, inverse, outer_bases
+from optid.program.units import energy_unit, in_units, inverse, outer_bases
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.linearised import Linearised
@@ -64,7 +66,7 @@ WORDS = {"criterion": tuple(SIMULATORS), "stability": ("stable", "free"),
 
 def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
                    criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
-                   weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+                   weighting: str = "auto", offset: bool | str = True, feedthrough: bool | Sequence[bool] = True,
                    stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (),
                    iterations: int = 100, constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation or prediction error of a Hammerstein state-space model with output feedback.
@@ -86,7 +88,8 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
         weighting: of the outputs: "scale" (variances of the outputs), "variance" or "determinant" (variances or
             covariance of the errors, iterated); "auto" is "variance" for simulation and "determinant" (maximum
             likelihood of Gaussian noise) for prediction.
-        offset: estimate a constant; False takes the record as it is.
+        offset: True for one constant of every output, "each" for one in every experiment (and stretch between missing
+            inputs), as of sensors with other zeros, in models without feedback; False takes the record as it is.
         feedthrough: whether the inputs act on the outputs at once, one for all or one per input.
         stability: "stable" keeps every iterate stable (for prediction, its predictor), with the feedback taken as a
             given signal; "free" lets the poles go where the errors are smallest, for plants that integrate or grow
@@ -107,7 +110,7 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
 
 
 def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
-       weighting: str = "auto", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
+       weighting: str = "auto", offset: bool | str = True, feedthrough: bool | Sequence[bool] = True,
        stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
        constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation or prediction error of a linear state-space model.
@@ -155,7 +158,12 @@ class StateSpaceFit(TangentFit):
         if self.constraints:
             weight = modal_weight(values["A"])
             regions = {"P": cp.Constant(weight), "Q": variables["A"] @ weight}
-        view = View({**variables, **self._products(variables, values), **functions, **regions}, iterate=True,
+        named: dict[str, Any] = dict(variables)
+        if unknowns.levels:
+            states = cp.reshape(variables["x0"], (unknowns.memory, unknowns.experiments), order="F")
+            named |= {"offset": cp.sum(states[unknowns.n :], axis=1) / unknowns.experiments,
+                      "x0": states[: unknowns.n]}
+        view = View({**named, **self._products(variables, values), **functions, **regions}, iterate=True,
                     gauge="norm", channels=expansion.input_names, outputs=expansion.output_names, reference=values,
                     units=units, bases=bases | {z: one.basis for z, one in latent.items()},
                     spans={z: one.vectors for z, one in latent.items()})
@@ -198,7 +206,7 @@ class StateSpaceFit(TangentFit):
 
 def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, stability: str,
                     weighting: str, iterations: int, constraints: Sequence[Any], initial: Any, block_rows: Any,
-                    basis: Any = "linear", feedback_basis: Any = None, offset: bool = True, feedthrough: Any = True,
+                    basis: Any = "linear", feedback_basis: Any = None, offset: Any = True, feedthrough: Any = True,
                     extend: Callable[..., Any] | None = None, finish: Callable[..., Procedure] | None = None
                     ) -> Procedure:
     """Fit a model in the units of the samples, and return it in those of the record.
@@ -210,8 +218,17 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
     """
     for what, word in {"criterion": criterion, "stability": stability, "weighting": weighting}.items():
         one_of(what, word, WORDS[what])
+    if asks_for_integrator(constraints):
+        raise StructureError(NO_EQUATION)
     check_integer(iterations, "iterations", 1 if finish is None else 0)
-    in_memory(data, f"{criterion} errors")
+    record = in_memory(data, f"{criterion} errors")
+    constants = check_offset(offset, record)
+    if constants == "each":
+        if feedback_basis is not None or extend is not None or finish is not None:
+            raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant for all "
+                                 "experiments: offset='each' is for 'ss.exact' and 'hammerstein_ss.exact' without "
+                                 "feedback, and for transfer functions")
+        data = levelled(record)[0]
     instruments = "inputs+past" if feedback_basis is None else "simulated"
     if feedback_basis is not None and criterion == "prediction":
         instruments = "simulated+past"
@@ -220,7 +237,7 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
         if getattr(rule, "verify", None) is None:
             raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
                                  "use it with hammerstein_ss.asivid")
-    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(offset),
+    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(constants),
                    instruments=instruments, feedthrough=feedthrough, stability="free",
                    iterations=2 * (feedback_basis is not None), constraints=poles)
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
@@ -233,7 +250,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
         nx = yield from _subspace_starts(first, given, block_rows is None, found, criterion == "prediction")
         if isinstance(nx, Evidence):
             return nx
-        errors, starts = _entered(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles))
+        errors, starts = _entered(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles),
+                                  in_units(record, plan.units) if constants == "each" else None)
         errors, best, figures = search_states(errors, starts, weighting, int(iterations))
         if extend is not None:
             errors, best, more = extend(replace(errors, data=with_whole_inputs(plan.data, 2 * nx + 1)), best)
@@ -286,16 +304,22 @@ def _subspace_starts(plan: Plan, block_rows: Sequence[int | None], imputes: bool
     return nx
 
 
-def _entered(plan: Plan, nx: int, found: dict[str, HammersteinSS], criterion: str, stability: str, checks: Any
-             ) -> tuple[StateErrors, dict[str, Array]]:
-    """Return the criterion, weighted by the variances of the outputs, and the starts as vectors of its unknowns."""
-    data = with_whole_inputs(plan.data, 2 * nx + 1)
-    unknowns = StateUnknowns(nx, plan.expansion(), data.n_experiments, plan.direct(), criterion, plan.offset)
+def _entered(plan: Plan, nx: int, found: dict[str, HammersteinSS], criterion: str, stability: str, checks: Any,
+             several: Data | None) -> tuple[StateErrors, dict[str, Array]]:
+    """Return the criterion, weighted by the variances of the outputs, and the starts as vectors of its unknowns.
+
+    Where every experiment has constants of its own, `several` is the record with its levels.
+    """
+    data, shifts = with_whole_inputs(plan.data if several is None else several, 2 * nx + 1), None
+    if several is not None:
+        data, shifts = levelled(data)
+    unknowns = StateUnknowns(nx, plan.expansion(), data.n_experiments, plan.direct(), criterion,
+                             plan.offset and shifts is None, levels=shifts is not None)
     # similarity takes away the freedom of as many unknowns as A has entries
     enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
     variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
     errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
-                         STABLE if stability == "stable" else np.inf, checks)
+                         STABLE if stability == "stable" else np.inf, checks, shifts)
     starts = {name: x for name, model in found.items() if (x := entered(errors, model)) is not None}
     if not starts:
         raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")

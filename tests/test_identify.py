@@ -13,10 +13,11 @@ import optid
 from optid.bases import Linear
 from optid.errors import DataError, DataWarning, OptidError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks, joined, pooled_fit
-from optid.identify.delays import LagSums, linear, scan, sharp_delays
+from optid.identify.informativity import Informativity
+from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
 from optid.identify.search import search as searching
-from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, RUNGS, Ladder, gain
+from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, RUNGS, Ladder
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, free_parameters, tried
 from optid.models.layout import Layout
@@ -171,21 +172,6 @@ def test_errors_of_smaller_structures_are_those_of_fits_without_the_blocks():
     assert best.error <= sums.error(na, nb, nk)
 
 
-@pytest.mark.parametrize("delay", [0, 1, 4, 7])
-def test_a_delay_is_sharp_where_the_input_is_rich(delay):
-    data = plant(600, delay=delay, noise=0.05)
-    assert sharp_delays(LagSums(Blocks.of(data), linear(data))) == (delay + 1,)
-
-
-def test_a_slow_input_shows_no_sharp_delay():
-    rng = np.random.default_rng(2)
-    u = np.convolve(rng.normal(size=700), np.ones(60) / 60, "valid")
-    u = np.convolve(u, np.hanning(40) / np.hanning(40).sum(), "same")
-    y = np.convolve(u, 0.9 ** np.arange(40))[: u.size]
-    data = optid.Data(u, y + 0.05 * y.std() * rng.standard_normal(u.size))
-    assert sharp_delays(LagSums(Blocks.of(data), linear(data))) == (0,)
-
-
 def test_a_trial_is_given_up_early_and_says_why():
     data = plant(400, cubic=0.5)
     blocks = Blocks.of(data)
@@ -215,14 +201,14 @@ def trial(kind, energies, parameters=3):
 
 
 def ladder_of(*trials):
-    return Ladder(plant(100), [(0,)], [], {t.candidate.key: t for t in trials})
+    return Ladder(plant(100), Informativity(("u",), ("y",)), [(0,)], [], {t.candidate.key: t for t in trials})
 
 
 def test_a_richer_class_has_to_win_clearly_in_the_median_block():
     simple = trial(LINEAR, [0.1, 0.1, 0.1, 0.5])
     lucky = trial(INPUTS, [0.1, 0.1, 0.1, 0.1])  # better in one block only
     clear = trial(INPUTS, [0.05, 0.05, 0.07, 0.4], 5)
-    assert gain(simple, lucky) < CLEAR < gain(simple, clear)
+    assert simple.gain(lucky) < CLEAR < simple.gain(clear)
     assert ladder_of(simple, lucky).choice() is simple
     assert ladder_of(simple, clear).choice() is clear
     worse = trial(INPUTS, [0.01, 0.01, 0.01, 3.0])  # clearly better in the median, worse in all

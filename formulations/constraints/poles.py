@@ -13,6 +13,9 @@ use the same central polynomial in LMI form). It is imposed on a grid of frequen
 near the circle, as linear inequalities; the roots are verified after the fit. In the steps of an output-error fit C is
 the current iterate, pulled inwards only as far as the iterate stays inside the region: no step is therefore cut off,
 and every iterate is stable by construction.
+
+`integrator` puts a pole at 1: the equality A(1) = 0, linear in the coefficients. The constant of the equation then is
+the slope with which the level of the output drifts while the input is held where f vanishes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,7 +33,7 @@ from optid.models.roots import radius as root_radius
 from optid.program.limits import Limit
 from optid.program.view import View
 
-__all__ = ["damped", "disc", "sector", "stable", "strip"]
+__all__ = ["damped", "disc", "integrator", "sector", "stable", "strip"]
 
 MARGIN = 1e-6  # by how much (of the radius of a disc) a region is shrunk, so that a binding constraint leaves it inside
 CHORDS = 12  # sides of the polygon inscribed in half of the region of a damping ratio
@@ -38,6 +41,9 @@ CHORDS = 12  # sides of the polygon inscribed in half of the region of a damping
 FREQUENCIES = 128
 NEARBY = 1e-4  # relative change of the radius by which the price of a larger one is found
 GAP = 1e-3  # least Re(A / C) on the grid, for what happens between its points
+NO_EQUATION = ("constraint 'integrator' applies to the coefficients of A; a pole at 1 of a state-space model is no linear "
+               "equation in its matrices. Use 'oe.exact' or 'hammerstein_oe.exact' with it, or 'ss.exact' with "
+               "stability='free', where a pole may come to lie at 1")
 LIMITS = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9997, 0.9999)  # where the roots of the centre end, as shares of the radius
 
 
@@ -238,6 +244,40 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         return "an inner region" if points is not None or isinstance(na, int) and na > 2 else ""
 
     return Rule(name, build, verify, frozenset({"poles"}), stand_in)
+
+
+def asks_for_integrator(constraints: Sequence[Any]) -> bool:
+    """Whether one of the constraints is `integrator`."""
+    return any("integrator" in getattr(rule, "about", ()) for rule in constraints)
+
+
+@recorded
+def integrator() -> Rule:
+    """A pole lies at 1, ``1 + a_1 + ... + a_na = 0``: the output ramps while the inputs are held.
+
+    It is defined for a transfer function with one output. There is no static characteristic then, and the constant of
+    the equation is a drift, the same in every sample.
+
+    Raises:
+        StructureError: no A to constrain, several outputs, or a state-space model.
+    """
+    def build(view: View) -> Any:
+        a = view.poles
+        if isinstance(a, tuple):
+            raise StructureError(NO_EQUATION)
+        if a is None:
+            raise StructureError("constraint 'integrator': there is no pole to be put at 1, since na is 0")
+        if a.ndim != 1:
+            raise StructureError("constraint 'integrator' is defined for one output: fit each output by itself")
+        return cp.sum(a) == -1
+
+    def verify(model: Any) -> str:
+        if not hasattr(model, "a"):
+            raise StructureError(NO_EQUATION)
+        rest = 1 + float(np.sum(model.a))
+        return "" if abs(rest) <= 1e-9 else f"constraint 'integrator': A(1) = {rest:.3g} instead of 0"
+
+    return Rule("integrator", build, verify, frozenset({"poles", "integrator"}))
 
 
 def _triangle(first: Any, second: Any, radius: float) -> list[Limit]:

@@ -14,7 +14,8 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
-from optid.identify.delays import LagSums, linear, shown_delays
+from optid.identify.informativity import Informativity, informativity
+from optid.identify.lag_sums import LagSums, linear
 from optid.identify.validation.checks import shares_outside
 from optid.identify.validation.predictions import SIMULATION, fit_percent, prediction_fit, simulated_or_nan
 from optid.models.functions import has_feedback
@@ -26,7 +27,9 @@ JUMP = 4.0  # ratio of the sizes of a channel's steps before and after a sample 
 APART = 15.0  # points by which both halves of a record fit better alone, from which the plant counts as changed
 DRIVEN = 0.5  # log ratio by which past outputs reduce the error of the input, from which columns count as swapped
 TOO_FEW = 10  # samples per parameter at least
+SLOW = 0.9  # real poles from here on are compared with 1
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
+NOISE_MODELS = ("arx", "hammerstein_arx", "armax", "hammerstein_armax", "bj", "hammerstein_bj")
 # formulations with a static function of the input, by those without
 STATIC = {"arx": "hammerstein_arx.exact", "oe.exact": "hammerstein_oe.exact", "ss.exact": "hammerstein_ss.exact"}
 
@@ -53,8 +56,10 @@ def advise(fit: Any) -> tuple[Advice, ...]:
     """Return at most five steps for a fit of a record in memory, the most useful first."""
     if not isinstance(fit.data, Data) or fit.model is None:
         return ()
-    steps = list(_on_record(fit))
-    tried = list(_tried(fit)) if fit.data.n_samples <= LONG else []
+    told = informativity(fit.data)
+    steps = [*_hopeless(told), *_in_a_loop(fit, told), *_on_record(fit)]
+    # in a loop a free run says nothing about the plant, by which neighbours are compared
+    tried = list(_tried(fit)) if fit.data.n_samples <= LONG and told.loop.word == "open" else []
     while tried:  # of steps with nearly the same gain, the simplest, which was tried first
         best = max(one.gain for one in tried)
         tried.remove(first := next(one for one in tried if one.gain >= best - SPARED))
@@ -63,6 +68,28 @@ def advise(fit: Any) -> tuple[Advice, ...]:
     for one in (*steps, *_on_model(fit)):
         found.setdefault(one.step, one)
     return tuple(found.values())[:MOST]
+
+
+def _hopeless(told: Informativity) -> Iterator[Advice]:
+    """Repeat why nothing can be identified, and what to do."""
+    if told.reason:
+        what, _, step = told.reason.partition("; " if "; " in told.reason else ": ")
+        yield Advice(what, step or "choose other columns, or record more")
+
+
+def _in_a_loop(fit: Any, told: Informativity) -> Iterator[Advice]:
+    """Advise a noise model and lags from 1 on where an output acts on an input."""
+    if told.loop.word == "open" or not told.processes:
+        return
+    direct = hasattr(fit.model, "nk") and min(fit.model.nk) == 0
+    if direct or not fit.formulation.startswith(NOISE_MODELS):
+        na = max(r.poles.size for p in told.processes for r in p.responses)
+        nk = " ".join(str(max(lag, 1)) for lag in told.lags)
+        step = (f"--formulation bj.exact --na {na} --nb 1 --nk {nk} --set nc=1 --set nd=1" if fit.data.l == 1 else
+                "--formulation ss.exact --set criterion=prediction --set feedthrough=false")
+        what = "an input that acts at once is the controller's answer" if direct else (
+            f"{fit.formulation} assumes that the inputs do not depend on the noise")
+        yield Advice(f"the loop was closed, and {what}: use a noise model and lags from 1 on", step)
 
 
 def _on_record(fit: Any) -> Iterator[Advice]:
@@ -152,8 +179,10 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield structures as a phrase, as options, and as changes of the arguments of a fit."""
     name, arguments, data = fit.formulation, fit.arguments, fit.data
     if hasattr(fit.model, "nk") and "nb" in arguments:
-        sharp = [delay for delay in shown_delays(fit.model, data) if delay is not None]
-        found = [(0,) * data.m, *(k for delay in sharp for k in (delay, tuple(max(k - 1, 0) for k in delay)))]
+        told = informativity(data)
+        shown = [told.lags] if told.processes else []
+        found = [(told.least,) * data.m, *(k for lags in shown for k in (
+            lags, tuple(max(lag - 1, told.least) for lag in lags)))]
         for delay in dict.fromkeys(found):
             if delay != tuple(fit.model.nk):
                 words = _words(delay)
@@ -188,8 +217,7 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 def _on_model(fit: Any) -> Iterator[Advice]:
     model, data = fit.model, fit.data.raw()
-    if not model.is_stable and not has_feedback(model):
-        yield Advice("the model has a pole outside the unit circle", "--constraint stable:0.99")
+    yield from _on_poles(fit)
     for function, x, share in shares_outside(model, data):
         if share > 0.01:
             yield Advice(f"{100 * share:.0f} % of {function.name} lies outside the interval of its basis",
@@ -208,6 +236,28 @@ def _on_model(fit: Any) -> Iterator[Advice]:
     found = _try(fit, formulation=plain, replaced=kept)
     if found is not None and _score(found.model, fit.data) > _score(model, fit.data) - SPARED:
         yield Advice("a linear function of the input fits as well", f"--formulation {plain}")
+
+
+def _on_poles(fit: Any) -> Iterator[Advice]:
+    """Tell a pole that the record does not tell from 1, an integrator, from one outside the unit circle."""
+    model = fit.model
+    if has_feedback(model) or any("integrator" in getattr(rule, "about", ()) for rule in fit.arguments.get(
+            "constraints", ())):
+        return
+    slow = [pole.real for pole in model.poles if not pole.imag and pole.real > SLOW]
+    pole = min(slow, key=lambda one: abs(one - 1), default=0.0)
+    try:
+        nearest = fit.uncertainty.of(lambda model: model.poles[np.argmin(np.abs(model.poles - pole))].real)
+        reach, words = 2 * float(nearest.error), f"{pole:.6g} ± {2 * float(nearest.error):.2g}"
+    except (OptidError, np.linalg.LinAlgError):  # no intervals: what grows by less than e over the record
+        reach, words = 1 / max(e.n_samples for e in fit.data.experiments), f"{pole:.6g}"
+    if abs(pole - 1) <= reach and model.integrates_within(reach):
+        word = "--constraint integrator" if hasattr(model, "nk") else "--formulation oe.exact --constraint integrator"
+        word = word if model.l == 1 else f"data.select(outputs=...) and {word} for each output"
+        yield Advice(f"the record does not tell the pole {words} from 1: the plant may integrate, its output ramp while "
+                     "the inputs are held", word)
+    elif not model.is_stable:
+        yield Advice("the model has a pole outside the unit circle", "--constraint stable:0.99")
 
 
 def _try(fit: Any, **changes: Any) -> Any:

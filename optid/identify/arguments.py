@@ -1,7 +1,7 @@
 """Checks of arguments and records that the formulations share."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 
 ROWS_PER_UNKNOWN = 1.1  # errors that a fit needs for each of its unknowns
+Offset = bool | Literal["each"]  # of an equation: one constant, none, or one for each experiment
 
 
 def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], low: int) -> tuple[int, ...]:
@@ -18,6 +19,21 @@ def per_channel(name: str, value: int | Sequence[int], inputs: Sequence[str], lo
     if len(values) != len(inputs):
         raise StructureError(f"{name} has {len(values)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
     return tuple(check_integer(entry, f"{name} of input {channel!r}", low) for channel, entry in zip(inputs, values))
+
+
+def check_offset(offset: Any, data: Any) -> Offset:
+    """Return whether there is one constant, none, or one for each of several experiments; refuse other words.
+
+    With a single experiment "each" is one constant. A stream does not keep its experiments apart (`StructureError`).
+    """
+    if not isinstance(offset, bool | np.bool_) and not (isinstance(offset, str) and offset == "each"):
+        raise StructureError(f"offset must be True (one constant), False (none) or 'each' (one for each experiment); "
+                             f"got {offset!r}")
+    if offset != "each":
+        return bool(offset)
+    if not isinstance(data, Data):
+        raise StructureError("offset='each' requires a record in memory: read it with optid.read instead of a stream")
+    return "each" if data.n_experiments > 1 else True
 
 
 def in_memory(data: Any, errors: str) -> Data:

@@ -124,7 +124,8 @@ class Fit(Rendered):
     def simulation_fit(self) -> np.ndarray:
         """Simulation fit in % of every output on the estimation record, initial conditions fitted.
 
-        NaN for a stream, where an input has missing samples, and where the simulation diverges.
+        NaN for a stream, and where the simulation diverges; missing inputs are left out, with an initial state after
+        each.
         """
         return self._fit("simulation")
 
@@ -145,6 +146,18 @@ class Fit(Rendered):
         from optid.identify.uncertainty import uncertainty
 
         return uncertainty(self)
+
+    @property
+    def informativity(self) -> Any:
+        """What the record can tell (`optid.identify.informativity.Informativity`); None for a stream."""
+        from optid.identify.informativity import informativity
+
+        return informativity(self.data) if isinstance(self.data, Data) else None
+
+    @property
+    def record_findings(self) -> tuple[str, ...]:
+        """What reading the record found, and what it can tell, one sentence each."""
+        return (*self.data.findings, *(self.informativity.findings if isinstance(self.data, Data) else ()))
 
     @cached_property
     def verdict(self) -> Any:

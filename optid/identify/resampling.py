@@ -96,10 +96,11 @@ def _records(fit: Fit, runs: int, seed: int) -> Iterator[Data]:
     rows = rows[~np.isnan(rows).any(axis=1)]
     # centred, with the variance of the equation error
     residuals = (rows - rows.mean(axis=0)) * np.sqrt(len(rows) / max(len(rows) - free_parameters(model) / model.l, 1.0))
+    models = [model] * data.n_experiments if model.levels is None else [model.at_level(one) for one in model.levels]
     rng = np.random.default_rng(seed)
     for _ in range(runs):
-        outputs = iter([_simulated(model, e.u, e.y, residuals[rng.integers(len(residuals), size=len(e.y))])
-                        for e in data.experiments])
+        outputs = iter([_simulated(own, e.u, e.y, residuals[rng.integers(len(residuals), size=len(e.y))])
+                        for own, e in zip(models, data.experiments)])
         yield data.mapped(lambda u: u, lambda _, outputs=outputs: next(outputs))
 
 

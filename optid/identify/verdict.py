@@ -6,9 +6,9 @@ gains over it; whether the residuals still depend on the inputs; and whether del
 functions suit the record. It speaks of this record only.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,10 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
-from optid.identify.delays import shown_delays
+from optid.identify.informativity import Informativity, informativity
 from optid.identify.validation.checks import record_structure, shares_outside
-from optid.identify.validation.correlations import cross_correlation
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
+from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
@@ -28,10 +28,10 @@ GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 """Fits in % from which on, and below which, a model is called so; the second is that of its worst block."""
 OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
 GAP = 15.0  # points that the one-step prediction may be better than the free run
-CORRELATED = 0.25  # largest correlation of residuals and past inputs; their p-values say nothing on long records
+WRONG = 0.07  # error of the response that inputs explain, over the spread of the simulated output
+APART = 0.12  # difference of the response from that of the low-order model, in a loop
 STRUCTURE = 0.1  # share of the residual variance that another structure may save in a model that is called good
 OUTSIDE = 0.01  # share of the samples that may lie outside the interval of a function
-LAGS = 25
 
 
 @dataclass(frozen=True)
@@ -78,28 +78,36 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         cross_validated: fits in % of the blocks that were left out one after another, where there are some.
         pooled: the same over all blocks.
     """
-    raw = data.raw()
+    raw, told = data.raw(), informativity(data)
     y = np.vstack([e.y for e in raw.experiments])
     runs, predicted = simulated_or_nan(model, raw), one_step_or_nan(model, raw)
     own, ahead = (float(np.mean(fit_percent(y, np.vstack(found)))) for found in (runs, predicted))
+    closed = told.loop.word != "open"
+    if pooled is not None and closed:
+        own = ahead  # blocks were compared one sample ahead
     score, lost = (own, 0.0) if pooled is None else (pooled, own - pooled)
-    parts = [Finding("simulation fit" if pooled is None else "cross-validated fit", _points(score), score >= POOR_FIT)]
+    parts = [Finding("record", re.split(r"[:;(]", told.reason)[0].strip() or "informative", not told.reason)]
+    parts.append(Finding("simulation fit" if pooled is None else "cross-validated fit", _points(score),
+                         score >= POOR_FIT))
     by_block = _by_block(raw, runs) if cross_validated is None else np.asarray(cross_validated)
     worst = float(np.min(by_block, initial=np.inf))
     if by_block.size:
         parts.append(Finding("worst block", f"{_points(worst)} (median {_points(float(np.median(by_block)))})",
                              worst >= GOOD_BLOCK - (GOOD_FIT - POOR_FIT)))
-    if pooled is not None:
+    if pooled is not None and np.isfinite(lost):
         parts.append(Finding("estimation minus cross-validated fit", _points(lost, " points"), lost <= OVERFIT))
-    if np.isfinite(ahead) and np.isfinite(own):
+    if np.isfinite(ahead) and np.isfinite(own) and not closed:
         parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
+    wrong = [*_response(model, raw, runs, told, closed), *_lags(model, told)]
+    # a pole nearer to 1 than the record is long grows by less than e over it: the record does not tell it from 1
+    ramps = model.integrates or (not model.is_stable and model.integrates_within(
+        1 / max(e.n_samples for e in raw.experiments)))
     steady = bool(model.is_stable) or (has_feedback(model) and np.isfinite(own))
-    parts += [_residuals(raw, predicted), *_delays(model, raw),
-              Finding("stability", "stable" if steady else "unstable", steady),
-              *_ranges(model, raw), *_structure(model, raw)]
-    if not score >= USELESS_FIT:
+    parts += [*wrong, Finding("stability", "integrates" if ramps else "stable" if steady else "unstable",
+                              steady or ramps), *_ranges(model, raw), *_structure(model, raw)]
+    if told.reason or not score >= USELESS_FIT:
         word = USELESS
-    elif score < POOR_FIT or lost > OVERFIT:
+    elif score < POOR_FIT or lost > OVERFIT or any(part.counts and not part.passed for part in wrong):
         word = POOR
     else:
         failed = any(part.counts and not part.passed for part in parts)
@@ -107,31 +115,64 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     return Verdict(word, tuple(parts), score)
 
 
-def _residuals(data: Data, predicted: Sequence[Array]) -> Finding:
-    residuals = [e.y - p for e, p in zip(data.experiments, predicted)]
-    lags = min(LAGS, max(e.n_samples for e in data.experiments) // 4)
-    largest, place, name = 0.0, "", "largest correlation of residuals and inputs"
-    if all(np.isnan(r).all() for r in residuals):
-        return Finding(name, "none: no one-step prediction", False)
-    for (o, output), (c, channel) in product(enumerate(data.outputs), enumerate(data.inputs)):
-        found = cross_correlation([r[:, o] for r in residuals], [e.u[:, c] for e in data.experiments], output, channel,
-                                  lags)
-        size = float(np.nanmax(np.abs(found.values[found.lags >= 0]), initial=0.0))
-        if size > largest:
-            largest, place = size, f" ({output} on {channel})" if data.m * data.l > 1 else ""
-    return Finding(name, f"{largest:.2f}{place}", largest <= CORRELATED)
+def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity, closed: bool) -> list[Finding]:
+    """Say how much of the response is wrong: what inputs explain of the residuals, or a difference in a loop."""
+    if told.reason:
+        return []
+    if closed:
+        return _beside_low_order(model, data, runs, told)
+    found = systematic(data, runs, told)
+    if found is None:
+        return [Finding("error that the inputs explain", "not available: too few samples", True, counts=False)]
+    where = f" ({found.output})" if data.l > 1 else ""
+    size = f"{100 * found.share:.2g} % of the response{where}" if found.found else f"none visible{where}"
+    return [Finding("error that the inputs explain", f"{size} (p = {found.p_value:.2g})",
+                    not (found.found and found.share > WRONG))]
 
 
-def _delays(model: Any, data: Data) -> list[Finding]:
-    """Say where inputs act later than the lags that the model has."""
-    if not hasattr(model, "nk"):
+def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Informativity) -> list[Finding]:
+    """Compare the response with that of the low-order model with a noise model: in a loop residuals say nothing."""
+    parts = []
+    direct = _acts_at_once(model)
+    if direct:
+        parts.append(Finding("direct feedthrough in a loop", f"input {direct!r} acts at once, as the controller's "
+                             "answer does", False))
+    for o, process in enumerate(told.processes):
+        own = np.concatenate([run[:, o] - np.nanmean(run[:, o]) for run in runs][: len(process.residuals)])
+        other = np.concatenate([(e.y[: len(r), o] - r) - np.nanmean(e.y[: len(r), o] - r)
+                                for e, r in zip(data.experiments, process.residuals)])
+        own = own[: other.size]
+        share = float(np.sqrt(np.nanmean((own - other) ** 2) / max(float(np.nanvar(other)), 1e-300)))
+        value = "none" if not np.isfinite(share) else f"{100 * share:.2g} % of the response"
+        parts.append(Finding("difference from a low-order model with noise model", value, share <= APART))
+    return parts
+
+
+def _acts_at_once(model: Any) -> str:
+    """Return an input that acts on an output without delay; "" where none does."""
+    if hasattr(model, "nk"):
+        return next((name for name, delay, b in zip(model.inputs, model.nk, model.b)
+                     if delay == 0 and np.any(b[0])), "")
+    first = np.abs(model.impulse_response(1))[0]
+    return next((name for c, name in enumerate(model.inputs) if np.any(first[:, c])), "")
+
+
+def _lags(model: Any, told: Informativity) -> list[Finding]:
+    """Say where inputs act later, or earlier, than the lags that the model has."""
+    if not hasattr(model, "nk") or not told.processes or told.reason:
         return []
-    delays = [delay for delay in shown_delays(model, data) if delay is not None]
-    if len(delays) < 2:
-        return []
-    late = [f"{name} acts after {k} samples" for name, k, first, b in zip(
-        data.inputs, np.max(delays, axis=0), model.nk, model.b) if k >= first + len(b)]
-    return [Finding("delay", ", ".join(late) or "covered by the lags", not late)]
+    wrong = []
+    for c, (name, first, b) in enumerate(zip(model.inputs, model.nk, model.b)):
+        lows, highs = zip(*(p.responses[c].lag_interval for p in told.processes))
+        if told.without_effect(c):
+            continue
+        if min(lows) >= first + len(b):
+            wrong.append(f"{name} acts from lag {min(p.responses[c].nk for p in told.processes)} on, the model has "
+                         f"lags {first} to {first + len(b) - 1}")
+        elif max(highs) < first and all(p.responses[c].poles.size <= 2 for p in told.processes):
+            wrong.append(f"{name} acts from lag {min(p.responses[c].nk for p in told.processes)} on, the model from "
+                         f"lag {first} on")
+    return [Finding("delay", ", ".join(wrong) or "covered by the lags", not wrong)]
 
 
 def _ranges(model: Any, data: Data) -> list[Finding]:

@@ -105,10 +105,11 @@ def free_parameters(model: Any) -> int:
     if hasattr(model, "parameters"):  # state equations of the user
         return len(model.parameters)
     shapes = sum(f.basis.size - 1 for f in model.nonlinearities)
+    constants = model.l if model.levels is None else model.levels.size
     if model.structure != "ss":
-        return int(model.a.size + sum(b.size for b in model.b) + model.offset.size + shapes)
+        return int(model.a.size + sum(b.size for b in model.b) + constants + shapes)
     n, signals = len(model.A), model.B.shape[1] + model.E.shape[1]
     direct = np.count_nonzero(np.any(np.c_[model.D, model.Fz] != 0, axis=0)) * model.l
     shapes += sum(f.basis.size - 1 for f in (*model.feedback, *model.latent))
     rows = sum(1 for f in model.latent) * (2 * n + 1)
-    return int(n * (model.l + signals) + direct + model.l + shapes + rows)
+    return int(n * (model.l + signals) + direct + constants + shapes + rows)

@@ -47,6 +47,7 @@ class HammersteinTF(Model):
         c: (nc,) coefficients of C = 1 + c_1 q^-1 + ...; one output.
         d: (nd,) coefficients of D = 1 + d_1 q^-1 + ...; one output. None where D is A.
         gauge: how the scale between f and B is fixed: "norm", "gain", "b0" or "none"; see `regauge`.
+        levels: (E, l) constants of the experiments of its record, whose mean `offset` is; see `Model`.
 
     Raises:
         StructureError: shapes that do not agree, coefficients that are not finite, an unknown gauge, a C or D for
@@ -68,6 +69,7 @@ class HammersteinTF(Model):
     d: Any = field(default=None, kw_only=True)
     gauge: str = field(default="none", kw_only=True)
     time_unit: str = field(default="", kw_only=True)
+    levels: Any = field(default=None, kw_only=True)
     GAUGES = GAUGES
     SIMULATORS = ("predict", "free")
     equation, coefficients, noise = text.equations, text.coefficients, property(text.noise)
@@ -267,21 +269,46 @@ class HammersteinTF(Model):
             moved, constant = f.mapped(scale, origin)
             functions.append(moved)
             offset = offset + constant * rows.sum(axis=0)
-        return replace(self, a=a, b=b, nonlinearities=tuple(functions), offset=offset)
+        levels = None if self.levels is None else offset + gain * (self.levels - self.offset)
+        return replace(self, a=a, b=b, nonlinearities=tuple(functions), offset=offset, levels=levels)
+
+    def at_level(self, constant: ArrayLike) -> Self:
+        """Return the model with one constant (l,) of the equation, such as `offset` or a row of `levels`."""
+        return replace(self, offset=constant, levels=None)
+
+    def with_output_levels(self, shifts: Array) -> Self:
+        """Return the model of a record whose outputs are higher by shifts (E, l) of zero mean, one an experiment."""
+        return replace(self, levels=self.levels + shifts @ (np.eye(self.l) + self.matrices.sum(axis=0)).T)
 
     # -- running over records ------------------------------------------------------------------------------------
 
     @property
     def _state_shape(self) -> tuple[int, int]:
-        return self.largest_lag, self.l
+        return self.largest_lag + (self.levels is not None), self.l
 
     def predict_record(self, u: Array, y: Any, horizon: int = 1, x0: Array | None = None, label: str = "") -> Array:
         """Predict one record in raw units; see `predict`. The arguments are those of `Model.predict_record`."""
+        if self.structure not in ("arx", "armax"):
+            return super().predict_record(u, y, horizon, x0, label)
+        drive = self.driven(u)
+        if self.levels is not None:
+            drive = drive + (self._fitted_level(drive, y) if x0 is None else x0[-1])
+        return self._stateless(drive, y, horizon)
+
+    def _stateless(self, drive: Array, y: Array, horizon: int) -> Array:
+        """Predict y (N, l) of an ARX or ARMAX model with a given right-hand side (N, l) of its equation."""
         if self.structure == "arx":
-            return predict_regression(self.matrices, self.driven(u), y, horizon, self.memory)
-        if self.structure == "armax":
-            return self._noise_predicted(y, self.driven(u), horizon, self.memory)
-        return super().predict_record(u, y, horizon, x0, label)
+            return predict_regression(self.matrices, drive, y, horizon, self.memory)
+        return self._noise_predicted(y, drive, horizon, self.memory)
+
+    def _fitted_level(self, drive: Array, y: Array) -> Array:
+        """Estimate what the constants (l,) of ARX or ARMAX differ from `offset` by least squares of one-step errors."""
+        predicted = self._stateless(drive, y, 1)
+        effect, rest = self._stateless(drive + 1.0, y, 1) - predicted, y - predicted
+        unknown = np.isnan(rest) | np.isnan(effect)
+        effect, rest = np.where(unknown, 0.0, effect), np.where(unknown, 0.0, rest)
+        energy = np.sum(effect**2, axis=0)
+        return np.sum(effect * rest, axis=0) / np.where(energy > 0, energy, 1.0)
 
     def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
         x = self._simulated(u, state, label)
@@ -306,14 +333,15 @@ class HammersteinTF(Model):
         return [self._simulated(u, state, label) for (u, _, label), state in zip(records, states)]
 
     def _simulated(self, u: Array, state: Array, label: str = "") -> Array:
-        """Compute the plant's outputs (N, l) from the inputs (N, m) and the state (n, l).
+        """Compute the plant's outputs (N, l) from the inputs (N, m) and the state, whose last row may be a level.
 
         Raises:
             DataError: a missing input, or an output that leaves the range of numbers; named by channel and sample.
         """
         check_inputs(self, u, label)
-        right = self.driven(u)
-        right[: len(state)] += state[: len(right)]
+        n, right = self.largest_lag, self.driven(u)
+        right[:n] += state[: min(n, len(right))]
+        right += state[n:].sum(axis=0)
         y = autoregression(self.matrices, right)
         lost = ~np.isfinite(y).all(axis=1)
         if lost.any():
@@ -325,23 +353,25 @@ class HammersteinTF(Model):
         return y
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
-        """Estimate the initial state (n, l) by least squares of a simulator's errors, where outputs are present.
+        """Estimate the initial state, the level included, by least squares of a simulator's errors.
 
         The errors of each output count in units of its standard deviation, so that the estimate does not depend on
         units. Those of the prediction pass the inverse of the noise filter; ARX and ARMAX predictors have no state, the
         free run gives it. Directions that the record does not determine are set to zero.
         """
-        n, outputs = self.largest_lag, self.l
+        (n, outputs), level = self._state_shape, self.levels is not None
         whitened = simulator == "predict" and self.d is not None
         radius = max(self.radius, roots.radius(self.c) if whitened else 0.0)
         forgotten = 10 * n + (int(2 * np.log(FORGOTTEN) / np.log(radius)) if 0 < radius < 1 else 0)
-        count = len(y) if radius >= 1 else min(len(y), forgotten)
+        count = len(y) if radius >= 1 or level else min(len(y), forgotten)
         units, rest = signal_units(y), (y - self._simulated(u, np.zeros((n, outputs)), label))[:count]
         present = np.isfinite(rest)
         free = self._response(np.eye(outputs)[None], count)
         columns = np.zeros((count, outputs, n, outputs))
-        for i in range(min(n, count)):
+        for i in range(min(self.largest_lag, count)):
             columns[i:, :, i] = free[: count - i]
+        if level:
+            columns[:, :, -1] = np.cumsum(free, axis=0)
         rest, columns = rest / units, columns.reshape(count, outputs, n * outputs) / units[:, None]
         if whitened:
             signals = np.where(present, np.column_stack([rest, columns[:, 0]]), np.nan).T
@@ -356,7 +386,11 @@ class HammersteinTF(Model):
 
         Raises:
             DataError: too few samples, or one of the last n missing.
+            StructureError: a model with `levels`, of which so few samples do not tell the one of their record.
         """
+        if self.levels is not None:
+            raise StructureError("Every record of this model has a constant of its own, which so few samples do not "
+                                 "tell: choose one by at_level, or use initial_state.")
         u, y, n = samples_of(u, "u", self.m), samples_of(y, "y", self.l), self.largest_lag
         if len(u) < n or len(u) != len(y):
             raise DataError(f"The state follows from {n} samples of u and y; got {len(u)} of u and {len(y)} of y.")

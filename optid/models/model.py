@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optid.arrays import Array, as_list, check_integer, one_of, one_or_all
+from optid.arrays import Array, as_list, check_integer, finite, one_of, one_or_all
 from optid.data.channels import Ports, Transform, check_texts, interval_text, numbered_names
 from optid.data.record import Data
 from optid.data.stretches import runs_of
@@ -20,6 +20,8 @@ from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
 
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
+ROUNDING = 1e-12  # of a pole on the unit circle
+AT_ONE = 1e-8  # distance from 1 within which a pole integrates: descents end 1e-9 before it
 
 
 class Model(Ports):
@@ -40,6 +42,8 @@ class Model(Ports):
         c0: offset of f where the data tell it from the constants of the equations, else None.
         offset_note: why c0 is None; "" where it is known.
         structure: the kind of linear part and noise: "arx", "armax", "oe", "bj" or "ss".
+        levels: (E, l) constants of the experiments of its record where each has one of its own, else None. The constant
+            of the model is then their mean, and that of another record unknown: a state that does not change.
     """
 
     nonlinearities: tuple[Nonlinearity, ...]
@@ -52,6 +56,7 @@ class Model(Ports):
     poles: Any
     memory: int
     structure: Any
+    levels: Any = None
     __dataclass_fields__: ClassVar[dict[str, Any]]
     GAUGES: ClassVar[tuple[str, ...]]
     SIMULATORS: ClassVar[tuple[str, ...]]
@@ -79,6 +84,10 @@ class Model(Ports):
             check_texts(f"the name of an {kind}", map(str, names), StructureError)
             check_texts(f"the unit of an {kind}", map(str, units), StructureError)
             fixed |= {f"{kind}s": names, f"{kind}_units": units}
+        if self.levels is not None:
+            fixed["levels"] = finite(self.levels, "levels")
+            if fixed["levels"].ndim != 2 or not len(fixed["levels"]) or fixed["levels"].shape[1] != l:
+                raise StructureError(f"levels has shape {fixed['levels'].shape}; it must be (experiments, {l}).")
         for name, value in fixed.items():
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.dt) and self.dt > 0):
@@ -117,8 +126,18 @@ class Model(Ports):
 
     @property
     def is_stable(self) -> bool:
-        """Whether all poles lie inside the unit circle."""
-        return self.radius < 1
+        """Whether all poles lie inside the unit circle, by more than rounding."""
+        return self.radius < 1 - ROUNDING
+
+    @property
+    def integrates(self) -> bool:
+        """Whether the model has a pole at 1 and is stable otherwise: its outputs ramp while the inputs are held."""
+        return self.integrates_within(AT_ONE)
+
+    def integrates_within(self, distance: float) -> bool:
+        """Whether a real pole lies so near to 1 and all others lie inside the unit circle, one an output at most."""
+        near = (np.abs(self.poles - 1) <= distance) & (np.abs(self.poles.imag) <= ROUNDING)
+        return 0 < int(near.sum()) <= self.l and bool(np.all(np.abs(self.poles[~near]) < 1 - ROUNDING))
 
     def step_response(self, n: int = 100) -> Array:
         """Return the response of the linear part to a unit step of every f, (n, l, r), in the gauge of the model."""
@@ -157,8 +176,16 @@ class Model(Ports):
 
     def __str__(self) -> str:
         """Return the equations, the poles and the sampling time."""
-        poles = f"\npoles: {roots.in_words(self.poles)}" if len(self.poles) else ""
-        return f"{self.equation()}{poles}\n{self.sampling}"
+        ramps = " (integrates)" * self.integrates
+        poles = f"\npoles: {roots.in_words(self.poles)}{ramps}" if len(self.poles) else ""
+        return f"{self.equation()}{self._levels_in_words()}{poles}\n{self.sampling}"
+
+    def _levels_in_words(self) -> str:
+        if self.levels is None:
+            return ""
+        parts = [f"{low:.4g} to {high:.4g}" + f" ({name})" * (self.l > 1)
+                 for name, low, high in zip(self.outputs, self.levels.min(axis=0), self.levels.max(axis=0))]
+        return f"\nconstants of the {len(self.levels)} experiments: {', '.join(parts)}; above is their mean"
 
     # -- running over records ------------------------------------------------------------------------------------
 
@@ -217,7 +244,8 @@ class Model(Ports):
         Args:
             data: Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
             x0: "zero" (nothing before the record), "fit" (least squares on the outputs present; needs Data), or the
-                state, one for each experiment; see `initial_state`.
+                state, one for each experiment; see `initial_state`. Of a model with `levels` the last row of a state is
+                the deviation of the constant from the mean: "zero" runs at the mean, "fit" estimates it.
 
         Returns:
             (N, l) in raw units, or (N,) for u given as (N,) and one output; a tuple of such arrays for several
@@ -229,7 +257,7 @@ class Model(Ports):
             StructureError: an x0 that cannot be read.
 
         Warns:
-            DataWarning: the model is unstable.
+            DataWarning: the model is unstable, and no integrator.
         """
         records, flat = records_of(self, data)
         outputs = self._run("free", records, x0)
@@ -274,7 +302,7 @@ class Model(Ports):
         return [state_like(state, self._state_shape) for state in states]
 
     def _warn_unstable(self) -> None:
-        if not self.is_stable:
+        if not (self.is_stable or self.integrates):
             warnings.warn(
                 f"The model is unstable: its largest pole has radius {self.radius:.6g}. Its simulation grows and tells "
                 "little about the fit; use one-step prediction, or identify with a stability constraint.",
@@ -328,7 +356,7 @@ class Model(Ports):
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build what `to_dict` described, with the functions of UserFunctions by name; errors as of the parts."""
-        content = {"time_unit": "", **content}  # an older file has none
+        content = {"time_unit": "", "levels": None, **content}  # an older file has none
         given = {one.name: content[one.name] for one in fields(cls)}
         for name in given.keys() & {"nonlinearities", "feedback", "latent"}:
             given[name] = tuple(Nonlinearity.from_dict(f, functions) for f in given[name])

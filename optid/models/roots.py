@@ -44,6 +44,23 @@ def in_words(roots: Any) -> str:
     return ", ".join(f"{r.real:.4g}" if abs(r.imag) < 1e-12 else f"{r:.4g}" for r in list(roots))
 
 
+def without_integrator(coefficients: Array) -> Array:
+    """Return the coefficients of A(q) / (1 - q^-1), for 1 + a_1 q^-1 + .. with A(1) = 0."""
+    return np.cumsum(np.concatenate([[1.0], coefficients]))[1:-1]
+
+
+def with_integrator(coefficients: Array) -> Array:
+    """Return the coefficients with the root nearest to 1 moved there; of a complex pair the other one stays real."""
+    roots = roots_of(coefficients)
+    nearest = int(np.argmin(np.abs(roots - 1)))
+    others = np.delete(roots, nearest)
+    if roots[nearest].imag:
+        partner = int(np.argmin(np.abs(others - np.conj(roots[nearest]))))
+        others[partner] = others[partner].real
+    quotient = np.concatenate([[1.0], with_roots(others, len(others))])
+    return np.convolve(quotient, [1.0, -1.0])[1:]
+
+
 def with_roots(roots: Any, size: int) -> Array:
     """Return the coefficients (size,) of the polynomial 1 + c_1 q^-1 + .. with these roots, and others at zero."""
     found = np.zeros(size)

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import solve_discrete_lyapunov
+from scipy.linalg import block_diag, solve_discrete_lyapunov
 
 from optid.arrays import Array, finite
 from optid.bases import Linear
@@ -63,6 +63,7 @@ class StateSpace(Model):
         Cz: (k, n).
         Dz: (k, m).
         offset_z: (k,).
+        levels: (E, l) offset_y of the experiments of its record; see `Model`.
 
     Raises:
         StructureError: shapes that do not agree, coefficients that are not finite, an unknown gauge, a direct
@@ -96,6 +97,7 @@ class StateSpace(Model):
     Cz: Any = field(default=None, kw_only=True)
     Dz: Any = field(default=None, kw_only=True)
     offset_z: Any = field(default=None, kw_only=True)
+    levels: Any = field(default=None, kw_only=True)
     GAUGES = ("norm", "gain", "none")
     structure = "ss"
     memory = 0  # the initial state is estimated
@@ -117,6 +119,9 @@ class StateSpace(Model):
             fixed.setdefault(name, finite(np.zeros(shapes[name]) if absent else given, name))
         self._fix(fixed, m, len(fixed["C"]))
         self._check(shapes)
+        if self.levels is not None and (self.feedback or np.any(self.L)):
+            raise StructureError("A model whose outputs are fed back has one constant for all experiments, not levels: "
+                                 "the zero of a sensor acts on its states.")
 
     def _check(self, shapes: Mapping[str, tuple[int, ...]]) -> None:
         """Refuse parts that do not agree, naming the part and the shape that is needed."""
@@ -270,6 +275,9 @@ class StateSpace(Model):
         P1 and P3 do not change; P2 does, since it feeds back the measured output. With a gain (n, l) of -L the
         injection is absorbed into A.
         """
+        if self.levels is not None:
+            raise StructureError("A model with levels feeds back no output, whose zero would act: choose a level by "
+                                 "at_level first.")
         moved = np.asarray(gain, dtype=float)
         if moved.shape != self.L.shape:
             raise StructureError(f"The gain has shape {moved.shape}; it must be {self.L.shape}.")
@@ -319,15 +327,39 @@ class StateSpace(Model):
         state = gain[0] if np.all(gain == gain[0]) else 1.0
         injection = state * self.L / gain
         inward = self.Dz / np.array(transform.u_scale)
+        offset_y = gain * (self.offset_y + self.D @ constants) + shift
         return replace(
             self, B=state * self.B, C=gain[:, None] * self.C / state, D=gain[:, None] * self.D, E=state * self.E,
             L=injection, K=state * self.K / gain,
             offset_x=state * (self.offset_x + self.B @ constants + self.E @ fed) - injection @ shift,
-            offset_y=gain * (self.offset_y + self.D @ constants) + shift,
+            offset_y=offset_y,
+            levels=None if self.levels is None else offset_y + gain * (self.levels - self.offset_y),
             nonlinearities=tuple(f for f, _ in functions), feedback=tuple(g for g, _ in feedback),
             noise=None if self.noise is None else self.noise.mapped(state * np.eye(self.nx), np.diag(gain)),
             Ez=state * self.Ez, Fz=gain[:, None] * self.Fz, Cz=self.Cz / state, Dz=inward,
             offset_z=self.offset_z - inward @ np.array(transform.u_offset))
+
+    def at_level(self, constant: ArrayLike) -> Self:
+        """Return the model with one constant (l,) of the outputs, such as `offset_y` or a row of `levels`."""
+        return replace(self, offset_y=constant, levels=None)
+
+    def with_output_levels(self, shifts: Array) -> Self:
+        """Return the model of a record whose outputs are higher by shifts (E, l) of zero mean, one an experiment."""
+        return replace(self, levels=self.levels + shifts)
+
+    @cached_property
+    def with_level_states(self) -> Self:
+        """The model in which the deviation of the constants of the outputs from `offset_y` are l more states.
+
+        They do not change, and nothing acts on them. Without `levels` it is the model itself.
+        """
+        if self.levels is None:
+            return self
+        below = {name: np.vstack([getattr(self, name), np.zeros((self.l, getattr(self, name).shape[1]))])
+                 for name in ("B", "E", "L", "K", "Ez")}
+        return replace(self, A=block_diag(self.A, np.eye(self.l)), C=np.hstack([self.C, np.eye(self.l)]),
+                       Cz=np.hstack([self.Cz, np.zeros((len(self.Cz), self.l))]), levels=None, noise=None,
+                       offset_x=np.concatenate([self.offset_x, np.zeros(self.l)]), **below)
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:

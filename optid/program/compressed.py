@@ -26,7 +26,7 @@ class Compressed(Protocol):
     Attributes:
         problem: the numbers of ``‖root z - target‖² + remainder``: root (k, n), target (k,), remainder.
         statistics: the rows behind it: ``root``, the triangular factor of [regressor | outputs]; ``rows`` used and
-            ``candidates`` in the record; ``condition`` of the factor and the ``method`` that made it.
+            ``candidates`` in the record, ``constants`` eliminated from them; ``condition`` of the factor and the ``method`` that made it.
         columns: (n_columns, l) positions in z of the coefficients of the columns of the factor.
         energy: (l,) sum of squares of every output about its mean, in units of the objective.
     """
@@ -71,7 +71,7 @@ def white_spread(compressed: Compressed, z: Array, moves: Array) -> Spread:
     (n, l), root = columns.shape, statistics.root  # noqa: E741
     sensitivity = np.einsum("ij,jok->oik", root[:n, :n], moves[columns])
     parameters = float(np.sum(sensitivity**2))
-    dof = degrees_of_freedom(statistics.rows, parameters / l)
+    dof = degrees_of_freedom(statistics.rows, parameters / l + statistics.constants)
     residual = root @ np.vstack([z[columns], -np.eye(l)])
     noise = residual.T @ residual / dof
     covariance = np.einsum("oij,op,pik->jk", sensitivity, noise, sensitivity)

@@ -9,10 +9,12 @@ import numpy as np
 from optid.data.description import RECORD
 from optid.data.record import Data
 from optid.errors import DataError
+from optid.identify.informativity import informativity
 from optid.identify.validation import Validation
 from optid.identify.validation.predictions import SIMULATION, prediction_fit
 from optid.identify.verdict import POOR_FIT, USELESS_FIT
 from optid.show import charts, checks, estimates, summary, wording
+from optid.show.record import informativity_table
 from optid.show.sections import (
     TONES,
     Banner,
@@ -57,7 +59,7 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
     """
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
     sections = [
-        *_record(fit.data.findings),
+        *_record(fit.record_findings),
         Section("trust", "", lambda: _trust(fit, fit.verdict if judged is None else judged, test, advise)),
         Section("optimum", "", lambda: _optimum(fit)),
         Section("model", "Model", lambda: _model(fit)),
@@ -110,8 +112,9 @@ def record_document(data: Data, *, command: str = "") -> Document:
     channels = f"{', '.join(data.inputs)} to {', '.join(data.outputs)}"
     lead = " · ".join([_length(data), f"every {data.interval}", channels])
     return Document(data.name or "Record", lead, [
-        *_record(data.findings),
+        *_record((*data.findings, *informativity(data).findings)),
         Section("channels", "Channels", lambda: [summary.channel_table(data)]),
+        Section("tests", "What the record tells", lambda: [informativity_table(informativity(data))]),
         Section("figures", "Figures", drawn, page_only=True),
         *([Section("reproduce", "Reproduce", [Code(command)], page_only=True)] if command else []),
     ])

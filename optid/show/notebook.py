@@ -30,7 +30,7 @@ def fit_html(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = Tr
     if fit.model is None:
         return f"<pre>{escape(describe(fit))}</pre>"
     return _html(summary.title(fit), [
-        *(_record(fit.data.findings) if findings else []),
+        *(_record(fit.record_findings) if findings else []),
         *attempt("The verdict on the model", lambda: _verdict(fit.verdict if judged is None else judged)),
         *attempt("The verdict on the solution", lambda: [_solution(fit)]),
         *attempt("The fit", lambda: [", ".join(f"{name} {percent(values)}" for name, values in (
@@ -55,7 +55,7 @@ def _solution(fit: "Fit") -> Banner:
 def search_html(found: "Identification") -> str:
     """Show the best structures by class above the fit."""
     fit = found.fit
-    return _html("", [*_record(fit.data.findings), search_table(found)]) + fit_html(fit, found.verdict, findings=False)
+    return _html("", [*_record(fit.record_findings), search_table(found)]) + fit_html(fit, found.verdict, findings=False)
 
 
 def parameters_html(found: "Parameters") -> str:

@@ -29,7 +29,7 @@ def describe(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = Tr
         return text(replace(document, sections=shown))
     tone, word, sentence = summary.verdict(fit)
     rule = "=" * WIDTH
-    return "\n".join([*findings_lines(fit.data.findings), rule, f"No model: {word}", rule, *wrapped(sentence), "",
+    return "\n".join([*findings_lines(fit.record_findings), rule, f"No model: {word}", rule, *wrapped(sentence), "",
                       *facts_lines(summary.certificate_facts(fit)), rule])
 
 
@@ -67,7 +67,7 @@ def describe_parameters(found: "Parameters") -> str:
 
 def describe_search(found: "Identification") -> str:
     """Return the search and the fit it ended with as text, at most 80 columns wide."""
-    return "\n".join([*findings_lines(found.fit.data.findings), *search_lines(found), "",
+    return "\n".join([*findings_lines(found.fit.record_findings), *search_lines(found), "",
                       describe(found.fit, found.verdict, findings=False)])
 
 

@@ -49,6 +49,7 @@ class Statistics:
     candidates: int  # rows that would have been used, had no sample been missing
     # upper triangular R with R^T R = gram, from a streamed QR decomposition; None when there was none
     factor: Array | None = None
+    constants: int = 0  # of experiments that are eliminated, beside the one of the column of ones
 
     def __add__(self, other: "Statistics") -> "Statistics":
         if self.layout != other.layout:

@@ -79,13 +79,14 @@ class TransferPredictor:
         for start in range(0, count, CHUNK):
             values = self._values(index, slice(start, start + CHUNK))
             right.append(np.column_stack([part @ mu for part, mu in zip(values, point.mus)]))
-        functions, total = np.concatenate(right), np.full(count, point.offset)
+        fading, state = self.unknowns.fading, point.x0[index]
+        functions, total = np.concatenate(right), np.full(count, point.offset + np.sum(state[fading:]))
         for f, lags, b in zip(functions.T, self.unknowns.layout.lags, point.bs):
             for lag, weight in zip(lags, b):
                 total[lag:] += weight * f[: max(count - lag, 0)]
         if not self.unknowns.apart:
             return total
-        total[: self.unknowns.memory] += point.x0[index][:count]
+        total[:fading] += state[: min(fading, count)]
         return lfilter([1.0], np.concatenate([[1.0], point.a]), total)
 
     def predict(self, point: TransferPoint, index: int, x: Array) -> Filtered:
@@ -108,19 +109,22 @@ class TransferPredictor:
         explained[np.isnan(explained)] = 0.0
         width = n + unknowns.shared + measured * na + 1
         history, kinds = np.zeros((depth, width)), np.full(depth, DEAD, dtype=np.int8)
-        head, run = n, _Run(unknowns, point)
+        head, run = unknowns.fading, _Run(unknowns, point)
         past = np.zeros((na + len(run.d), 1 + measured))  # outputs of the plant and measured ones through 1 / A
         for start in range(0, len(y), CHUNK):
             part = slice(start, min(start + CHUNK, len(y)))
             count = part.stop - part.start
             run.advance(np.hstack(self._values(index, part)))
-            if head and run.forgotten and np.max(np.abs(history[:, :n]), initial=0.0) <= FORGOTTEN * run.peak:
-                head, history = 0, history[:, n:]
+            if head and run.forgotten and np.max(np.abs(history[:, :head]), initial=0.0) <= FORGOTTEN * run.peak:
+                head, history = 0, history[:, head:]
             block = np.empty((depth + count, history.shape[1]))
             block[:depth] = history
             rows = block[depth:]
             for i in range(head):
                 rows[:, i] = run.shifted(run.impulse, i)
+            if unknowns.levels:
+                rows[:, head] = run.shifted(run.step, 0)
+            shared = head + unknowns.levels
             if unknowns.apart:
                 lines = np.empty((len(past) + count, 1 + measured))
                 lines[: len(past)], lines[len(past) :, 0] = past, x[part]
@@ -130,20 +134,20 @@ class TransferPredictor:
                 past, lines = lines[count:], _through(run.d, lines)
             else:
                 lines = explained[depth + start - na : depth + part.stop, None]
-            for line, first in zip(lines.T, (head, head + unknowns.shared)):
+            for line, first in zip(lines.T, (shared, shared + unknowns.shared)):
                 for i in range(na):
                     rows[:, first + i] = -line[na - 1 - i :][:count]
             for c, lags in enumerate(unknowns.layout.lags):
                 if unknowns.free[c]:
-                    rows[:, head + at[f"mu{c}"].start : head + at[f"mu{c}"].stop] = run.through_numerator(c)
+                    rows[:, shared + at[f"mu{c}"].start : shared + at[f"mu{c}"].stop] = run.through_numerator(c)
                 f = run.table[:, run.spans[c]] @ point.mus[c]
                 for j, lag in enumerate(lags):
-                    rows[:, head + at[f"b{c}"].start + j] = f[run.n - lag :][:count]
+                    rows[:, shared + at[f"b{c}"].start + j] = f[run.n - lag :][:count]
             if unknowns.constant:
-                rows[:, head + at["offset"].start] = run.shifted(run.step, 0)
+                rows[:, shared + at["offset"].start] = run.shifted(run.step, 0)
             for name, signal in (("c", innovations), ("d", -explained)):
                 for i in range(at[name].stop - at[name].start):
-                    rows[:, head + at[name].start + i] = signal[depth + start - i - 1 :][:count]
+                    rows[:, shared + at[name].start + i] = signal[depth + start - i - 1 :][:count]
             rows[:, -1] = -found.innovations[part]
             state = np.concatenate([kinds, found.state[part]])
             if depth:

@@ -57,9 +57,10 @@ def beyond_affine(basis: Basis) -> Array:
     return found
 
 
-# shapes of the arrays of a point: n states, l outputs, m inputs, s feedback and k latent functions, E experiments
+# shapes of the arrays of a point: n states, l outputs, m inputs, s feedback and k latent functions, E experiments, N
+# entries of an initial state
 SHAPES = {
-    "A": "nn", "C": "ln", "K": "nl", "offset": "l", "b": "nm", "d": "lm", "e": "ns", "x0": "En", "Ez": "nk", "Fz": "lk",
+    "A": "nn", "C": "ln", "K": "nl", "offset": "l", "b": "nm", "d": "lm", "e": "ns", "x0": "EN", "Ez": "nk", "Fz": "lk",
     "Cz": "kn", "Dz": "km", "offset_z": "k"}
 
 
@@ -85,7 +86,7 @@ class StatePoint:
     d: Array  # (l, m); zero where an input has no feedthrough
     nus: tuple[Array, ...]  # (Q_f,) one array per family of feedback functions
     e: Array  # (n, s)
-    x0: Array  # (E, n)
+    x0: Array  # (E, n), or (E, n + l) with the constants of the outputs of every experiment last
     cs: tuple[Array, ...]  # (r_i,) one array per latent function
     Ez: Array  # (n, k)
     Fz: Array  # (l, k)
@@ -107,6 +108,8 @@ class StateUnknowns(Unknowns):
     constant: bool = True  # whether the offset is unknown; where not, it is zero
     latent: tuple[Latent, ...] = ()  # functions of latent signals
     linear_output: bool = True  # whether C is unknown; where not, it is zero
+    # whether every experiment has constants of its own, in place of the offset: l states that do not change
+    levels: bool = False
 
     l: int = field(init=False)  # noqa: E741 - number of outputs, the field's letter
     innovations: bool = field(init=False)  # whether K is unknown
@@ -118,6 +121,11 @@ class StateUnknowns(Unknowns):
                  "free": tuple(size > 1 for size in self.expansion.input_sizes)}
         for name, value in found.items():
             object.__setattr__(self, name, value)
+
+    @property
+    def memory(self) -> int:
+        """Size of an initial state among the unknowns, the constants of an experiment included."""
+        return self.n + self.l * self.levels
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -131,7 +139,7 @@ class StateUnknowns(Unknowns):
     def _known(self) -> StatePoint:
         """Return a point that holds what is known; what is unknown is zero."""
         size = {"n": self.n, "l": self.l, "m": self.expansion.m, "s": len(self.expansion.feedback),
-                "k": len(self.latent), "E": self.experiments}
+                "k": len(self.latent), "E": self.experiments, "N": self.memory}
         found = {name: np.zeros([size[letter] for letter in letters]) for name, letters in SHAPES.items()}
         for i, one in enumerate(self.latent):
             if one.row is not None:
@@ -214,15 +222,15 @@ class StateUnknowns(Unknowns):
 
     @cached_property
     def _columns(self) -> StatePoint:
-        """The number of every unknown behind the n columns of the initial state, at its place; below zero: known."""
+        """The number of every unknown behind the columns of the initial state, at its place; below zero: known."""
         numbers = self._known()
         for value in vars(numbers).values():
             for array in value if isinstance(value, tuple) else (value,):
                 array[...] = -np.inf
-        return self._filled(numbers, np.arange(self.n, self.n + self.size, dtype=float))
+        return self._filled(numbers, np.arange(self.memory, self.memory + self.size, dtype=float))
 
     def direct(self, point: StatePoint) -> Direct:
-        """Return what every unknown changes directly; the n columns of the initial state come first."""
+        """Return what every unknown changes directly; the columns of the initial state come first."""
         gains = np.concatenate([np.ones(1), point.d.ravel(), point.b.ravel(), point.e.ravel()])
         return self._direct._replace(gain=gains[self._direct.gain.astype(int)])
 

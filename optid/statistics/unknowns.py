@@ -65,7 +65,8 @@ class TransferPoint:
     mus: tuple[Array, ...]  # (P_c,) coefficients of f_c, one array per input
     bs: tuple[Array, ...]  # (nb_c,) coefficients of B_c, one array per input
     offset: float  # constant of the equation
-    x0: Array  # (E, n) what the past of every experiment adds to its first n equations
+    # (E, n) what the past of every experiment adds to its first n equations; last, where each has one, its constant
+    x0: Array
     c: Array = field(default_factory=lambda: np.zeros(0))  # (nc,) coefficients of C
     d: Array = field(default_factory=lambda: np.zeros(0))  # (nd,) coefficients of D; A where D is A
 
@@ -82,6 +83,8 @@ class TransferUnknowns(Unknowns):
     nc: int = 0  # order of C
     # order of D; None where D is A (ARX, ARMAX). Then there are no initial states among the unknowns
     nd: int | None = 0
+    # whether every experiment has a constant of its own, in place of the offset: a state that does not change
+    levels: bool = False
 
     @property
     def apart(self) -> bool:
@@ -95,7 +98,12 @@ class TransferUnknowns(Unknowns):
 
     @property
     def memory(self) -> int:
-        """Size n of an initial state among the unknowns."""
+        """Size n of an initial state among the unknowns, the constant of an experiment included."""
+        return self.fading + self.levels
+
+    @property
+    def fading(self) -> int:
+        """Size of what is forgotten of an initial state among the unknowns."""
         return self.layout.first_row if self.apart else 0
 
     @cached_property

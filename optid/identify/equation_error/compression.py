@@ -16,16 +16,18 @@ from optid.arrays import check_integer, check_weight, one_of
 from optid.bases import Linear, fitted_bases
 from optid.bases.basis import Basis
 from optid.data.channels import Transform, model_meta
+from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.streams import Stream
-from optid.identify.arguments import per_channel
+from optid.errors import StructureError
+from optid.identify.arguments import Offset, check_offset, per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.models.gauges import leading_sign
 from optid.program.compressed import Spread, white_spread
 from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.program.view import View
-from optid.statistics import Layout, Statistics, collect
+from optid.statistics import ExperimentMeans, Layout, Statistics, collect, collect_by_experiment
 from optid.structures.lifted_regression import lifted_problem, positions
 from optid.structures.rank_one import RankOne
 
@@ -42,6 +44,9 @@ class EquationError:
     bases: tuple[Basis, ...]  # one per input, in the units of the record
     unit: float = 1.0  # size of one unit of the objective in units of the record
     unweighted: Statistics | None = None  # of the same rows without weights, where ``statistics`` has weights
+    means: ExperimentMeans | None = None  # of the rows of every experiment, where each has its own constant
+    shifts: np.ndarray | None = None  # (E, l) what `levelled` subtracted from the outputs
+    between: np.ndarray | float = 0.0  # (l,) sum of squares of the mean outputs of the experiments about their mean
 
     @property
     def layout(self) -> Layout:
@@ -107,7 +112,8 @@ class EquationError:
         """Sum of squares (l,) of every output about its mean over the rows used, in the units of the problem."""
         statistics, n = self.unweighted or self.statistics, self.layout.n_columns
         columns = statistics.root[:, n:]
-        return np.sum(columns**2, axis=0) - (statistics.root[:n, n - 1] @ columns[:n]) ** 2 / statistics.rows
+        ones = statistics.root[:n, n - 1]
+        return np.sum(columns**2, axis=0) - (ones @ columns[:n]) ** 2 / (ones @ ones) + self.between
 
     def one_step_fit(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the one-step fit in % of every output over the rows used, from the statistics alone."""
@@ -131,18 +137,27 @@ class EquationError:
         if ny > 1:
             a = np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
         signs = [leading_sign(np.asarray(b)) if flip else 1.0 for b in bs]
+        levels = None
+        if self.means is not None:
+            pairs = zip(self.keys("mu"), mus, self.keys("b"), bs)
+            point = {key: value for mu, at_mu, b, at_b in pairs for key, value in ((mu, at_mu), (b, at_b))}
+            linear = {name: values[name] for name in ("a", "offset") if name in values}
+            levels = self.means.constants(self.regression({**linear, **point}))
         model = HammersteinTF(
             a=a, b=tuple(s * np.asarray(b) for s, b in zip(signs, bs)),
             nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
                                  for s, basis, mu in zip(signs, self.layout.bases, mus)),
-            nk=self.layout.nk, offset=np.asarray(values["offset"], dtype=float), gauge=gauge, **self.meta)
+            nk=self.layout.nk, offset=np.asarray(values["offset"], dtype=float), levels=levels, gauge=gauge,
+            **self.meta)
+        if self.shifts is not None:
+            model = model.with_output_levels(self.shifts)
         return model.with_transform(self.units)
 
 
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],
              basis: Basis | str | Sequence[Basis | str], ridge: float = 0.0, curvature: float = 0.0,
-             weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2, prior: str = "none"
-             ) -> EquationError:
+             weights: Sequence[np.ndarray] | None = None, own: bool = True, degree: int = 2, prior: str = "none",
+             offset: Offset = True) -> EquationError:
     """Read the record once and return the compressed problem in the record's own units (`optid.program.units`).
 
     Args:
@@ -157,15 +172,23 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
         own: False for a record that is in its own units already.
         degree: of the loss in the residuals: 2 for squares, 1 for the sum of magnitudes.
         prior: of the impulse responses, "none", "tc", "dc" or "ss", see `optid.identify.equation_error.priors`.
+        offset: True for one constant, "each" for one for every experiment.
 
     Raises:
-        StructureError: impossible orders.
+        StructureError: impossible orders, another offset.
         RankError: the record does not determine the parameters.
     """
     inputs, outputs = data.inputs, data.outputs
     nbs = per_channel("nb", nb, inputs, low=1)
     nks = per_channel("nk", nk, inputs, low=0)
     order = check_integer(na, "na (the number of past outputs)", 0)
+    constants = check_offset(offset, data)
+    if not constants:
+        raise StructureError("offset=False: equation-error fits estimate the constant; hold it by "
+                             "formulations.constraints.shape.fixed('offset', 0), or centre the record and use 'oe.exact' or 'armax.exact'")
+    shifts, means, between = None, None, 0.0
+    if isinstance(data, Data) and constants == "each":
+        data, shifts = levelled(data)
     bases = fitted_bases(data, basis)
     units = Transform.identity(len(inputs), len(outputs))
     if own:
@@ -176,7 +199,12 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
                     inputs=tuple(inputs))
     check_weight(ridge, "ridge")
     check_weight(curvature, "curvature")
-    statistics = collect(data, layout, weights=weights)
+    if shifts is not None and isinstance(data, Data):
+        shifts = shifts / np.array(units.y_scale)
+        statistics, means = collect_by_experiment(data, layout, weights)
+        between = means.energy(shifts)
+    else:
+        statistics = collect(data, layout, weights=weights)
     unit = units.y_scale[0] ** degree
     share = energy_unit(units) / unit
     columns = positions(layout)
@@ -186,4 +214,4 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
 
         rows = likeliest(prior, statistics).rows(columns)
     problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale, prior=rows)
-    return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit)
+    return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit, None, means, shifts, between)

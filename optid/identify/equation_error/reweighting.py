@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError, nearest
@@ -83,14 +84,16 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
 def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure: dict[str, Any], kind: str,
                 threshold: float, convex: bool) -> Procedure:
     whole = compress(data, **structure)
-    used = _Rows(in_units(data, whole.units), whole.layout)
+    record = data if whole.shifts is None else levelled(data)[0]
+    used = _Rows(in_units(record, whole.units), whole.layout)
     problem, base = whole, pose(whole)
     scale = base.scale  # the weights of a pass are no unit of the data
 
     def weighted(sizes: list[np.ndarray], start: Any) -> tuple[Program, list[np.ndarray]]:
         """Return the programme and the weights of a pass, which starts from the solution of the pass before."""
         weights = used.only(_weights(r, kind, width) for r in sizes)
-        compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics)
+        compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics,
+                             between=problem.between)
         return replace(pose(compressed), start=start, certify=None, scale=scale), weights
 
     while True:
@@ -157,7 +160,10 @@ class _Rows:
 
     def residuals(self, problem: EquationError, solution: Solution) -> list[np.ndarray]:
         """Return the one-step residuals (N, l), NaN in rows that do not count."""
-        errors = residuals(self._data, self._layout, problem.regression(solution.values))
+        theta = problem.regression(solution.values)
+        errors = residuals(self._data, self._layout, theta)
+        if problem.means is not None:
+            errors = [e - level for e, level in zip(errors, problem.means.constants(theta) - theta[self._layout.offset])]
         for error, touched in zip(errors, self._touched()):
             error[touched] = np.nan
         return errors

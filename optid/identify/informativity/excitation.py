@@ -4,16 +4,17 @@ n sinusoids determine 2 n numbers of a linear response. One move from rest deter
 time, four numbers; what a record holds beyond that is noise.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.identify.design.rules import LONGEST, many_lines, remaining_shares
+from optid.identify.design.rules import LONGEST, Check, many_lines, remaining_shares
 from optid.identify.informativity.signals import Signals
 
-FEW_MOVES = 3  # up to which the moves are counted in words
 ONE_MOVE = 4  # numbers that one move determines
 MOST_LINES, LINES = 3, 1e-4  # sinusoids that are looked for; share of the variance that they must leave at most
 TOGETHER = 1e-8  # share of an input's energy that another leaves, below which they move together
@@ -79,6 +80,29 @@ def _even(x: Array) -> bool:
     k = np.arange(len(x)) - (len(x) - 1) / 2
     rest = x - x.mean() - k * (k @ x) / max(float(k @ k), 1.0)
     return len(x) > 2 and bool(rest @ rest <= 1e-8 * float((x - x.mean()) @ (x - x.mean()))) and bool(np.ptp(x) > 0)
+
+
+def check_numbers(signals: Signals, inputs: tuple[str, ...], arguments: Mapping[str, Any]) -> Check | None:
+    """Compare the coefficients of a linear model with the numbers that the inputs determine; None for other models.
+
+    The check is fine where an input determines many.
+    """
+    na, nb, nx = (arguments.get(name) for name in ("na", "nb", "nx"))
+    each = [nb] * len(inputs) if isinstance(nb, int) else nb
+    listed = isinstance(each, list | tuple) and len(each) == len(inputs) and all(isinstance(b, int) for b in each)
+    if isinstance(na, int) and na > 0 and listed:
+        asked, words = na + sum(each), f"na {na} and nb {' '.join(map(str, each))}"
+    elif isinstance(nx, int):
+        asked, words = nx * (1 + len(inputs)), f"nx {nx}"
+    else:
+        return None
+    found = [excitation(signals, c, name) for c, name in enumerate(inputs)]
+    numbers = [one.numbers for one in found]
+    if None in numbers or (most := sum(n for n in numbers if n)) >= asked or not most:
+        return Check("numbers", np.inf, "fine", "the inputs determine more numbers than the model has")
+    return Check("numbers", float(most), "error",
+                 f"{'; '.join(one.finding for one in found)}. {words} ask for {asked}: use lower orders, or move the "
+                 "input more often")
 
 
 def hopeless(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...], found: list[Excitation]) -> str:

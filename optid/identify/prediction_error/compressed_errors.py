@@ -48,6 +48,7 @@ class ErrorRows(NamedTuple):
     candidates: int
     condition: float
     method: str
+    constants: int = 0
 
 
 @dataclass(eq=False)
@@ -66,7 +67,7 @@ class CompressedErrors:
     @property
     def energy(self) -> Array:
         """Sum of squares of the output about its mean, (1,)."""
-        return np.array([self.criterion.energy])
+        return np.array([self.criterion.energy_of_record])
 
     @property
     def problem(self) -> LeastSquares:
@@ -168,7 +169,8 @@ class CompressedStates(CompressedErrors):
         response, root = self._noise_filter(errors, noise)
         meat = np.zeros((unknowns.size, unknowns.size))
         for i in range(unknowns.experiments):
-            columns = np.r_[unknowns.shared + i * unknowns.n + np.arange(unknowns.n), np.arange(unknowns.shared)]
+            states = unknowns.shared + i * unknowns.memory + np.arange(unknowns.memory)
+            columns = np.r_[states, np.arange(unknowns.shared)]
             meat[np.ix_(columns, columns)] += scattered(criterion.blocks(x)(i), response, root)
         covariance = moves.T @ meat @ moves
         taken = 1 + float(np.trace(covariance)) / self.at.value  # what the fit has taken out of the errors

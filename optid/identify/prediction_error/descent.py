@@ -37,7 +37,7 @@ EXPLAINED = 0.1
 BETTER = 2.0  # times the errors' energy that a local optimum may have of that at the border of stability, and win
 ROUNDING = 1e-9  # relative difference of two sums of squares that were added up in different ways
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
-          "constraint such as stable:0.999")
+          "constraint such as integrator (a pole at 1) or stable:0.999")
 
 
 class Criterion(ABC):
@@ -62,10 +62,22 @@ class Criterion(ABC):
         count = self.data.n_experiments
         return [f"[{i}]" if count > 1 else "" for i in range(1, count + 1)]
 
+    # (E, l) what `levelled` subtracted from the outputs, where every experiment has constants of its own
+    shifts: Array | None = None
+
     @cached_property
     def energy(self) -> float:
-        """Weighted sum of squares of the outputs about their means."""
-        y = np.vstack([e.y for e in self.data.experiments])
+        """Weighted sum of squares of the outputs about their means, without the levels that were subtracted."""
+        return self._energy([e.y for e in self.data.experiments])
+
+    @cached_property
+    def energy_of_record(self) -> float:
+        """The same of the outputs with their levels."""
+        outputs, shifts = [e.y for e in self.data.experiments], self.shifts
+        return self._energy(outputs if shifts is None else [y + shift for y, shift in zip(outputs, shifts)])
+
+    def _energy(self, outputs: Sequence[Array]) -> float:
+        y = np.vstack(outputs)
         y = np.nan_to_num(y - np.nanmean(y, axis=0))
         return float(np.sum((y @ self.weight) * y))
 

@@ -8,6 +8,7 @@ extended least squares (ARMAX), the residuals of a plant (Box-Jenkins).
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain, count, islice
 from typing import Any
 
@@ -23,8 +24,9 @@ from optid.identify.prediction_error.tangent_fit import TangentFit, violation
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
-from optid.models.roots import contained, roots_of, with_roots
+from optid.models.roots import contained, roots_of, with_integrator, with_roots
 from optid.statistics.expansion import expand
+from optid.statistics.experiments import collect_by_experiment
 from optid.statistics.hankel import hankel_statistics
 from optid.statistics.regression import collect
 from optid.statistics.unknowns import TransferPoint, TransferUnknowns
@@ -96,21 +98,24 @@ def _complete(data: Data) -> float:
 def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) -> Array:
     """Return the start under the constraints: the best of the optima with their poles moved into the region.
 
-    The other unknowns are fitted again; without constraints on the poles alone they stay.
+    The other unknowns are fitted again; without constraints on the poles alone they stay. Where a pole must lie at 1,
+    the nearest one is moved there.
     """
     if not fit.constraints:
         return fit.signed(found[0].x)
     at, ends = criterion.unknowns.slices["a"], []
     for one in found[:ENTRIES]:
         x = fit.signed(one.x)
-        for radius in PULLS:
-            pulled = x[at] if radius == 1.0 else contained(x[at], radius)
+        moved = [partial(contained, limit=radius) for radius in PULLS]
+        moved[0] = with_integrator if criterion.integrates else np.array
+        for move in moved:
+            pulled = move(x[at])
             program = fit.pose(np.concatenate([pulled, x[at.stop :]]), one.at, 0.0)
             a = program.variables.get("a")
             others = [name for name, group in program.user_constraints.items()
                       if a is not None and any({v.id for v in c.variables()} != {a.id} for c in group)]
             if violation(program.without(*others, "residual", "gauge")) <= 1e-9:  # those on the poles alone hold
-                again = one if radius == 1.0 else with_poles(criterion, x, pulled)
+                again = one if np.array_equal(pulled, x[at]) else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break
     return fit.signed(min(ends, key=lambda end: end[0])[1] if ends else found[0].x)
@@ -283,11 +288,15 @@ def equation_error(criterion: TransferErrors, innovations: Sequence[Array] | Non
         data = Data(us, [one.y for one in data.experiments], data.dt, names, list(data.outputs))
         layout = replace(layout, nb=(*layout.nb, unknowns.nc), nk=(*layout.nk, 1), inputs=tuple(names),
                          bases=fitted_bases(data, (*layout.bases, Linear())))
-    na, point = layout.na, minimise(lifted_problem(collect(data, layout), positions(layout)), count=4).point
+    statistics, means = collect_by_experiment(data, layout) if unknowns.levels else (collect(data, layout), None)
+    na, point = layout.na, minimise(lifted_problem(statistics, positions(layout)), count=4).point
+    x0, a = np.zeros((unknowns.experiments, unknowns.memory)), np.array(point.w[:na])
+    if means is not None:
+        thetas = [np.ravel(np.outer(mu, b), order="F") for mu, b in zip(point.mus, point.bs)]
+        x0[:, -1:] = means.constants(np.concatenate([point.w, *thetas])[positions(layout)])
     pairs = [(np.array(mu, dtype=float), np.ravel(np.array(b, dtype=float))) for mu, b in zip(point.mus, point.bs)]
     c = pairs.pop() if innovations is not None else (np.ones(1), np.zeros(unknowns.nc))
     pairs = [(mu, b) if free else (np.ones(1), b * mu[0]) for free, (mu, b) in zip(unknowns.free, pairs)]
-    x0, a = np.zeros((unknowns.experiments, unknowns.memory)), np.array(point.w[:na])
     return TransferPoint(a, tuple(mu for mu, _ in pairs), tuple(b for _, b in pairs), float(point.w[na]), x0,
                          contained(c[0][0] * c[1], RADIUS), a)
 

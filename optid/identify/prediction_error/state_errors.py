@@ -43,6 +43,7 @@ class StateErrors(Criterion):
     limit: float = STABLE  # modulus below which the poles that carry the state must stay
     # constraints on poles that every iterate satisfies: model -> violation, "" for none
     checks: tuple[Callable[[Any], str], ...] = ()
+    shifts: Array | None = None
     gauge: ClassVar[str] = "norm"
 
     def key(self, name: str, number: int) -> str:
@@ -71,7 +72,7 @@ class StateErrors(Criterion):
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x; of infinite value where a run leaves the range allowed."""
-        n, p, experiments = self.unknowns.n, self.unknowns.shared, self.unknowns.experiments
+        n, p, experiments = self.unknowns.memory, self.unknowns.shared, self.unknowns.experiments
         try:
             return linearised(self.blocks(x), experiments, n, p, self.gauge_rows(x), method)
         except (FloatingPointError, DataError):
@@ -82,7 +83,7 @@ class StateErrors(Criterion):
         """Return a generator of the weighted rows [x0 | shared | error] of experiment i, zero where y is missing."""
         unknowns, covariance = self.unknowns, np.linalg.inv(self.weight)
         point, model = self._placed(x)
-        chunk = max(32, NUMBERS // ((unknowns.n + unknowns.shared + 1) * unknowns.l))
+        chunk = max(32, NUMBERS // ((unknowns.memory + unknowns.shared + 1) * unknowns.l))
 
         def rows(index: int) -> Iterator[tuple[Array, int]]:
             for block in _runs(self._job(model, index), unknowns, point, index, chunk):
@@ -131,7 +132,7 @@ class StateErrors(Criterion):
 
     def visited(self, point: StatePoint) -> list[Array]:
         """Return the states (N, n) of the run of every experiment, whatever its range."""
-        model = self.at(point)
+        _, model = self._placed(self.unknowns.pack(point))
         return [simulation.visited(self._job(model, i, within=False), x0) for i, x0 in enumerate(point.x0)]
 
     def _job(self, model: HammersteinSS, index: int, within: bool = True) -> simulation.Run:
@@ -162,7 +163,10 @@ class StateErrors(Criterion):
         kept = self._last.get(key)
         if kept is None:
             point = self.unknowns.unpack(x)
-            kept = point, self.at(point)
+            model = self.at(point)
+            if self.unknowns.levels:  # the constants are states of the run
+                model = replace(model, offset_y=np.zeros(model.l)).with_level_states
+            kept = point, model
             self._last.clear()
             self._last[key] = kept
         return kept
@@ -173,9 +177,13 @@ class StateErrors(Criterion):
 
     def at(self, point: StatePoint) -> HammersteinSS:
         """Build the model of a point."""
-        matrices = point.A, point.b, point.C, point.d
+        matrices, levels, offset = (point.A, point.b, point.C, point.d), None, point.offset
+        if self.unknowns.levels:
+            levels = point.x0[:, self.unknowns.n :] + (0.0 if self.shifts is None else self.shifts)
+            offset = levels.mean(axis=0)
         plain = state_model(self.unknowns.expansion, self.data, matrices, point.mus, point.nus, point.e, K=point.K,
-                            offset=point.offset)
+                            offset=offset)
+        plain = replace(plain, levels=levels)
         if not self.unknowns.latent:
             return plain
         functions = [Nonlinearity(one.basis, one.vectors @ c) for one, c in zip(self.unknowns.latent, point.cs)]
@@ -210,8 +218,10 @@ class StateErrors(Criterion):
         shift = np.linalg.lstsq(np.eye(unknowns.n) - A, constant)[0]
         gain = model.K + injection if unknowns.innovations else np.zeros_like(model.K)
         d = model.D * scale * np.array(unknowns.feedthrough)
-        offset = model.offset_y + model.C @ shift if unknowns.constant else np.zeros(unknowns.l)
-        x0 = np.zeros((unknowns.experiments, unknowns.n))
+        constant = model.offset_y + model.C @ shift
+        offset = constant if unknowns.constant else np.zeros(unknowns.l)
+        x0 = np.zeros((unknowns.experiments, unknowns.memory))
+        x0[:, unknowns.n :] = constant[: unknowns.memory - unknowns.n]
         cs = tuple(np.linalg.lstsq(one.vectors, h.mu)[0] for one, h in zip(unknowns.latent, model.latent))
         return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0, cs,
                           model.Ez + injection @ model.Fz, model.Fz, model.Cz, model.Dz, model.offset_z)
@@ -242,10 +252,10 @@ def weight_root(covariance: Array, missing: Any) -> Array:
 
 
 def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index: int, chunk: int) -> Iterator[Array]:
-    """Yield the sensitivities and the errors in the last column, (T, l, n + shared + 1), chunk by chunk."""
+    """Yield the sensitivities and the errors in the last column, (T, l, memory + shared + 1), chunk by chunk."""
     from optid.models.state_kernels import sensitivities
 
-    n, l, parts = unknowns.n, unknowns.l, job.model.parts  # noqa: E741
+    n, l, parts = unknowns.memory, unknowns.l, job.model.parts  # noqa: E741
     direct, state, turn = unknowns.direct(point), point.x0[index].copy(), np.eye(n, n + unknowns.shared)
     for first in range(0, len(job.u), chunk):
         samples = slice(first, min(first + chunk, len(job.u)))
@@ -263,7 +273,7 @@ def _runs(job: simulation.Run, unknowns: StateUnknowns, point: StatePoint, index
 def _values(unknowns: StateUnknowns, point: StatePoint, stretch: Stretch, states: Array, outputs: Array,
             slopes: Array, u: Array, f: Array, eta: Sequence[Array]) -> Array:
     """Return the signals of a run (T, s) that multiply unknowns, in the order of `StateUnknowns.signals`."""
-    missing, one = np.isnan(stretch.y), np.ones((len(u), 1))
+    missing, one, states = np.isnan(stretch.y), np.ones((len(u), 1)), states[:, : unknowns.n]
     fed, argument = np.where(missing, outputs, stretch.y), np.hstack([states, u, one])
     zeta = [family.values(fed) for family in unknowns.expansion.feedback]
     z = (stretch.z + states @ point.Cz.T).T

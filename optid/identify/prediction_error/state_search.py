@@ -132,8 +132,9 @@ def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
         unknowns.criterion == "simulation" and not unknowns.expansion.feedback)
     if linear and not unknowns.latent and not np.any(weight - np.diag(np.diag(weight))):
         records = errors.data.records
-        bound = simulation_bound(records, unknowns.expansion, unknowns.n, np.sqrt(np.diag(weight)), evidence.objective,
-                                 2 * (unknowns.n // unknowns.l + 2), "the errors are not convex in the poles, several "
+        order = unknowns.memory  # a constant of an experiment is a state
+        bound = simulation_bound(records, unknowns.expansion, order, np.sqrt(np.diag(weight)), evidence.objective,
+                                 2 * (order // unknowns.l + 2), "the errors are not convex in the poles, several "
                                  "starts are compared")
         reason = bound.reason if evidence.status is Status.LOCAL else reason
     figures = {**evidence.figures, "weight of the outputs": weight / unit, **remarks}

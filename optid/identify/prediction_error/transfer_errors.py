@@ -9,9 +9,10 @@ import numpy as np
 from optid.arrays import Array, check_integer
 from optid.bases import Linear, fitted_bases
 from optid.data.channels import Transform
+from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
-from optid.identify.arguments import enough_rows, one_output, outputs_present, per_channel
+from optid.identify.arguments import Offset, check_offset, enough_rows, one_output, outputs_present, per_channel
 from optid.identify.prediction_error.descent import Criterion
 from optid.models import recursions, roots
 from optid.models.gauges import gauge_factor
@@ -24,6 +25,7 @@ from optid.statistics.sensitivities import TransferPredictor
 from optid.statistics.unknowns import TransferUnknowns
 
 STABLE = 1 - 1e-9  # radius inside which every pole of an iterate, or zero of C, lies
+INTEGRATES = 1e-6  # size of A(1) that is the accuracy of a solver, where a constraint makes it zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,8 @@ class TransferErrors(TransferPredictor, Criterion):
 
     gauge: str  # how the scale between mu and b is fixed; "none" for a linear model
     units: Transform  # from those of the record (`optid.program.units`) to those of the model
+    shifts: Array | None = None
+    integrates: bool = False  # whether a constraint puts a pole of the plant at 1, where it counts as stable
     weight: ClassVar[Array] = np.eye(1)
 
     @property
@@ -58,11 +62,22 @@ class TransferErrors(TransferPredictor, Criterion):
         return [np.where(one.state == recursions.PRESENT, one.innovations, np.nan) for one in found]
 
     def admissible(self, x: Array) -> bool:
-        """Whether the predictor is stable: C invertible and, unless D is A, the plant stable."""
+        """Whether the predictor is stable: C invertible and, unless D is A, the plant stable but for an integrator."""
         at = self.unknowns.slices
         if not np.all(np.isfinite(x)) or roots.radius(x[at["c"]]) >= STABLE:
             return False
-        return not self.unknowns.apart or roots.radius(x[at["a"]]) < STABLE
+        a = x[at["a"]]
+        if self.integrates and abs(1 + a.sum()) <= INTEGRATES:
+            a = roots.without_integrator(a)
+        return not self.unknowns.apart or roots.radius(a) < STABLE
+
+    def normalised(self, x: Array) -> Array:
+        """Return the same model in the gauge; a pole that a constraint puts at 1 lies there to the last digit."""
+        x, at = super().normalised(x), self.unknowns.slices["a"]
+        rest = 1 + x[at].sum()
+        if self.integrates and abs(rest) <= INTEGRATES:
+            x[at.stop - 1] -= rest
+        return x
 
     def scale(self, x: Array, b: str) -> float:
         """Return the divisor of a part b of x, and factor of its mu, to reach the gauge."""
@@ -90,21 +105,24 @@ class TransferErrors(TransferPredictor, Criterion):
 
         a (na,) and Theta (P, nb) of every input may be expressions.
         """
-        units, memory, layout = self.units, self.unknowns.memory, self.unknowns.layout
+        units, memory, layout = self.units, self.unknowns.fading, self.unknowns.layout
         rows, total = np.arange(memory)[:, None], np.zeros(memory)
+        later = (np.arange(1, layout.na + 1) > rows).astype(float)
         if layout.na and units.y_offset[0]:
-            later = (np.arange(1, layout.na + 1) > rows).astype(float)
             total = total - units.y_offset[0] / units.y_scale[0] * (later @ a)
         for lags, theta, origin, scale in zip(layout.lags, thetas, units.u_offset, units.u_scale):
             if origin:
                 total = total + origin / scale * ((np.asarray(lags) > rows).astype(float) @ theta[0])
         if self.unknowns.experiments == 1:
             return total
-        return total[:, None] @ np.ones((1, self.unknowns.experiments))
+        every = total[:, None] @ np.ones((1, self.unknowns.experiments))
+        if self.shifts is None or not layout.na:
+            return every
+        return every - (later @ a)[:, None] @ self.shifts.T
 
 
 def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None, gauge: str | None,
-                    offset: bool) -> TransferErrors:
+                    offset: Offset) -> TransferErrors:
     """Check the arguments of a fit, and return its criterion on the record in its own units (`optid.program.units`).
 
     Unless D is A the initial states are unknown, and a record with missing inputs is cut into experiments. Arguments
@@ -112,22 +130,26 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     linear model. Without ``offset`` nothing is centred.
     """
     data = one_output(data, "simulation errors" if (nc, nd) == (0, 0) else "prediction errors")
+    constants, shifts = check_offset(offset, data), None
     layout = Layout(check_integer(na, "na (the number of poles)", 0), per_channel("nb", nb, data.inputs, low=1),
                     per_channel("nk", nk, data.inputs, low=0), (Linear(),) * data.m, data.outputs, data.inputs)
     states = nd is not None
     if states:
         check_lengths([e.n_samples for e in data.experiments], layout)
         data = with_whole_inputs(data, 2 * layout.first_row + 1)
+    if constants == "each":
+        data, shifts = levelled(data)
     bases = fitted_bases(data, basis)
-    units = own_units(data, [isinstance(one, Linear) for one in bases], bool(offset))
+    units = own_units(data, [isinstance(one, Linear) for one in bases], bool(constants))
     record, layout = in_units(data, units), replace(layout, bases=tuple(inner_bases(bases, units)))
     if states:
         _check_inputs(record, layout)
-    unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, bool(offset),
-                                check_integer(nc, "nc", 0), nd)
+    unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, constants is True,
+                                check_integer(nc, "nc", 0), nd, constants == "each")
     if states:
         enough_rows(outputs_present(record), "output samples", replace(unknowns, nc=0, nd=0).size, "lags")
-    return TransferErrors(record, unknowns, gauge or "none", units)
+    return TransferErrors(record, unknowns, gauge or "none", units,
+                          None if shifts is None else shifts / units.y_scale[0])
 
 
 def _check_inputs(data: Data, layout: Layout) -> None:

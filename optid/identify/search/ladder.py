@@ -13,8 +13,8 @@ import numpy as np
 
 from optid.data.record import Data
 from optid.identify.blocks import Blocks
-from optid.identify.delays import LagSums, linear, scan
 from optid.identify.informativity import Informativity, Process, informativity
+from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search.trial import Candidate, Trial
 
 Rung = Generator[list[Candidate], list[Trial], None]

@@ -11,6 +11,7 @@ from optid.bases import Linear, UserFunctions, feedback_bases, fitted_bases
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
+from optid.identify.arguments import check_offset
 from optid.identify.subspace.projection import WEIGHTINGS
 from optid.program.units import in_units, inner_bases, own_units
 from optid.solving.solve import Evidence, Procedure
@@ -91,6 +92,9 @@ def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, of
     """
     if not isinstance(data, Data):
         raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")
+    if check_offset(offset, data) == "each":
+        raise StructureError(f"{name} has one constant for all experiments: use 'ss.exact' or 'hammerstein_ss.exact' with "
+                             "offset='each'")
     inputs, outputs = fitted_bases(data, basis), feedback_bases(data, feedback_basis)
     units = own_units(data, [isinstance(one, Linear) for one in inputs], bool(offset))
     if any(isinstance(one, UserFunctions) for one in outputs):  # known in the units of the record only

@@ -5,6 +5,7 @@ nonlinear feedback the simulation with measured feedback takes the outputs in th
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data
+from optid.data.stretches import runs_of
 from optid.errors import DataError
 from optid.models.functions import has_feedback
 from optid.registry import Rendered
@@ -19,6 +21,7 @@ from optid.registry import Rendered
 ONE_STEP, MEASURED, SIMULATION = "one step", "measured feedback", "simulation"
 HORIZONS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50, 70, 100)
 """Samples ahead at which the fit is evaluated, as far as the record reaches."""
+RESTARTS = 5  # samples per pole that a stretch between missing inputs must have
 
 
 def predictors(model: Any) -> tuple[str, ...]:
@@ -43,11 +46,18 @@ def simulated(model: Any, data: Data, word: str = SIMULATION, x0: Any = "fit") -
 
 
 def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Array]:
-    """Return what `simulated` does; NaN where an input is missing or the simulation diverges."""
-    try:
-        return simulated(model, data, word)
-    except DataError:
-        return [np.full(e.y.shape, np.nan) for e in data.experiments]
+    """Return what `simulated` does, from one missing input to the next; NaN there and where the simulation diverges."""
+    found = []
+    for i, e in enumerate(data.experiments):
+        runs = runs_of(np.isfinite(e.u).all(axis=1)).tolist()
+        y = np.full(e.y.shape, np.nan)
+        for first, last in runs:
+            if len(runs) > 1 and last - first < RESTARTS * max(len(model.poles), 1):  # the state would follow the noise
+                continue
+            with suppress(DataError):
+                y[first:last] = simulated(model, data.select(experiments=i).window(first, last), word)[0]
+        found.append(y)
+    return found
 
 
 def one_step_or_nan(model: Any, data: Data) -> list[Array]:

@@ -5,7 +5,6 @@ its own samples and as many after it as there are lags. All structures are colum
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from optid.arrays import Array
 from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data.record import Data
-from optid.errors import OptidError, RankError
+from optid.errors import RankError
 from optid.identify.blocks import Blocks, Part, joined
 from optid.statistics import Layout, Statistics, accumulate
 
@@ -22,8 +21,6 @@ Places = NDArray[np.intp]
 
 ROWS_PER_COLUMN = 4
 RIDGE = 1e-12
-SHARP = 0.2  # reduction of the log error by the first lag with an effect, from which a delay counts as certain
-SLIGHT = 0.05  # reduction by all lags before it, as a share of that, at most
 
 
 @dataclass(frozen=True)
@@ -94,34 +91,6 @@ def scan(sums: LagSums, delays: list[tuple[int, ...]]) -> list[Autoregression]:
     found = [Autoregression(na, nb, nk, sums.error(na, nb, nk)) for nk in delays for na in range(1, layout.na + 1)
              for nb in range(1, min(layout.nb[0] - max(nk), 8) + 1)]
     return sorted(found, key=lambda one: one.error)
-
-
-def sharp_delays(sums: LagSums) -> tuple[int, ...]:
-    """Return the delay of every input where it is certain, 0 elsewhere.
-
-    Lags are removed from the first on. A delay is certain where the last of them reduces the error much and all before
-    it next to nothing; for a slow input neighbouring lags replace one another.
-    """
-    layout, found = sums.layout, []
-    lags = layout.nb[0]
-    for one in np.eye(layout.m, dtype=int):
-        rest = [sums.remainder(sums.columns(layout.na, lags, tuple(k * one))) for k in range(lags)]
-        saved = np.diff(np.log(np.maximum(rest, RIDGE)))
-        delay = int(np.argmax(saved)) if saved.size else 0
-        sharp = delay and saved[delay] >= SHARP and saved[:delay].sum() <= SLIGHT * saved[delay]
-        found.append(delay if sharp else 0)
-    return tuple(found)
-
-
-def shown_delays(model: Any, data: Data) -> list[tuple[int, ...] | None]:
-    """Return the certain delays of a record with linear functions and with those of a model; None: too short."""
-    found: list[tuple[int, ...] | None] = []
-    for bases in (linear(data), tuple(f.basis for f in model.nonlinearities)):
-        try:
-            found.append(sharp_delays(LagSums(Blocks.of(data), bases)))
-        except OptidError:
-            found.append(None)
-    return found
 
 
 def linear(data: Data) -> tuple[Basis, ...]:

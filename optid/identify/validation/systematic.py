@@ -1,0 +1,102 @@
+"""The part of what a simulation leaves that the inputs explain: the error of the response, apart from the noise.
+
+What a model leaves of the outputs is regressed on its own past and on the inputs behind a bank of poles, behind the
+poles and dead time found in the record, and on their powers. The F test says whether inputs explain any of it; the
+part that they explain without the past is measured by the spread of the simulated output.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.data.record import Data
+from optid.identify.informativity import Informativity
+from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
+from optid.identify.informativity.signals import Signals, delayed, held, respond
+
+LEVEL = 1e-3
+TAUS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)  # time constants of the bank, in samples
+LAGS = 2  # samples of a response behind the poles of the record
+ROWS = 8  # samples per column, at least
+
+
+@dataclass(frozen=True)
+class Systematic:
+    """The error of the response to the inputs, the largest over the outputs.
+
+    Attributes:
+        share: its spread over that of the simulated output.
+        p_value: of none.
+        output: where it is.
+    """
+
+    share: float
+    p_value: float
+    output: str
+
+    @property
+    def found(self) -> bool:
+        """Whether inputs explain a part of the residuals."""
+        return self.p_value < LEVEL
+
+
+def systematic(data: Data, runs: Sequence[Array], told: Informativity) -> Systematic | None:
+    """Measure what the inputs explain of the residuals of simulated outputs (N, l) by experiment.
+
+    None where the record is too short, or nothing was simulated.
+    """
+    raw = data.raw()
+    found: list[Systematic] = []
+    for o, name in enumerate(data.outputs):
+        errors = [e.y[:, o] - run[:, o] for e, run in zip(raw.experiments, runs)]
+        if sum(int(np.isfinite(e).sum()) for e in errors) < 3 * ROWS:
+            continue
+        one = _measured(raw, errors, [run[:, o] for run in runs], told, o)
+        if one is not None:
+            found.append(replace(one, output=name))
+    return max(found, key=lambda s: (s.found, s.share), default=None)
+
+
+def _measured(raw: Data, errors: list[Array], runs: list[Array], told: Informativity, o: int) -> Systematic | None:
+    whole = Signals.of(raw)
+    kept = len(whole.y)
+    present = [np.isfinite(e[: len(y)])[:, None] for e, y in zip(errors[:kept], whole.y)]
+    y = [held(e[: len(y)][:, None]) for e, y in zip(errors[:kept], whole.y)]
+    signals = replace(whole, y=tuple(y), present=tuple(present))
+    rows = sum(int(there.sum()) for there in present)
+    columns = [_columns(u, whole, told, o) for u in whole.u]
+    most = max(rows // ROWS, 1)
+    columns = [c[:, :most] for c in columns]
+    na = memory(signals, 0) + 1
+    parts = stacked(signals, na, 0, lambda i, first, last: [
+        part[present[i][first:last, 0]] for part in (
+            np.hstack([np.ones((last - first, 1)), lagged(y[i][:, 0], range(1, na + 1), first, last)]),
+            columns[i][first:last], y[i][first:last, 0])])
+    if not parts or len(parts[2]) < parts[0].shape[1] + 2 * parts[1].shape[1]:
+        return None
+    past, inputs, error = parts
+    p_value = added(error, past, inputs).p_value
+    alone = added(error, np.ones((len(error), 1)), inputs)
+    rest = float(np.var(error))
+    spare = max(len(error) - 1 - alone.columns, 1)
+    explained = rest * max(alone.share - (1 - alone.share) * alone.columns / spare, 0.0)
+    spread = float(np.nanstd(np.concatenate(runs)))
+    return Systematic(float(np.sqrt(explained) / spread) if spread > 0 else np.inf, p_value, "")
+
+
+def _columns(u: Array, signals: Signals, told: Informativity, o: int) -> Array:
+    """Return the inputs behind the dynamics of the record, then behind the bank, the most telling columns first."""
+    first: list[Array] = []
+    more: list[Array] = []
+    for c in range(u.shape[1]):
+        response = told.processes[o].responses[c] if told.processes else None
+        for x in powers(u[:, c], signals.levels(c)):
+            if response is not None:
+                shaped = respond(response.poles[response.poles != 1], x)
+                first += [delayed(shaped, response.nk + j) for j in range(LAGS)]
+            lag = 0 if response is None else response.nk
+            more += [delayed(respond((float(np.exp(-1 / tau)) if tau else 0.0,), x), late)
+                     for tau in TAUS for late in sorted({told.least, max(lag, told.least)})]
+    return np.column_stack([*first, *more])
