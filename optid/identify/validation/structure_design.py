@@ -16,7 +16,7 @@ from optid.models.recursions import lfilter
 
 DEGREE, HATS, SAMPLES = 3, 5, 250  # coarse: powers and hats (at most) of an input; samples per hat and input
 FINE_DEGREE, SPLIT = 7, 4  # fine: powers; parts of every interval between the nodes of the coarse hats
-PULSES = 4  # lags of an input beside its poles
+PULSES = 8  # lags of an input beside its poles
 LONGEST = 5  # time constant of a filter, at most, in lengths of the longest experiment
 MOVE, MOVES = 0.1, 4  # share of its range that an input covers in a move; moves that can be compared
 PRESENT = 0.9  # share of the energy of the filters that must have passed after a missing input before rows count
