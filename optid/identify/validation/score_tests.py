@@ -8,18 +8,20 @@ Source: Lagrange-multiplier tests of nonlinear regressions (Engle 1984).
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lstsq, qr
 from scipy.special import fdtrc, ncfdtr
 
 from optid.arrays import Array
 from optid.identify.informativity.signals import whitened
 from optid.statistics.factors import ROUNDING
 
-DEPENDENT = 1e-7  # singular value, over the largest, below which a direction is a combination of the others
+DEPENDENT = 1e-8  # share of its length that a column must keep beside the others not to be a combination of them
 LEAST = 1e-2  # share of its length that a column must keep beside the tangent space, to be more than its own error
-DISTINCT = 1e-2  # the same among the columns of one alternative, all of length one
+DISTINCT = 1e-4  # eigenvalue of the correlations of such columns that counts as a further direction
 
 
 @dataclass(frozen=True)
@@ -75,21 +77,31 @@ class Regression:
 
     def reduce(self, columns: Sequence[Array]) -> Array:
         """Whiten columns, (N, ...) per experiment, and project the nuisance out: (R, ...)."""
-        found = []
+        found, before = [], 0.0
         for one, (complete, basis) in zip(columns, self._parts):
             white = whitened(self.noise, one)[complete].reshape(int(complete.sum()), -1)
+            before = before + np.sum(white**2, axis=0)
             found.append(white - basis @ (basis.T @ white))
-        return np.vstack(found).reshape(-1, *columns[0].shape[1:])
+        rows = np.vstack(found)
+        rows[:, np.sum(rows**2, axis=0) <= DEPENDENT**2 * before] = 0.0  # what is left of a level is rounding
+        return rows.reshape(-1, *columns[0].shape[1:])
 
 
 def orthonormal(columns: Array) -> Array:
     """Return an orthonormal basis of the columns, whatever their lengths."""
     sizes = np.linalg.norm(columns, axis=0)
-    sound = columns[:, sizes > 0] / sizes[sizes > 0]
-    if not sound.size:
+    if not sizes.any():
         return np.zeros((len(columns), 0))
-    basis, sizes, _ = np.linalg.svd(sound, full_matrices=False)
-    return basis[:, sizes > DEPENDENT * sizes[0]]
+    found = qr(columns[:, sizes > 0] / sizes[sizes > 0], mode="economic", pivoting=True)
+    basis, diagonal = np.asarray(found[0]), np.abs(np.diag(np.asarray(found[1])))
+    return basis[:, diagonal > DEPENDENT * diagonal[0]]
+
+
+def solve(columns: Array, target: Array) -> Array:
+    """Return the least-squares coefficients of columns of any length, however dependent they are."""
+    sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    found: Any = lstsq(columns / sizes, target, cond=DEPENDENT, lapack_driver="gelsy")
+    return np.asarray(found[0]) / sizes
 
 
 def score_test(error: Array, tangent: Array, columns: Array, spare: int, negligible: float) -> FTest | None:
@@ -110,8 +122,8 @@ def score_test(error: Array, tangent: Array, columns: Array, spare: int, negligi
     left = left[:, lengths > LEAST] / lengths[lengths > LEAST]
     if not left.size:
         return None
-    basis, values, _ = np.linalg.svd(left, full_matrices=False)
-    basis = basis[:, values > DISTINCT]
+    values, vectors = np.linalg.eigh(left.T @ left)
+    basis = left @ vectors[:, values > DISTINCT] / np.sqrt(values[values > DISTINCT])
     extra = basis.shape[1]
     if spare < tangent.shape[1] + 2 * extra:
         return None

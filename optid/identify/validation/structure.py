@@ -90,8 +90,11 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None, found: 
     for o, (name, process) in enumerate(zip(data.outputs, found)):
         design = Design.of(data, o, process)
         runs = simulated and [simulated[i][: e.n_samples, o] for i, e in zip(kept, data.experiments)]
-        hypothesis = given_model(design, runs) if runs else fit_hammerstein(design, process.noise)
-        tests[name] = _test(hypothesis)
+        try:
+            hypothesis = given_model(design, runs) if runs else fit_hammerstein(design, process.noise)
+            tests[name] = _test(hypothesis)
+        except np.linalg.LinAlgError as error:
+            raise RankError(f"the test of output {name!r} is not available: {error}") from error
         ratios.append(hypothesis.ratios)
     every = [(test, words) for each in tests.values() for words, test in each.items()]
     if not all(np.isfinite(test.p_value) for test, _ in every):

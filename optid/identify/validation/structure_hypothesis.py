@@ -11,7 +11,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.identify.informativity.signals import delayed
-from optid.identify.validation.score_tests import Regression, orthonormal
+from optid.identify.validation.score_tests import Regression, orthonormal, solve
 from optid.identify.validation.structure_design import PULSES, Design
 from optid.models.recursions import lfilter
 from optid.statistics.coloured import autoregression
@@ -113,8 +113,7 @@ def _descend(design: Design, regression: Regression, point: _Point) -> _Point:
     for _ in range(STEPS):
         columns = np.hstack([part for bank, b, mu in zip(banks, point.bs, point.mus)
                              for part in (bank @ mu, np.einsum("rjp,j->rp", bank, b))])
-        sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        step = np.split(np.linalg.lstsq(columns / sizes, error, rcond=1e-10)[0] / sizes, edges)
+        step = np.split(solve(columns, error), edges)
         energy = float(error @ error)
         for share in SHARES:
             there = _Point([b + share * d for b, d in zip(point.bs, step[::2])],
@@ -132,8 +131,7 @@ def _whiten(design: Design, predicted: Sequence[Array]) -> tuple[Regression, Seq
     """Add level and decays to a prediction; return the regression that whitens what is left, and the sum."""
     whole = []
     for y, p, here, columns in zip(design.output, predicted, design.regression.present, design.regression.nuisance):
-        sizes = np.linalg.norm(columns[here], axis=0) + 1e-300
-        whole.append(p + columns @ (np.linalg.lstsq(columns[here] / sizes, (y - p)[here], rcond=1e-7)[0] / sizes))
+        whole.append(p + columns @ solve(columns[here], (y - p)[here]))
     total = sum(int(np.sum(here)) for here in design.regression.present)
     complete = total / sum(map(len, whole))
     most = min(NOISE_ORDER, total // 50)
@@ -169,7 +167,7 @@ def _carriers(design: Design, regression: Regression, lines: Sequence[Array]) ->
     """
     linear = [[x[:, :, 0] for x in bank] for bank in design.banks]
     columns = np.hstack([regression.reduce(one) for one in linear])
-    theta = np.linalg.lstsq(columns, regression.reduce(design.output), rcond=1e-10)[0]
+    theta = solve(columns, regression.reduce(design.output))
     each = 2 if len(linear) == 1 else 1
     found = []
     for parts in zip(*linear):
