@@ -92,7 +92,7 @@ def orthonormal(columns: Array) -> Array:
     sizes = np.linalg.norm(columns, axis=0)
     if not sizes.any():
         return np.zeros((len(columns), 0))
-    found = qr(columns[:, sizes > 0] / sizes[sizes > 0], mode="economic", pivoting=True)
+    found: Any = qr(columns[:, sizes > 0] / sizes[sizes > 0], mode="economic", pivoting=True)
     basis, diagonal = np.asarray(found[0]), np.abs(np.diag(np.asarray(found[1])))
     return basis[:, diagonal > DEPENDENT * diagonal[0]]
 

@@ -79,9 +79,9 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None, found: 
     Raises:
         RankError: the record does not support a test: it is short, or its inputs move too little.
     """
-    found = processes(data) if found is None else found
     if data.n_samples > 1.1 * SAMPLES:
         data = data.split(SAMPLES / data.n_samples)[0]
+    found = processes(data) if found is None else found
     kept = [i for i, e in enumerate(data.experiments) if e.n_samples >= SHORTEST]
     if not kept:
         raise RankError(f"no experiment has {SHORTEST} samples: use longer ones")
