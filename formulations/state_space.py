@@ -225,8 +225,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
     constants = check_offset(offset, record)
     if constants == "each":
         if feedback_basis is not None or extend is not None or finish is not None:
-            raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant for all "
-                                 "experiments: offset='each' is for 'ss.exact' and 'hammerstein_ss.exact' without "
+            raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant for "
+                                 "all experiments: offset='each' is for 'ss.exact' and 'hammerstein_ss.exact' without "
                                  "feedback, and for transfer functions")
         data = levelled(record)[0]
     instruments = "inputs+past" if feedback_basis is None else "simulated"
@@ -237,8 +237,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
         if getattr(rule, "verify", None) is None:
             raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
                                  "use it with hammerstein_ss.asivid")
-    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis, offset=bool(constants),
-                   instruments=instruments, feedthrough=feedthrough, stability="free",
+    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis,
+                   offset=bool(constants), instruments=instruments, feedthrough=feedthrough, stability="free",
                    iterations=2 * (feedback_basis is not None), constraints=poles)
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
     found = {f"start {i}": model.with_transform(inverse(plan.units)) for i, model in enumerate(models, start=1)}

@@ -41,8 +41,8 @@ CHORDS = 12  # sides of the polygon inscribed in half of the region of a damping
 FREQUENCIES = 128
 NEARBY = 1e-4  # relative change of the radius by which the price of a larger one is found
 GAP = 1e-3  # least Re(A / C) on the grid, for what happens between its points
-NO_EQUATION = ("constraint 'integrator' applies to the coefficients of A; a pole at 1 of a state-space model is no linear "
-               "equation in its matrices. Use 'oe.exact' or 'hammerstein_oe.exact' with it, or 'ss.exact' with "
+NO_EQUATION = ("constraint 'integrator' applies to the coefficients of A; a pole at 1 of a state-space model is no "
+               "linear equation in its matrices. Use 'oe.exact' or 'hammerstein_oe.exact' with it, or 'ss.exact' with "
                "stability='free', where a pole may come to lie at 1")
 LIMITS = (0.98, 0.99, 0.995, 0.998, 0.999, 0.9997, 0.9999)  # where the roots of the centre end, as shares of the radius
 

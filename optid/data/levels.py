@@ -20,8 +20,8 @@ def levelled(data: Data) -> tuple[Data, Array]:
         means = np.array([np.nanmean(e.y, axis=0) for e in data.experiments])
     if not np.isfinite(means).all():
         i, o = np.argwhere(~np.isfinite(means))[0]
-        raise DataError(f"experiment {i + 1} has no sample of output {data.outputs[o]!r}, so that its level is unknown: "
-                        f"leave the experiment out (data.select(experiments=...)), or use offset=True")
+        raise DataError(f"experiment {i + 1} has no sample of output {data.outputs[o]!r}, so that its level is "
+                        "unknown: leave the experiment out (data.select(experiments=...)), or use offset=True")
     shifts = means - means.mean(axis=0)
     outputs = iter([e.y - shift for e, shift in zip(data.experiments, shifts)])
     return data.mapped(lambda u: u, lambda _: next(outputs)), shifts

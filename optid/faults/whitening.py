@@ -129,6 +129,9 @@ def predictor(model: "HammersteinSS") -> Predictor:
     Warns:
         DataWarning: a noise without power at some frequency.
     """
+    if model.levels is not None:
+        raise StructureError("Every record of this model has a level of its own, which a fault of a sensor would pass "
+                             "for: choose the level of the plant by model.at_level(constant).")
     if model.noise is None:
         raise StructureError(
             "The model has no noise covariances, which give the scale of its innovations: estimate them with "

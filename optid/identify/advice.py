@@ -217,7 +217,7 @@ def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
 
 def _on_model(fit: Any) -> Iterator[Advice]:
     model, data = fit.model, fit.data.raw()
-    yield from _on_poles(fit)
+    yield from advise_on_poles(fit)
     for function, x, share in shares_outside(model, data):
         if share > 0.01:
             yield Advice(f"{100 * share:.0f} % of {function.name} lies outside the interval of its basis",
@@ -238,7 +238,7 @@ def _on_model(fit: Any) -> Iterator[Advice]:
         yield Advice("a linear function of the input fits as well", f"--formulation {plain}")
 
 
-def _on_poles(fit: Any) -> Iterator[Advice]:
+def advise_on_poles(fit: Any) -> Iterator[Advice]:
     """Tell a pole that the record does not tell from 1, an integrator, from one outside the unit circle."""
     model = fit.model
     if has_feedback(model) or any("integrator" in getattr(rule, "about", ()) for rule in fit.arguments.get(
@@ -254,8 +254,8 @@ def _on_poles(fit: Any) -> Iterator[Advice]:
     if abs(pole - 1) <= reach and model.integrates_within(reach):
         word = "--constraint integrator" if hasattr(model, "nk") else "--formulation oe.exact --constraint integrator"
         word = word if model.l == 1 else f"data.select(outputs=...) and {word} for each output"
-        yield Advice(f"the record does not tell the pole {words} from 1: the plant may integrate, its output ramp while "
-                     "the inputs are held", word)
+        yield Advice(f"the record does not tell the pole {words} from 1: the plant may integrate, its output ramp "
+                     "while the inputs are held", word)
     elif not model.is_stable:
         yield Advice("the model has a pole outside the unit circle", "--constraint stable:0.99")
 

@@ -162,9 +162,17 @@ class Fit(Rendered):
     @cached_property
     def verdict(self) -> Any:
         """Tests of the model on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
+        return self.judged() if isinstance(self.data, Data) and self.model is not None else None
+
+    def judged(self, cross_validated: Sequence[float] | None = None, pooled: float | None = None) -> Any:
+        """Return the verdict on the model, by fits of blocks that were left out where there are some."""
         from optid.identify.verdict import verdict
 
-        return verdict(self.model, self.data) if isinstance(self.data, Data) and self.model is not None else None
+        try:
+            known = self.uncertainty
+        except OptidError:
+            known = None
+        return verdict(self.model, self._record(), cross_validated, pooled, known)
 
     @cached_property
     def advice(self) -> tuple[Any, ...]:

@@ -39,8 +39,8 @@ class LevelEvidence:
 
     def __str__(self) -> str:
         word = "have levels of their own" if self.offset == "each" else "share one level"
-        return (f"the {self.experiments} experiments {word}: BIC {self.each:.1f} with one constant each, {self.one:.1f} "
-                "with one for all")
+        return (f"the {self.experiments} experiments {word}: BIC {self.each:.1f} with one constant each, "
+                f"{self.one:.1f} with one for all")
 
 
 def level_evidence(data: Data, *, na: int = 4, nb: int | Sequence[int] = 4, nk: int | Sequence[int] = 0,

@@ -18,17 +18,20 @@ from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.informativity import Informativity, informativity
-from optid.identify.validation.checks import record_structure, shares_outside
+from optid.identify.validation.checks import record_structure, shares_outside, tested_residuals
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.identify.validation.systematic import systematic
-from optid.models.functions import has_feedback
+from optid.models.functions import has_feedback, step_length
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
 GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 """Fits in % from which on, and below which, a model is called so; the second is that of its worst block."""
 OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
 GAP = 15.0  # points that the one-step prediction may be better than the free run
-WRONG = 0.07  # error of the response that inputs explain, over the spread of the simulated output
+# errors of the response that inputs explain, over the spread of the simulated output: of a model that is not good, and
+NOTED, WRONG = 0.07, 0.10  # of one that is poor
+UNCERTAIN = 0.07  # standard error of the step response, over its size
+POINTS = 20  # of a step response, at which it is looked at
 APART = 0.12  # difference of the response from that of the low-order model, in a loop
 STRUCTURE = 0.1  # share of the residual variance that another structure may save in a model that is called good
 OUTSIDE = 0.01  # share of the samples that may lie outside the interval of a function
@@ -68,8 +71,8 @@ class Verdict:
             f"{part.name} {part.value}: {'PASS' if part.passed else 'FAIL'}" for part in self.parts)
 
 
-def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = None, pooled: float | None = None
-            ) -> Verdict:
+def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = None, pooled: float | None = None,
+            known: Any = None) -> Verdict:
     """Judge a model on a record.
 
     Args:
@@ -77,6 +80,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         data: the record that it was estimated from.
         cross_validated: fits in % of the blocks that were left out one after another, where there are some.
         pooled: the same over all blocks.
+        known: the `Uncertainty` of the model, where there is one.
     """
     raw, told = data.raw(), informativity(data)
     y = np.vstack([e.y for e in raw.experiments])
@@ -98,7 +102,9 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
         parts.append(Finding("estimation minus cross-validated fit", _points(lost, " points"), lost <= OVERFIT))
     if np.isfinite(ahead) and np.isfinite(own) and not closed:
         parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
-    wrong = [*_response(model, raw, runs, told, closed), *_lags(model, told)]
+    parts += _residuals(model, raw, predicted)
+    wrong = [*_response(model, raw, runs, told, closed), *_uncertain(model, raw, known)]
+    wrong += _lags(model, told, all(part.passed for part in wrong))
     # a pole nearer to 1 than the record is long grows by less than e over it: the record does not tell it from 1
     ramps = model.integrates or (not model.is_stable and model.integrates_within(
         1 / max(e.n_samples for e in raw.experiments)))
@@ -110,9 +116,23 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     elif score < POOR_FIT or lost > OVERFIT or any(part.counts and not part.passed for part in wrong):
         word = POOR
     else:
-        failed = any(part.counts and not part.passed for part in parts)
+        failed = any(not part.passed for part in wrong) or any(part.counts and not part.passed for part in parts)
         word = GOOD if score >= GOOD_FIT and not worst < GOOD_BLOCK and not failed else FAIR
     return Verdict(word, tuple(parts), score)
+
+
+def _residuals(model: Any, data: Data, predicted: Sequence[Array]) -> list[Finding]:
+    """Say what the residual tests find, those of a page too."""
+    if all(np.isnan(p).all() for p in predicted):
+        return [Finding("residuals", "not available: no one-step prediction", True, counts=False)]
+    tests = tested_residuals(model, data, predicted)
+    found = []
+    for name, kind in (("independence of the inputs", "cross_correlations"), ("whiteness", "autocorrelations")):
+        failed = [test for test in tests[kind].values() if not test.passed]
+        known = any(np.isfinite(test.p_value) for test in tests[kind].values())
+        words = ", ".join(f"{test.output} {'on ' + test.input if kind[0] == 'c' else 'on its past'}" for test in failed)
+        found.append(Finding(name, words or ("kept" if known else "not available"), not failed, known))
+    return found
 
 
 def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity, closed: bool) -> list[Finding]:
@@ -127,7 +147,7 @@ def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity
     where = f" ({found.output})" if data.l > 1 else ""
     size = f"{100 * found.share:.2g} % of the response{where}" if found.found else f"none visible{where}"
     return [Finding("error that the inputs explain", f"{size} (p = {found.p_value:.2g})",
-                    not (found.found and found.share > WRONG))]
+                    not (found.found and found.share > NOTED), found.found and found.share > WRONG)]
 
 
 def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Informativity) -> list[Finding]:
@@ -148,6 +168,32 @@ def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Infor
     return parts
 
 
+def _uncertain(model: Any, data: Data, known: Any) -> list[Finding]:
+    """Say how well the record determines the response to a step over the range of every input."""
+    if known is None or has_feedback(model) or getattr(model, "latent", ()):
+        return []
+    length = step_length(model)
+    points = np.unique(np.geomspace(1, length, POINTS).astype(int)) - 1
+    spans = []
+    for c, f in enumerate(model.nonlinearities):
+        u = np.concatenate([e.u[:, c] for e in data.experiments])
+        spans.append(np.array([np.nanmin(u), np.nanmax(u)]) if f.basis.interval is None else np.array(f.basis.interval))
+
+    def response(one: Any) -> Array:
+        moves = np.array([np.ptp(f(span)) for f, span in zip(one.nonlinearities, spans)])
+        return (one.step_response(length)[points] * moves).ravel()
+
+    try:
+        found = known.of(response)
+    except (OptidError, np.linalg.LinAlgError, ValueError):
+        return []
+    shape = (points.size, data.l, data.m)
+    size, error = np.abs(found.value).reshape(shape).max(axis=0), found.error.reshape(shape).max(axis=0)
+    with np.errstate(all="ignore"):
+        share = float(np.nanmax(np.where(size > 0, error / size, np.nan), initial=0.0))
+    return [Finding("standard error of the step response", f"{100 * share:.2g} %", share <= UNCERTAIN)]
+
+
 def _acts_at_once(model: Any) -> str:
     """Return an input that acts on an output without delay; "" where none does."""
     if hasattr(model, "nk"):
@@ -157,8 +203,11 @@ def _acts_at_once(model: Any) -> str:
     return next((name for c, name in enumerate(model.inputs) if np.any(first[:, c])), "")
 
 
-def _lags(model: Any, told: Informativity) -> list[Finding]:
-    """Say where inputs act later, or earlier, than the lags that the model has."""
+def _lags(model: Any, told: Informativity, harmless: bool) -> list[Finding]:
+    """Say where inputs act later, or earlier, than the lags that the model has.
+
+    Poles cover a delay as well: it is harmless where nothing else is wrong with the response.
+    """
     if not hasattr(model, "nk") or not told.processes or told.reason:
         return []
     wrong = []
@@ -172,6 +221,8 @@ def _lags(model: Any, told: Informativity) -> list[Finding]:
         elif max(highs) < first and all(p.responses[c].poles.size <= 2 for p in told.processes):
             wrong.append(f"{name} acts from lag {min(p.responses[c].nk for p in told.processes)} on, the model from "
                          f"lag {first} on")
+    if wrong and harmless:
+        return [Finding("delay", "covered by the dynamics", True)]
     return [Finding("delay", ", ".join(wrong) or "covered by the lags", not wrong)]
 
 

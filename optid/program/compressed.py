@@ -26,7 +26,8 @@ class Compressed(Protocol):
     Attributes:
         problem: the numbers of ``‖root z - target‖² + remainder``: root (k, n), target (k,), remainder.
         statistics: the rows behind it: ``root``, the triangular factor of [regressor | outputs]; ``rows`` used and
-            ``candidates`` in the record, ``constants`` eliminated from them; ``condition`` of the factor and the ``method`` that made it.
+            ``candidates`` in the record; number of ``constants`` eliminated; ``condition`` of the factor and the
+            ``method`` that made it.
         columns: (n_columns, l) positions in z of the coefficients of the columns of the factor.
         energy: (l,) sum of squares of every output about its mean, in units of the objective.
     """

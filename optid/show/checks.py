@@ -36,8 +36,8 @@ def validation_tables(checked: "Validation") -> list[Table]:
 def _test_table(checked: "Validation") -> Table:
     rows = []
     for t in checked.tests:
-        outcome, outside = "PASS" if t.passed else "FAIL", f"{t.outside} of {t.lags.size - (t.input is None)}"
-        found = (outcome, number(t.p_value, 2), outside) if np.isfinite(t.p_value) else ("-", "-", "-")
+        outside = f"{t.outside} of {t.lags.size - (t.input is None)}"
+        found = (t.outcome, number(t.p_value, 2), outside) if np.isfinite(t.p_value) else (t.outcome, "-", "-")
         rows.append((f"{t.output}: {_verdict(t)}", *found))
     structure, note = checked.structure, ""
     if structure is not None:
@@ -55,8 +55,8 @@ def _verdict(test: Any) -> str:
     if np.isnan(test.p_value):
         return "not tested (constant or rounding error)"
     if test.input is None:
-        return "white" if test.passed else "not white"
-    return f"independent of {test.input}" if test.passed else f"depends on {test.input}"
+        return "not white" if test.significant else "white"
+    return f"depends on {test.input}" if test.significant else f"independent of {test.input}"
 
 
 def horizon_table(curve: "HorizonCurve") -> Table:

@@ -11,7 +11,7 @@ from optid.data.record import Data
 from optid.errors import RankError
 from optid.models.layout import Layout
 from optid.statistics.blocks import check_lengths
-from optid.statistics.factors import add_to_root, any_root_of_gram
+from optid.statistics.factors import ROUNDING, add_to_root, any_root_of_gram
 from optid.statistics.regression import CONDITION_LIMIT, LEAST_REMAINDER, Statistics, accumulate, factorise
 
 
@@ -44,13 +44,14 @@ def collect_by_experiment(data: Data, layout: Layout, weights: Sequence[Array] |
 
     The constants are eliminated but for their mean, which is the coefficient of the column of ones: rows are taken
     about the mean of their experiment, and one row, exact at the optimum, holds the mean of these means with the
-    weight that leaves the information about the mean of the constants as it is. Arguments and errors as `collect`.
+    weight that leaves the information about the mean of the constants as it is. Arguments and errors as `collect`; a
+    column that is constant within every experiment is refused as well (`RankError`).
     """
     parts = _by_experiment(accumulate, data, layout, weights)
     for i, part in enumerate(parts, start=1):
         if not part.rows:
-            raise RankError(f"Experiment {i} has no complete row, so that its constant is unknown: leave it out, or use "
-                            "fewer lags.")
+            raise RankError(f"Experiment {i} has no complete row, so that its constant is unknown: leave it out, or "
+                            "use fewer lags.")
     found, means = _about_means(parts)
     found.check()
     if found.condition > CONDITION_LIMIT or found.remainder < LEAST_REMAINDER:
@@ -81,6 +82,13 @@ def _about_means(parts: Sequence[Statistics]) -> tuple[Statistics, ExperimentMea
     mean = np.sqrt(len(parts) / shares.mean()) * np.mean(means, axis=0)
     root = add_to_root(np.zeros((order.size, order.size)), np.vstack([mean, inner[:, back]]))
     exact = any(part.factor is not None for part in parts)
+    energy = np.sum([np.diag(part.gram)[: layout.n_columns - 1] for part in parts], axis=0)
+    left = np.sum(inner[:, back[: layout.n_columns - 1]] ** 2, axis=0)
+    constant = left <= ROUNDING["qr" if exact else "gram"] ** 2 * energy
+    if constant.any():
+        raise RankError(f"Column {layout.names()[int(np.argmax(constant))]} of the regressor is constant within every "
+                        "experiment: the record does not tell its effect from a constant of each. Use offset=True, or "
+                        "experiments in which it moves.")
     total = Statistics(layout, root.T @ root, sum(part.rows for part in parts),
                        sum(part.candidates for part in parts), root if exact else None, len(parts) - 1)
     return total, ExperimentMeans(np.array(means), np.array(weights))

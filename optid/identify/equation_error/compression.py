@@ -185,7 +185,8 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     constants = check_offset(offset, data)
     if not constants:
         raise StructureError("offset=False: equation-error fits estimate the constant; hold it by "
-                             "formulations.constraints.shape.fixed('offset', 0), or centre the record and use 'oe.exact' or 'armax.exact'")
+                             "formulations.constraints.shape.fixed('offset', 0), or centre the record and use "
+                             "'oe.exact' or 'armax.exact'")
     shifts, means, between = None, None, 0.0
     if isinstance(data, Data) and constants == "each":
         data, shifts = levelled(data)
@@ -214,4 +215,5 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
 
         rows = likeliest(prior, statistics).rows(columns)
     problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale, prior=rows)
-    return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit, None, means, shifts, between)
+    return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit, means=means, shifts=shifts,
+                         between=between)

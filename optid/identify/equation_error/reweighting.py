@@ -163,7 +163,8 @@ class _Rows:
         theta = problem.regression(solution.values)
         errors = residuals(self._data, self._layout, theta)
         if problem.means is not None:
-            errors = [e - level for e, level in zip(errors, problem.means.constants(theta) - theta[self._layout.offset])]
+            beyond = problem.means.constants(theta) - theta[self._layout.offset]
+            errors = [e - level for e, level in zip(errors, beyond)]
         for error, touched in zip(errors, self._touched()):
             error[touched] = np.nan
         return errors

@@ -1,6 +1,6 @@
 """Whether an input has a visible effect on an output, beside a level, a decay, the output's own past and other inputs.
 
-The F test of the input behind a few poles and the dead time found is distorted where lagged outputs and slow inputs
+The F test of the input behind a few poles and delays is distorted where lagged outputs and slow inputs
 are few: in doubt its law without an effect is simulated (parametric bootstrap).
 """
 
@@ -18,8 +18,12 @@ from optid.statistics.coloured import autoregression
 
 LEVEL = 0.01
 TAUS = (0.2, 3.0, 12.0, 50.0)  # time constants in samples
+# delays in samples; not the one that a scan finds, which is the best of many on the same record
+DELAYS = (0, 4, 16, 64)
+LATEST = 0.25  # longest of them as a share of the longest experiment
 CLEAR, DOUBTFUL = 1e-9, 0.05  # p values between which the law is simulated
 DRAWS, WARMING = 199, 200  # simulations, and samples before each
+SAMPLES = 30  # per coefficient of the noise model: a longer one takes a slow response for noise
 LAGS = 12  # of the other inputs
 DECAYS = 30  # time constants of the decay that are compared
 
@@ -43,9 +47,10 @@ def effect(signals: Signals, c: int, o: int, process: Process, names: tuple[str,
            ) -> Effect:
     """Test the effect of input c on output o, whose names are given, from a lag on: 1 in a loop."""
     na = memory(signals, o) + 2
-    more = [_bank(u[:, c], signals.levels(c), process.responses[c].nk, least) for u in signals.u]
+    latest = int(LATEST * signals.longest)
+    more = [_bank(u[:, c], signals.levels(c), least, latest) for u in signals.u]
     others = [np.column_stack([np.ones(len(u)), *(x for i in range(u.shape[1]) if i != c
-                                                  for x in _others(u[:, i], process.responses[i], least).T)])
+                                                  for x in _others(u[:, i], process.responses[i], least, latest).T)])
               for u in signals.u]
 
     def tested(outputs: tuple[Array, ...]) -> tuple[float, float, int]:
@@ -97,24 +102,21 @@ def _without_effect(signals: Signals, o: int, outputs: tuple[Array, ...], others
         _, pole, theta = min(found, key=lambda one: one[0])
         errors = regression.residuals([x[:, 1:] for x in others], theta, pole)
         smooth = [y - np.nan_to_num(e) for y, e in zip(outputs, errors)]
-        regression = regression.with_noise(autoregression(errors, min(12, signals.samples // 15)))
+        regression = regression.with_noise(autoregression(errors, min(12, signals.samples // SAMPLES)))
     _, _, white, _ = regression.solve([x[:, 1:] for x in others], pole)
     return smooth, regression.noise, float(np.std(white))
 
 
-def _bank(x: Array, levels: int, lag: int, least: int) -> Array:
-    """Return an input, and its square, behind a few poles, at once and after the dead time."""
-    columns = []
-    for one in powers(x, levels, 2):
-        for tau in TAUS:
-            v = respond((float(np.exp(-1 / tau)),), one)
-            columns += [delayed(v, late) for late in sorted({least, max(lag, least)})]
-    return np.column_stack(columns)
+def _bank(x: Array, levels: int, least: int, latest: int) -> Array:
+    """Return an input, and its square, behind a few poles after a few delays."""
+    lags = sorted({max(lag, least) for lag in DELAYS if lag <= max(latest, least)})
+    responses = [respond((float(np.exp(-1 / tau)),), one) for one in powers(x, levels, 2) for tau in TAUS]
+    return np.column_stack([delayed(v, lag) for v in responses for lag in lags])
 
 
-def _others(x: Array, response: Response, least: int) -> Array:
+def _others(x: Array, response: Response, least: int, latest: int) -> Array:
     """Return the past of another input: its bank, first lags, and response."""
     first = [delayed(x - x[0], least + j) for j in range(LAGS)]
     shaped = respond(response.poles, x)
-    return np.column_stack([_bank(x, 1, response.nk, least), *first,
+    return np.column_stack([_bank(x, 1, least, latest), *first,
                             *(delayed(shaped, response.nk + j) for j in range(2))])

@@ -4,9 +4,9 @@ n sinusoids determine 2 n numbers of a linear response. One move from rest deter
 time, four numbers; what a record holds beyond that is noise.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ ONE_MOVE = 4  # numbers that one move determines
 MOST_LINES, LINES = 3, 1e-4  # sinusoids that are looked for; share of the variance that they must leave at most
 TOGETHER = 1e-8  # share of an input's energy that another leaves, below which they move together
 COPY = 1e-8  # the same for an output, earlier or later
+SAME = 0.01  # difference from one of the factor of a copied column
 AFTER = 3  # samples that must follow the first move
 
 
@@ -30,6 +31,7 @@ class Excitation:
         input: its name.
         levels: distinct values.
         moves: samples at which it changes, all experiments together.
+        held: whether it is held at most samples.
         lines: sinusoids that it consists of; None where they are many.
         ramp: whether it rises evenly with time.
     """
@@ -37,6 +39,7 @@ class Excitation:
     input: str
     levels: int
     moves: int
+    held: bool
     lines: int | None
     ramp: bool
 
@@ -64,7 +67,8 @@ def excitation(signals: Signals, c: int, name: str) -> Excitation:
     records = signals.inputs(c)
     moves = sum(int(np.count_nonzero(np.diff(u))) for u in records)
     x = max(records, key=len)[:LONGEST]
-    return Excitation(name, signals.levels(c), moves, _lines(x), moves > 1 and all(map(_even, records)))
+    return Excitation(name, signals.levels(c), moves, 2 * moves < signals.samples, _lines(x),
+                      moves > 1 and all(map(_even, records)))
 
 
 def _lines(x: Array) -> int | None:
@@ -105,8 +109,8 @@ def check_numbers(signals: Signals, inputs: tuple[str, ...], arguments: Mapping[
                  "input more often")
 
 
-def hopeless(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...], found: list[Excitation]) -> str:
-    """Return why nothing can be learned from an input, "" where something can."""
+def hopeless(signals: Signals, inputs: tuple[str, ...], found: list[Excitation]) -> str:
+    """Return why nothing can be learned from an input, however the outputs answer, "" where something can."""
     for c, one in enumerate(found):
         if not one.moves:
             return f"input {one.input!r} does not move"
@@ -117,12 +121,6 @@ def hopeless(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...]
         if left <= AFTER:
             return (f"input {one.input!r} moves for the first time {left} sample{'s' * (left > 1)} before the end: its "
                     "effect is not in the record")
-        for o, output in enumerate(outputs):
-            if (late := _copied(signals, c, o)) is not None:
-                when = "the same sample" if late == 0 else f"{abs(late)} sample{'s' * (abs(late) > 1)} "
-                when += "" if late == 0 else "later" if late > 0 else "before"
-                return (f"input {one.input!r} is output {output!r}, {when}: it says nothing about a plant; choose the "
-                        "column of the actuator")
     for first, second in combinations(range(len(inputs)), 2):
         x, y = (np.concatenate(signals.inputs(c)) for c in (first, second))
         if 1 - (x @ y) ** 2 / max(float((x @ x) * (y @ y)), 1e-300) < TOGETHER:
@@ -133,8 +131,43 @@ def hopeless(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...]
     return ""
 
 
-def _copied(signals: Signals, c: int, o: int) -> int | None:
-    """Return how many samples after output o an equal input c comes, None where it does not."""
+@dataclass(frozen=True)
+class Copy:
+    """An input that is an output some samples earlier or later, but for a factor and a constant."""
+
+    input: str
+    output: str
+    late: int
+    factor: float
+
+    @property
+    def controller(self) -> bool:
+        """Whether it may be the answer of a proportional controller, and is no copied column."""
+        return self.late >= 0 and abs(self.factor - 1) > SAME
+
+    @property
+    def sentence(self) -> str:
+        """What it is, and what to do."""
+        samples = f"{abs(self.late)} sample{'s' * (abs(self.late) > 1)} "
+        when = f"{samples}later" if self.late > 0 else f"{samples}before" if self.late else "the same sample"
+        if self.controller:
+            return (f"cannot be identified: input {self.input!r} is {self.factor:.4g} times output {self.output!r} but "
+                    f"for a constant, {when}, as behind a proportional controller at constant set-point, and nothing "
+                    "else moved it; move the set-point, or choose the column of the actuator")
+        return (f"input {self.input!r} is output {self.output!r}, {when}: it says nothing about a plant; choose the "
+                "column of the actuator")
+
+
+def copies(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Iterator[Copy]:
+    """Yield the inputs that are outputs."""
+    for (c, name), (o, output) in product(enumerate(inputs), enumerate(outputs)):
+        if (found := _copied(signals, c, o)) is not None:
+            late, factor = found
+            yield Copy(name, output, late, factor * float(signals.u_scale[c] / signals.y_scale[o]))
+
+
+def _copied(signals: Signals, c: int, o: int) -> tuple[int, float] | None:
+    """Return how many samples after output o an equal input c comes, and its factor; None where it does not."""
     i = int(np.argmax([len(u) for u in signals.u]))
     u, y = signals.u[i][:, c], signals.y[i][:, o]
     n, half = 2 * len(u), len(u) // 2
@@ -144,4 +177,4 @@ def _copied(signals: Signals, c: int, o: int) -> int | None:
     a, b = u[max(late, 0) : len(u) + min(late, 0)], y[max(-late, 0) : len(y) - max(late, 0)]
     a, b = a - a.mean(), b - b.mean()
     rest = 1 - (a @ b) ** 2 / max(float((a @ a) * (b @ b)), 1e-300)
-    return late if rest < COPY else None
+    return (late, float(a @ b) / float(b @ b)) if rest < COPY else None

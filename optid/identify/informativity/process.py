@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.record import Data
@@ -28,6 +29,7 @@ SWEEPS = 3  # over several inputs, each fitted beside the others
 LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
 LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice the log likelihood ratio
 UNIT = 0.5  # share of the longest experiment beyond which a time constant is compared with an integrator
+FILLED = 20  # missing samples of an input up to which they are estimated
 ROUNDING = 1e-13
 STEPS, FARTHEST, NUDGE = 12, 1.0, 1e-6  # of a descent; longest step in a logarithm; step of a difference
 ENOUGH = 1e-3  # fall of twice the log likelihood at which a descent ends
@@ -173,38 +175,44 @@ def _process(signals: Signals, o: int, name: str, least: int) -> Process:
     inputs = range(len(signals.u_scale))
     longest = max(int(LATEST * signals.longest), min(least, signals.longest - 1))
     points: list[_Point | None] = [None for _ in inputs]
+    u = [signals.inputs(c) for c in inputs]
     for turn in range(TURNS):
         before = [None if p is None else (p.term.lag, p.term.order, p.term.zeros) for p in points]
         for _ in range(SWEEPS if len(points) > 1 and turn == 0 else 1):
             for c in inputs:
                 others = [p for i, p in enumerate(points) if p is not None and i != c]
                 rest = replace(regression, y=_without(regression.y, others))
-                points[c] = _found(rest, signals, c, least, longest, points[c])
+                points[c] = _found(rest, u[c], signals.levels(c), least, longest, points[c])
         known = [p for p in points if p is not None]
+        for c in inputs:
+            rest = replace(regression, y=_without(regression.y, [p for i, p in enumerate(known) if i != c]))
+            u[c] = _completed(rest, known[c], u[c], [lost[:, c] for lost in signals.lost])
         columns, theta, slowest = _joint(regression, known)
         errors = regression.residuals(columns, theta, slowest)
         noise = autoregression(errors, min(NOISE, regression.count // 30))
         size = max(noise.size, regression.noise.size)
         change = np.pad(noise, (0, size - noise.size)) - np.pad(regression.noise, (0, size - regression.noise.size))
         same = before == [(p.term.lag, p.term.order, p.term.zeros) for p in known]
-        if np.max(np.abs(change)) < SETTLED and (same or turn == 0):
+        whole = not any(lost.any() for lost in signals.lost)
+        if np.max(np.abs(change)) < SETTLED and (same or (turn == 0 and whole)):
             break
         regression = regression.with_noise(noise)
     spread = float(np.nanvar(np.concatenate(errors)))
-    whole = float(np.mean(np.concatenate([(y - y.mean()) ** 2 for y in regression.y])))
+    energy = float(np.mean(np.concatenate([(y - y.mean()) ** 2 for y in regression.y])))
     scale = float(signals.y_scale[o])
     found = [_response(signals, c, o, p, _interval(replace(regression, y=_without(
         regression.y, [q for q in known if q is not p])), p, least, longest)) for c, p in enumerate(known)]
-    return Process(name, tuple(found), noise, tuple(scale * e for e in errors), 1 - spread / max(whole, 1e-300),
+    return Process(name, tuple(found), noise, tuple(scale * e for e in errors), 1 - spread / max(energy, 1e-300),
                    sum(p.criterion for p in known))
 
 
-def _found(regression: Regression, signals: Signals, c: int, least: int, longest: int, before: _Point | None) -> _Point:
+def _found(regression: Regression, u: tuple[Array, ...], levels: int, least: int, longest: int,
+           before: _Point | None) -> _Point:
     """Return the best response to one input, whose f is bent where that pays."""
-    straight = _Drive(signals.inputs(c))
+    straight = _Drive(u)
     start = None if before is None else before.term
     best = _searched(regression, straight, least, longest, start)
-    if signals.levels(c) <= LEVELS:
+    if levels <= LEVELS:
         return best
     whole = np.concatenate(straight.values)
     nodes = np.unique(np.quantile(whole, np.linspace(0, 1, NODES)))
@@ -355,6 +363,26 @@ def _bent(regression: Regression, drive: _Drive, term: _Term, nodes: Array) -> _
         return None
     heights = heights / spread
     return _Drive(tuple(np.interp(u, nodes, heights) for u in drive.values), nodes, heights)
+
+
+def _completed(regression: Regression, point: _Point, u: tuple[Array, ...], lost: Sequence[NDArray[np.bool_]]
+               ) -> tuple[Array, ...]:
+    """Estimate a few missing samples of an input from what they do to the output; more of them stay as they are."""
+    places = [(i, k) for i, one in enumerate(lost) for k in np.flatnonzero(one).tolist() if k]
+    if not 0 < len(places) <= FILLED or point.drive.nodes is not None:
+        return u
+    own = _columns(point.term, u)
+    columns = [[x @ point.theta] for x in own]
+    for place, k in places:
+        for i, record in enumerate(u):
+            pulse = np.zeros(len(record))
+            pulse[k if i == place else 0] = i == place
+            columns[i].append(_columns(point.term, [pulse])[0] @ point.theta)
+    _, theta, _, _ = regression.solve([np.column_stack(x) for x in columns], _slowest(point.term.poles))
+    filled = [x.copy() for x in u]
+    for (i, k), value in zip(places, theta[1:] / (theta[0] or 1.0)):
+        filled[i][k] += value
+    return tuple(filled)
 
 
 def _without(y: Sequence[Array], points: Sequence[_Point]) -> tuple[Array, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from optid.data.channels import interval_text
 from optid.data.record import Data
 from optid.identify.informativity.effect import Effect, effect
-from optid.identify.informativity.excitation import Excitation, excitation, hopeless
+from optid.identify.informativity.excitation import Excitation, copies, excitation, hopeless
 from optid.identify.informativity.feedback import Loop, loop, setpoint
 from optid.identify.informativity.process import Process, processes
 from optid.identify.informativity.signals import Signals
@@ -101,8 +101,12 @@ def _examined(data: Data) -> Informativity:
     if not signals.y or any(np.ptp(np.concatenate(signals.outputs(o))) == 0 for o in range(l)):
         return _untested(data, "an output does not move")
     moves = [excitation(signals, c, name) for c, name in enumerate(data.inputs)]
-    if reason := hopeless(signals, data.inputs, data.outputs, moves):
-        return Informativity(data.inputs, data.outputs, excitations=tuple(moves), reason=reason, findings=(reason,))
+    copy = next(copies(signals, data.inputs, data.outputs), None)
+    if reason := hopeless(signals, data.inputs, moves) or ("" if copy is None else copy.sentence):
+        regulated = copy is not None and copy.controller
+        loops = tuple(Loop("regulated" if regulated and copy.input == name else "open") for name in data.inputs)
+        return Informativity(data.inputs, data.outputs, loops, excitations=tuple(moves), reason=reason,
+                             findings=(reason,))
     found = processes(data)
     if any(r.nk == 0 for p in found for r in p.responses):
         later = processes(data, 1)
@@ -156,8 +160,7 @@ def _findings(found: Informativity, data: Data, reason: str) -> list[str]:
         if one.word == "closed":
             sentences.append(
                 f"closed loop: output {one.output!r} acts on input {name!r} (p = {one.p_value:.1g}); use lags from 1 "
-                "on and a noise model (bj.exact, armax.exact, or arx with many lags), and pass the set-point as a "
-                "column where there is one")
+                "on and a noise model (bj.exact, armax.exact, or arx with many lags), and move the set-point")
     sentences += [one.finding for one in found.excitations if one.finding and not reason]
     if reason:
         return sentences
@@ -175,10 +178,11 @@ def _findings(found: Informativity, data: Data, reason: str) -> list[str]:
                 interval = f"; 95 %: {low} to {high}" if high > low else ""
                 time = interval_text(dead * data.dt, data.time_unit)
                 samples = f"{dead} sample{'s' * (dead > 1)}"
-                sentences.append(f"dead time from {name!r} to {process.output!r}: {time} ({samples}{interval})"
-                                 if data.time_unit else
-                                 f"dead time from {name!r} to {process.output!r}: {samples}{interval}")
-            if _follows(data, c, process, found.outputs.index(process.output)):
+                # further poles than those found act like a dead time
+                what = "dead time" if response.poles.size < 2 else "apparent dead time"
+                size = f"{time} ({samples}{interval})" if data.time_unit else f"{samples}{interval}"
+                sentences.append(f"{what} from {name!r} to {process.output!r}: {size}")
+            if found.excitations[c].held and _follows(data, c, process, found.outputs.index(process.output)):
                 sentences.append(f"output {process.output!r} settles at input {name!r}, as at the set-point of a loop: "
                                  "the model is then that of the closed loop")
             if response.integrates:

@@ -29,12 +29,14 @@ class Signals:
         u: inputs (T, m), the last value held where one is missing.
         y: outputs (T, l), interpolated where one is missing.
         present: whether an output was measured, (T, l).
+        lost: whether an input is missing, (T, m).
         u_scale, y_scale: spread of every channel, (m,) and (l,).
     """
 
     u: tuple[Array, ...]
     y: tuple[Array, ...]
     present: tuple[NDArray[np.bool_], ...]
+    lost: tuple[NDArray[np.bool_], ...]
     u_scale: Array
     y_scale: Array
 
@@ -54,7 +56,8 @@ class Signals:
             spread = np.where(spread > 1e-14 * np.abs(middle), spread, 1.0)
             (u, y)[i][:] = [(x - middle) / spread for x in several]
             scales.append(spread)
-        return cls(tuple(u), tuple(y), tuple(np.isfinite(e.y) for e in experiments), *scales)
+        return cls(tuple(u), tuple(y), tuple(np.isfinite(e.y) for e in experiments),
+                   tuple(np.isnan(e.u) for e in experiments), *scales)
 
     @cached_property
     def samples(self) -> int:

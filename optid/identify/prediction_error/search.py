@@ -36,7 +36,7 @@ from optid.structures.lifted_regression import lifted_problem, positions
 SEARCH = 5_000  # samples, from the middle of the record, on which starts are compared
 SUFFICIENT = 3  # starts of different methods that may suffice without a noise filter, see `descent.best_of`
 # radii tried to bring the poles of a start into the region of the constraints
-PULLS = (1.0, 0.999, 0.99, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.3, 0.1, 0.0)
+PULLS = (0.999, 0.99, 0.98, 0.95, 0.9, 0.85, 0.8, 0.7, 0.6, 0.5, 0.3, 0.1, 0.0)
 ENTRIES = 3  # different optima from which the constrained iteration may start
 PASSES = 8  # passes of Steiglitz-McBride and of the instruments
 WIDE = 6  # functions, over all inputs, up to which the subspace start is used
@@ -106,9 +106,9 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
     at, ends = criterion.unknowns.slices["a"], []
     for one in found[:ENTRIES]:
         x = fit.signed(one.x)
-        moved = [partial(contained, limit=radius) for radius in PULLS]
-        moved[0] = with_integrator if criterion.integrates else np.array
-        for move in moved:
+        first = with_integrator if criterion.integrates and criterion.unknowns.layout.na else np.array
+        moves: list[Callable[[Array], Array]] = [first, *(partial(contained, limit=radius) for radius in PULLS)]
+        for move in moves:
             pulled = move(x[at])
             program = fit.pose(np.concatenate([pulled, x[at.stop :]]), one.at, 0.0)
             a = program.variables.get("a")

@@ -132,10 +132,11 @@ def complete(evidence: Evidence, errors: StateErrors, unit: float) -> Evidence:
         unknowns.criterion == "simulation" and not unknowns.expansion.feedback)
     if linear and not unknowns.latent and not np.any(weight - np.diag(np.diag(weight))):
         records = errors.data.records
-        order = unknowns.memory  # a constant of an experiment is a state
+        order, said = unknowns.memory, "the errors are not convex in the poles, several starts are compared"
+        if unknowns.levels:
+            said += "; in what follows the constants of an experiment count as states"
         bound = simulation_bound(records, unknowns.expansion, order, np.sqrt(np.diag(weight)), evidence.objective,
-                                 2 * (order // unknowns.l + 2), "the errors are not convex in the poles, several "
-                                 "starts are compared")
+                                 2 * (order // unknowns.l + 2), said)
         reason = bound.reason if evidence.status is Status.LOCAL else reason
     figures = {**evidence.figures, "weight of the outputs": weight / unit, **remarks}
     if unknowns.expansion.feedback and unknowns.criterion != "simulation" and _diverges(model, errors.data):

@@ -19,6 +19,7 @@ from optid.models.gauges import gauge_factor
 from optid.models.layout import Layout
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.statistics.blocks import check_lengths
+from optid.statistics.experiments import collect_by_experiment
 from optid.statistics.linearised import Linearised, Method
 from optid.statistics.regression import ROWS_PER_COLUMN, accumulate, collect
 from optid.statistics.sensitivities import TransferPredictor
@@ -143,7 +144,7 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
     units = own_units(data, [isinstance(one, Linear) for one in bases], bool(constants))
     record, layout = in_units(data, units), replace(layout, bases=tuple(inner_bases(bases, units)))
     if states:
-        _check_inputs(record, layout)
+        _check_inputs(record, layout, constants == "each")
     unknowns = TransferUnknowns(layout, record.n_experiments, (gauge is not None,) * layout.m, constants is True,
                                 check_integer(nc, "nc", 0), nd, constants == "each")
     if states:
@@ -152,13 +153,16 @@ def transfer_errors(data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, 
                           None if shifts is None else shifts / units.y_scale[0])
 
 
-def _check_inputs(data: Data, layout: Layout) -> None:
-    """Refuse a basis function without energy, and dependent columns of the expanded inputs, by name."""
+def _check_inputs(data: Data, layout: Layout, levels: bool) -> None:
+    """Refuse a basis function without energy, and dependent columns of the expanded inputs, by name.
+
+    With levels columns are also dependent that are constant within every experiment.
+    """
     outputs = [e.u[:, :1] for e in data.experiments]  # any without gaps
     complete = Data([e.u for e in data.experiments], outputs, data.dt, list(data.inputs), list(data.outputs))
     if not all(isinstance(basis, Linear) for basis in layout.bases):
         accumulate(complete, replace(layout, na=0, nb=(1,) * layout.m, nk=(0,) * layout.m)).check()
     columns = replace(layout, na=0)
     rows = sum(e.n_samples - layout.first_row for e in data.experiments)
-    if layout.m > 1 and rows >= ROWS_PER_COLUMN * columns.n_columns:
-        _ = collect(complete, columns).root
+    if (layout.m > 1 or levels) and rows >= ROWS_PER_COLUMN * columns.n_columns:
+        _ = (collect_by_experiment(complete, columns)[0] if levels else collect(complete, columns)).root

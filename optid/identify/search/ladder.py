@@ -5,22 +5,25 @@ orders only as long as the fit improves. Later rungs start from the best structu
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from optid.data.record import Data
+from optid.errors import OptidError
 from optid.identify.blocks import Blocks
 from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.lag_sums import LagSums, linear, scan
+from optid.identify.levels import LevelEvidence, level_evidence
 from optid.identify.search.trial import Candidate, Trial
 
 Rung = Generator[list[Candidate], list[Trial], None]
 
 LINEAR, INPUTS, FEEDBACK, LATENT = KINDS = ("linear", "input functions", "feedback", "latent signals")
 """Classes of models, each richer than those before."""
+ONE_LEVEL = ("hammerstein_ss.sid", "lfr.exact")  # formulations with one constant for all experiments
 PATIENCE = 2  # successive orders without improvement after which a rung ends
 LARGEST = 10  # largest number of states
 FEW_LEVELS = 5  # levels of an input up to which a static function is not identifiable between them
@@ -44,6 +47,7 @@ class Ladder:
         told: what it can tell.
         delays: combinations of delays of the inputs: none, and those found.
         regressions: orders (na, nb, nk) of the best autoregressions.
+        levels: the evidence for levels of the experiments; None for one experiment.
         trials: all trials so far, by key.
     """
 
@@ -52,6 +56,7 @@ class Ladder:
     delays: list[tuple[int, ...]]
     regressions: list[tuple[int, int, tuple[int, ...]]]
     trials: dict[Any, Trial]
+    levels: LevelEvidence | None = None
 
     @classmethod
     def of(cls, blocks: Blocks) -> "Ladder":
@@ -62,7 +67,13 @@ class Ladder:
         if told.processes:
             delays = list(dict.fromkeys([*delays, told.lags]))
         best = [one for delay in delays for one in scan(sums, [delay])[:1]]
-        return cls(data, told, delays, [(one.na, one.nb, one.nk) for one in best], {})
+        return cls(data, told, delays, [(one.na, one.nb, one.nk) for one in best], {}, _levels_of(data, delays[-1]))
+
+    def levelled(self, candidate: Candidate) -> Candidate:
+        """Return a candidate with a level for every experiment, where the record has them and the method knows them."""
+        if self.levels is None or self.levels.offset is True or candidate.formulation in ONE_LEVEL:
+            return candidate
+        return replace(candidate, arguments={**candidate.arguments, "offset": "each"})
 
     @property
     def few_moves(self) -> bool:
@@ -275,6 +286,15 @@ RUNGS: dict[str, Callable[[Ladder], Rung]] = {
 def structure(kind: str, formulation: str, **arguments: Any) -> Candidate:
     """Return a candidate of a class."""
     return Candidate(kind, formulation, arguments)
+
+
+def _levels_of(data: Data, nk: tuple[int, ...]) -> LevelEvidence | None:
+    if data.n_experiments == 1:
+        return None
+    try:
+        return level_evidence(data, nk=list(nk))
+    except OptidError:  # too short for a regression: one level then
+        return None
 
 
 def _levels(data: Data, c: int) -> int:

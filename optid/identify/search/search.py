@@ -19,7 +19,7 @@ from optid.identify.fitting import Fit, fit
 from optid.identify.search.ladder import CLEAR, EQUAL, FEEDBACK, KINDS, LATENT, LINEAR, RUNGS, Ladder, few_levels
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, spared, tried
-from optid.identify.verdict import Verdict, verdict
+from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
 from optid.progress import Clock
 from optid.registry import Rendered, named_constraint
@@ -62,7 +62,7 @@ class Identification(Rendered):
     def verdict(self) -> Verdict:
         """The quality of the model on the record, by cross-validation."""
         assert isinstance(self.fit.data, Data)
-        return verdict(self.model, self.fit.data, self.chosen.by_block.tolist(), self.chosen.score)
+        return self.fit.judged(self.chosen.by_block.tolist(), self.chosen.score)
 
 
 def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, blocks: int = 4,
@@ -136,6 +136,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         raise _nothing(list(ladder.trials.values()))
     found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
     why = reasons(ladder, best)
+    if ladder.levels is not None:
+        why.append(str(ladder.levels))
     why += dict.fromkeys(limits[kind] for kind in classes if kind in limits)
     if alone:
         why.append(f"the search worked in one process: {alone}")
@@ -180,6 +182,7 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: 
         if batch is None:
             del rungs[kind]
             continue
+        batch = [ladder.levelled(candidate) for candidate in batch]
         clock, rival = time.monotonic(), ladder.rival(kind)
         fresh = [c for c in {c.key: c for c in batch}.values() if c.key not in ladder.trials]
         last = end if rival else np.inf  # the first are waited for

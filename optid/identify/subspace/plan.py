@@ -93,8 +93,8 @@ def planned(name: str, data: Data, *, basis: Any, feedback_basis: Any = None, of
     if not isinstance(data, Data):
         raise DataError(f"{name} needs records in memory (optid.Data), not a {type(data).__name__}.")
     if check_offset(offset, data) == "each":
-        raise StructureError(f"{name} has one constant for all experiments: use 'ss.exact' or 'hammerstein_ss.exact' with "
-                             "offset='each'")
+        raise StructureError(f"{name} has one constant for all experiments: use 'ss.exact' or 'hammerstein_ss.exact' "
+                             "with offset='each'")
     inputs, outputs = fitted_bases(data, basis), feedback_bases(data, feedback_basis)
     units = own_units(data, [isinstance(one, Linear) for one in inputs], bool(offset))
     if any(isinstance(one, UserFunctions) for one in outputs):  # known in the units of the record only

@@ -26,6 +26,10 @@ class Correlation:
         band: (L,) half width of the 99 % band of an ideal model.
         p_value: of the hypothesis that all correlations from lag 1 (auto) or 0 (cross) on are zero; NaN where a signal
             is constant. On the record that the model was estimated from the test is optimistic.
+        first: lag from which on correlations are tested.
+        slight: correlations up to this size are negligible, however significant.
+        claimed: whether the model says that there is no correlation: without a noise model it says nothing about
+            whiteness.
     """
 
     output: str
@@ -34,11 +38,27 @@ class Correlation:
     values: Array
     band: Array
     p_value: float
+    first: int = 1
+    slight: float = 0.0
+    claimed: bool = True
+
+    @property
+    def significant(self) -> bool:
+        """Whether the hypothesis is rejected at the 1 % level, by more than what is negligible."""
+        tested = self.values[self.lags >= self.first]
+        return bool(self.p_value < LEVEL) and float(np.nanmax(np.abs(tested), initial=0.0)) > self.slight
 
     @property
     def passed(self) -> bool:
-        """Whether the hypothesis is kept at the 1 % level."""
-        return not self.p_value < LEVEL
+        """Whether nothing speaks against what the model says."""
+        return not (self.claimed and self.significant)
+
+    @property
+    def outcome(self) -> str:
+        """The outcome in a word."""
+        if np.isnan(self.p_value):
+            return "not available"
+        return "FAIL" if not self.passed else "coloured" if self.significant else "PASS"
 
     @property
     def outside(self) -> int:
@@ -67,9 +87,9 @@ def autocorrelation(residuals: Sequence[Array], output: str, lags: int = 25, *, 
                        _portmanteau(values[1 - first :], counts[1 - first :] * inflation))
 
 
-def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], output: str, channel: str, lags: int = 25
-                      ) -> Correlation:
-    """Test whether the residuals depend on the input at lags 0 .. lags; negative lags show feedback.
+def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], output: str, channel: str, lags: int = 25,
+                      first: int = 0) -> Correlation:
+    """Test whether the residuals depend on the input at lags `first` .. lags; negative lags show feedback.
 
     The statistic takes the autocorrelation of the input into account. Arguments as in `autocorrelation`, with the
     samples (N,) per experiment and the name of an input.
@@ -77,15 +97,15 @@ def cross_correlation(residuals: Sequence[Array], inputs: Sequence[Array], outpu
     e, u = _standardised(residuals), _standardised(inputs)
     around = np.arange(-lags, lags + 1)
     values, counts = lagged_products(e, u, around)
-    own, _ = lagged_products(u, u, range(lags + 1))
+    own, _ = lagged_products(u, u, range(lags + 1 - first))
     p_value = float("nan")
     if np.isfinite(values).all() and np.isfinite(own).all():
         scale, axes = np.linalg.eigh(toeplitz(own))
         # a slowly varying input excites few directions only: the others carry no evidence
         informed = scale > 1e-3 * scale[-1]
-        score = axes.T[informed] @ (np.sqrt(counts[lags:]) * values[lags:])
+        score = axes.T[informed] @ (np.sqrt(counts[lags + first :]) * values[lags + first :])
         p_value = _portmanteau(score, 1 / scale[informed])
-    return Correlation(output, channel, around, values, _band(counts), p_value)
+    return Correlation(output, channel, around, values, _band(counts), p_value, first)
 
 
 def _portmanteau(values: Array, weights: Array) -> float:
