@@ -186,7 +186,7 @@ def test_notes_are_warnings():
         validate(siso(a=[-1.1]), data)
     with pytest.warns(DataWarning, match="not consistent with a Hammerstein system"):
         validate(siso(Triangular(5), a=[-0.5], dt=1.0), two_paths())
-    with pytest.warns(DataWarning, match="No structure test"):
+    with pytest.warns(DataWarning, match="Structure of the record: not tested"):
         short = validate(model, Data(data.u[:15], data.y[:15], dt=0.1))
     assert short.structure is None and short.autocorrelations["y"].lags[-1] == 3
 

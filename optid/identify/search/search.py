@@ -3,8 +3,8 @@
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -58,11 +58,10 @@ class Identification(Rendered):
         """The model, in raw units."""
         return self.fit.model
 
-    @cached_property
+    @property
     def verdict(self) -> Verdict:
-        """The quality of the model on the record, by cross-validation."""
-        assert isinstance(self.fit.data, Data)
-        return self.fit.judged(self.chosen.by_block.tolist(), self.chosen.score)
+        """The quality of the model on the record, by cross-validation; that of the fit."""
+        return self.fit.verdict
 
 
 def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, blocks: int = 4,
@@ -135,6 +134,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     if chosen is None:
         raise _nothing(list(ladder.trials.values()))
     found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
+    found = replace(found, cross_validated=(tuple(chosen.by_block.tolist()), chosen.score))
     why = reasons(ladder, best)
     if ladder.levels is not None:
         why.append(str(ladder.levels))

@@ -233,16 +233,24 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
     beyond = has_feedback(model) or bool(getattr(model, "latent", ()))
     if not beyond and not static_functions(model):
         return None
-    runs = simulated_or_nan(model, data) if beyond else None
-    if runs is not None and not all(np.isfinite(y).all() for y in runs):
-        return None
     notes = [] if notes is None else notes
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
-            found = structure_test(data, runs)
-    except RankError as error:
-        notes.append(f"No structure test: this record does not determine a free model. {error}")
+    known = informativity(data)
+    runs = simulated_or_nan(model, data) if beyond else None
+    reason = known.reason or known.untested
+    if known.loop.word != "open":
+        reason = (f"feedback: output {known.loop.output!r} acts on an input, so that functions of the inputs depend on "
+                  "the noise")
+    elif runs is not None and not all(np.isfinite(y).all() for y in runs):
+        reason = "the simulation of the model is not available for every sample"
+    if not reason:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DataWarning)
+                found = structure_test(data, runs, known.processes)
+        except RankError as error:
+            reason = str(error)
+    if reason:
+        notes.append(f"Structure of the record: not tested: {reason}.")
         return None
     if not found.passed:
         notes.append(

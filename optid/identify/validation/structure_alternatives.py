@@ -1,94 +1,117 @@
-"""Alternatives to the Hammerstein structure: groups of columns, functions of the inputs and of time alone.
+"""The alternatives to the structure of a model: a table of names and of functions that make their columns.
 
-Where the hypothesis holds, they are independent of the noise.
+Every column is a function of inputs, of the predicted output and of time alone: where the hypothesis holds, it is
+independent of the noise. Sources: higher-order correlations as structure tests (Billings and Voon 1986); different
+nonlinearities at different lags as a matrix of coefficients, lags times functions, of rank above one (Bai 1998).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import combinations_with_replacement
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.identify.validation.structure_design import Design, Family, convolved, orthonormal_filters
+from optid.identify.validation.structure_design import Poles, denominators, filtered
+from optid.identify.validation.structure_hypothesis import Hypothesis
 from optid.models.recursions import lfilter
 
+PRODUCTS = "products of inputs at different lags, as in a Wiener system"
+RANK = "different nonlinearities at different lags"
+FUNCTIONS = "functions of the inputs explain a part of the residuals"
 COURSES = 4  # degree of the polynomials in time that a gain may follow
-# lags and poles by which the filters are completed; experiments up to which each has decays of its own
-LAGS, SLOW, FEW_RECORDS = 16, (0.8, 0.9, 0.95, 0.98, 0.99), 3
+FEW = 10  # experiments up to which each may have a gain of its own
+FAST = 0.05  # modulus of a pole that is no more than a delay
 MOST = 6  # groups of poles, over all inputs, that may come before a second nonlinearity, at most
+Columns = Callable[[Hypothesis], list[Array]]
 
 
-def alternatives(design: Design, predicted: list[Array]) -> dict[str, list[Array]]:
-    """Return groups of columns by their meaning, one array (rows, k) per experiment.
-
-    The predicted outputs are those of the best Hammerstein model, from sample L - 1 of every experiment on.
-    """
-    reach = len(design.filters) - 1
-    level, spread = _moments(predicted)
-    outputs = [(y - level) / spread for y in predicted]
-    after = orthonormal_filters(design.poles, 1, design.delay, reach + 1, squared=False)
-    after = np.pad(after, ((0, max(reach + 1 - len(after), 0)), (0, 0)))[: reach + 1]
-    before = [np.concatenate([np.zeros(reach), y]) for y in outputs]
-    ends = np.cumsum([len(y) for y in outputs])
-    times = [2 * np.arange(end - len(y), end) / ends[-1] - 1 for end, y in zip(ends, outputs)]  # since the record began
-    found = {
-        "functions of the output": [_curved(y) for y in outputs],
-        "a gain that changes with time": [np.polynomial.legendre.legvander(t, COURSES)[:, 1:] * y[:, None]
-                                          for t, y in zip(times, outputs)],
-        "functions of the output that are fed back": [_through(_curved(y), after) for y in before],
+def alternatives(hypothesis: Hypothesis) -> dict[str, Columns]:
+    """Return functions by name that make the columns of an alternative, (N, k) per experiment."""
+    own = {PRODUCTS: products, RANK: additive} if hypothesis.carriers else {FUNCTIONS: additive}
+    return {
+        **own,
+        "functions of the output": bent_output,
+        "a gain that changes with time": gain_courses,
+        "functions of the output that are fed back": fed_back,
+        **dict(_behind_poles(hypothesis)),
     }
-    for c, denominator, words in _parts(design):
-        signals = [lfilter([1.0], denominator, (u[:, c] - design.families[c].centre) / design.families[c].spread)
-                   for u in design.u]
-        middle, size = _moments(signals)
-        found[f"functions of {design.data.inputs[c]!r} behind {words}"] = [
-            _through(_curved((x - middle) / size), after) for x in signals]
-    return found
 
 
-def wider(design: Design, functions: Sequence[tuple[Family, Array]]) -> list[Array]:
-    """Return every f, (family, coefficients), at single lags and through slow poles, and decays of initial states.
-
-    The filters may miss these parts of a Hammerstein system. There is one array (rows, k) per experiment.
-    """
-    reach = len(design.filters) - 1
-    room = design.data.n_samples // (20 * design.data.m)
-    lags, slow = min(LAGS, room // 2, reach), SLOW[max(len(SLOW) - room // 4, 0) :]
+def products(hypothesis: Hypothesis) -> list[Array]:
+    """Products of two of all and of three of the first three carriers, and further functions of the first two."""
     found = []
-    for u in design.u:
-        columns = []
-        for c, (family, part) in enumerate(functions):
-            v = family.values(u[:, c]) @ part
-            columns += [v[reach - lag : len(v) - lag] for lag in range(lags)]
-            columns += [lfilter([1.0], [1.0, -pole], v - v.mean())[reach:] for pole in slow]
-        if slow and len(design.u) <= FEW_RECORDS:
-            decays = np.asarray([pole ** np.arange(len(u) - reach) for pole in slow]).T
-            blocks = [decays if i == len(found) else 0 * decays for i in range(len(design.u))]
-            columns += list(np.hstack(blocks).T)
-        found.append(np.reshape(columns, (len(columns), len(u) - reach)).T)  # none of a short record
+    for x in _standardised(hypothesis.carriers):
+        bent = 2 * np.tanh(x / 2)
+        one, other = np.triu_indices(bent.shape[1])
+        cubes = [a * b * c for a, b, c in combinations_with_replacement(bent.T[:3], 3)]
+        found.append(np.column_stack([bent[:, one] * bent[:, other], *cubes, bent[:, 0] ** 4, bent[:, 0] ** 5,
+                                      np.abs(bent[:, :2])]))
     return found
 
 
-def _parts(design: Design) -> Iterator[tuple[int, Array, str]]:
-    """Yield input, denominator and name of the dynamics before a nonlinearity: each pole, and all together."""
-    poles = design.poles[design.poles.imag >= 0]
-    groups = [[p] if p.imag == 0 else [p, p.conjugate()] for p in poles[np.argsort(-np.abs(poles))]]
-    several = [list(design.poles)] if len(groups) > 1 else []
-    for group in (groups + several)[: max(MOST // design.data.m, 1)]:
-        for c in range(design.data.m):
-            yield c, np.real(np.poly(group)), f"poles at {np.round(np.abs(group[0]), 2):g}"
+def additive(hypothesis: Hypothesis) -> list[Array]:
+    """Functions of the inputs, each behind filters of its own."""
+    design = hypothesis.design
+    return [np.hstack([np.einsum("njp,pk->njk", bank[i], family.coarse).reshape(len(y), -1)
+                       for bank, family in zip(design.banks, design.families)]) for i, y in enumerate(design.output)]
 
 
-def _curved(x: Array) -> Array:
+def bent_output(hypothesis: Hypothesis) -> list[Array]:
+    """Functions of the output."""
+    return [_bent(y) for y in _standardised(hypothesis.predicted)]
+
+
+def gain_courses(hypothesis: Hypothesis) -> list[Array]:
+    """The output times polynomials in time, and times one for every experiment."""
+    outputs = _standardised(hypothesis.predicted)
+    longest, several = max(map(len, outputs)), 1 < len(outputs) <= FEW
+    found = []
+    for i, y in enumerate(outputs):
+        courses = [np.polynomial.legendre.legvander(2 * np.arange(len(y)) / longest - 1, COURSES)[:, 1:]]
+        courses += [np.tile(np.eye(len(outputs))[i], (len(y), 1))] * several
+        found.append(np.hstack(courses) * y[:, None])
+    return found
+
+
+def fed_back(hypothesis: Hypothesis) -> list[Array]:
+    """Functions of the output through the poles of the process, at least a sample late."""
+    poles = max(hypothesis.design.poles, key=len)
+    return [_through(_bent(y), poles, 1) for y in _standardised(hypothesis.predicted)]
+
+
+def _behind_poles(hypothesis: Hypothesis) -> Iterator[tuple[str, Columns]]:
+    """Yield the dynamics before a nonlinearity, each pole and all together, for every input."""
+    design = hypothesis.design
+    for c, poles in enumerate(design.poles):
+        factors = denominators(poles[np.abs(poles) > FAST])
+        whole = [np.asarray(np.real(np.poly(poles)))] if len(factors) > 1 else []
+        for a in (factors + whole)[: max(MOST // len(design.poles), 1)]:
+            size = f"{np.abs(np.roots(a)).max():.2g}"
+            word = f"functions of {design.data.inputs[c]!r} behind {'all poles' if a is whole else 'poles'} at {size}"
+            yield word, partial(behind, c=c, denominator=a)
+
+
+def behind(hypothesis: Hypothesis, c: int, denominator: Array) -> list[Array]:
+    """Functions of an input behind some poles, through all of them."""
+    design = hypothesis.design
+    signals = [lfilter([1.0], denominator, u[:, c] - u[0, c]) for u in design.inputs]
+    return [_through(_bent(x), design.poles[c], design.lags[c]) for x in _standardised(signals)]
+
+
+def _bent(x: Array) -> Array:
     """Square, cube and modulus of a standardised signal, which saturates, (N, 3)."""
     bent = 2 * np.tanh(x / 2)
     return np.column_stack([bent**2, bent**3, np.abs(bent)])
 
 
-def _through(values: Array, filters: Array) -> Array:
-    found = convolved(values, filters)
+def _through(values: Array, poles: Poles, lag: int) -> Array:
+    found = filtered(values - values[:1], poles, lag, pulses=2, twice=False)
     return found.reshape(len(found), -1)
 
 
-def _moments(signals: list[Array]) -> tuple[float, float]:
+def _standardised(signals: Sequence[Array]) -> list[Array]:
+    """Return signals, (N,) or (N, q) per experiment, with mean zero and variance one over all experiments."""
     whole = np.concatenate(signals)
-    return float(whole.mean()), float(max(whole.std(), 1e-300))
+    middle, spread = whole.mean(axis=0), np.maximum(whole.std(axis=0), 1e-300)
+    return [(x - middle) / spread for x in signals]

@@ -1,62 +1,62 @@
-"""The columns of the structure test: functions of inputs through a few filters, stretch by stretch of a record."""
+"""The columns of the structure test: functions of the inputs, through filters with the poles of a process."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import irfft, next_fast_len, rfft
-from scipy.special import fdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.data.stretches import interpolated
 from optid.errors import RankError
-from optid.identify.order.ranks import rank_test
+from optid.identify.informativity.process import Process
+from optid.identify.informativity.signals import delayed, held
+from optid.identify.validation.score_tests import Regression
 from optid.models.recursions import lfilter
-from optid.statistics.expansion import Expansion
-from optid.statistics.factors import ROUNDING
-from optid.statistics.hankel import HankelStatistics, hankel_statistics
-from optid.statistics.rq import rq
 
-BLOCK_ROWS, FEWEST = 10, 3  # future and past block rows; the least where the record is short
-EXPLAINED = ROUNDING["gram"] ** 2  # share of an energy below which the rest of a regression is rounding
-LATEST = 30  # longest delay, in samples
-LEVEL = 0.01
-SPARE = 1  # poles beyond the order that noisy data show, which may still matter
-FEW = 3  # functions per input with which the dynamics are estimated
-RADIUS, SLOWEST = 0.98, 20  # poles beyond 0.98 or 1 - 20 / N are contracted: their responses must end within the record
-SETTLED = 1e-3  # share of its largest value below which an impulse response has ended
-DEGREE, HATS, SAMPLES = 3, 5, 250  # powers and hats (at most) of an input in every filter; samples per hat and input
-FINE_DEGREE, FINE_HATS, FINE_SAMPLES = 7, 20, 40  # the same for the leading filter
-EXTRA = 3  # pulses beyond the order of the filters
-LONGEST = 600  # samples after which the filters are cut, at most
-CHUNK = 16384
-PRESENT = 0.9  # share of the energy of the filters that must have passed after an interpolated input before rows count
+DEGREE, HATS, SAMPLES = 3, 5, 250  # coarse: powers and hats (at most) of an input; samples per hat and input
+FINE_DEGREE, SPLIT = 7, 4  # fine: powers; parts of every interval between the nodes of the coarse hats
+PULSES = 8  # lags of an input beside its poles
+LONGEST = 5  # time constant of a filter, at most, in lengths of the longest experiment
+MOVE, MOVES = 0.1, 4  # share of its range that an input covers in a move; moves that can be compared
+PRESENT = 0.9  # share of the energy of the filters that must have passed after a missing input before rows count
+EARLY, DECAYS = 4, 12  # an experiment gives up a 4th of its rows, at most, for its past, and a 12th for its decays
+Poles = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Functions of one input: powers of the standardised input, and a hat for each inner node of (k + 2,) quantiles."""
+    """Functions of one input: powers of the standardised input, and a hat for each inner node.
+
+    Attributes:
+        nodes: (k + 2,) quantiles, or all levels where they are few: the family then contains every function.
+        coarse: (size, p) combinations of them that are fewer powers and hats.
+    """
 
     centre: float
     spread: float
     degree: int
     nodes: Array
+    coarse: Array
 
     @classmethod
-    def of(cls, data: Data, c: int, degree: int, hats: int) -> "Family":
+    def of(cls, data: Data, c: int) -> "Family":
         """Return the functions for input c, fewer than its levels; a constant input is a `RankError`."""
         samples = np.concatenate([e.u[:, c] for e in data.experiments])
         samples = samples[~np.isnan(samples)]
-        levels = np.unique(samples).size
-        if levels < 2:
-            raise RankError(f"Input {data.inputs[c]!r} is constant.")
-        degree = min(degree, levels - 1)
-        room = max(0, min(hats, levels - 1 - degree))
-        nodes = np.unique(np.quantile(samples, np.linspace(0, 1, room + 2))) if room else np.zeros(0)
-        return cls(float(samples.mean()), float(samples.std()), degree, nodes)
+        levels = np.unique(samples)
+        if levels.size < 2:
+            raise RankError(f"input {data.inputs[c]!r} is constant")
+        hats = int(np.clip(data.n_samples // data.m // SAMPLES, 0, HATS))
+        nodes = np.unique(np.quantile(samples, np.linspace(0, 1, SPLIT * (hats + 1) + 1)))
+        degree, coarse_nodes, grid = FINE_DEGREE, nodes[::SPLIT], np.quantile(samples, np.linspace(0, 1, 200))
+        if levels.size <= degree + nodes.size - 1:
+            degree, nodes, coarse_nodes, grid = 1, levels, levels[:0], levels
+        found = cls(float(samples.mean()), float(samples.std()), degree, nodes, np.zeros((0, 0)))
+        few = cls(found.centre, found.spread, min(DEGREE, levels.size - 1), coarse_nodes, found.coarse)
+        whole = np.column_stack([np.ones(grid.size), found.values(grid)])
+        coarse = np.linalg.lstsq(whole, few.values(grid), rcond=1e-12)[0][1:]
+        return cls(found.centre, found.spread, degree, nodes, coarse)
 
     @property
     def size(self) -> int:
@@ -67,178 +67,122 @@ class Family:
         """Evaluate the functions of complete samples, (N, size)."""
         x = (u - self.centre) / self.spread
         powers = np.asarray(np.polynomial.hermite_e.hermevander(x, self.degree)[:, 1:], dtype=float)
-        if self.nodes.size < 3:
-            return powers
         hats = [np.interp(u, self.nodes, one) for one in np.eye(self.nodes.size)[1:-1]]
         return np.column_stack([powers, *hats])
 
 
-def delay_of(data: Data) -> int:
-    """Estimate the delay of a record: one less than the first lag with significant coefficients of three functions.
-
-    Zero where the record is too short. A delay too short costs a few filters, one too long is wrong: the level is high.
-    """
-    records, signals = _signals(data, 0)
-    p, shortest = signals.p, min(e.n_samples for e in data.experiments)
-    lags = min(LATEST + 10, data.n_samples // (6 * p), shortest // 3)
-    if lags < 3:
-        return 0
-    statistics = _statistics(records, signals, lags)
-    past = np.concatenate([[0], *(statistics.at(signals.eta, [lags - 1 - lag]) for lag in range(lags))])
-    spare = statistics.windows - past.size
-    if spare < past.size:
-        return 0
-    now = statistics.at(signals.y, [lags - 1])
-    gram = statistics.gram
-    inverse = np.linalg.pinv(gram[np.ix_(past, past)], hermitian=True)
-    theta = inverse @ gram[np.ix_(past, now)]
-    whole = np.diag(gram)[now]
-    rest = np.maximum(whole - np.einsum("ij,ij->j", theta, gram[np.ix_(past, now)]), EXPLAINED * whole + 1e-300)
-    for lag in range(lags):
-        block = slice(1 + lag * p, 1 + (lag + 1) * p)
-        weight = np.linalg.pinv(inverse[block, block], hermitian=True)
-        energy = np.einsum("io,ij,jo->o", theta[block], weight, theta[block])
-        if (fdtrc(p, spare, (energy / p) / (rest / spare)) < LEVEL).any():
-            return min(max(lag - 1, 0), LATEST)
-    return 0
-
-
-def poles_of(data: Data, delay: int = 0) -> NDArray[np.complex128]:
-    """Estimate the poles (n,) between delayed inputs and outputs by a subspace method with inputs as instruments.
-
-    The inputs enter through three functions each; the noise may have any colour; the order is that of `rank_test`. The
-    poles are well within the unit circle, none for a static record. A record that is too short, or does not excite the
-    functions, is a `RankError`.
-    """
-    records, signals = _signals(data, delay)
-    alpha = int(np.clip(data.n_samples // (6 * len(signals.names)), FEWEST, BLOCK_ROWS))
-    statistics, largest = _statistics(records, signals, 3 * alpha), (alpha - 1) * data.l
-    z, phi, y = signals.positions(statistics.at, "inputs", alpha)
-    ranks = rank_test(statistics, z, phi, y, rows=2 * alpha, largest=largest)
-    if ranks.order == 0:
-        return np.zeros(0, dtype=complex)
-    order = ranks.order if ranks.exact else min(ranks.order + SPARE, largest)
-    observability = rq(statistics, z, phi, y).decomposition[0][:, :order]
-    a = np.linalg.lstsq(observability[: -data.l], observability[data.l :])[0]
-    poles = np.asarray(np.linalg.eigvals(a), dtype=complex)
-    radius = min(RADIUS, 1 - SLOWEST / data.n_samples)
-    return poles * np.minimum(1.0, radius / np.maximum(np.abs(poles), 1e-300))
-
-
-def orthonormal_filters(poles: NDArray[np.complex128], extra: int, delay: int, longest: int, squared: bool = True
-                        ) -> Array:
-    """Return impulse responses (T, J) that span q^-(delay + i) / A(q)^2, i = 0 ... 2n + extra, A with the given poles.
-
-    With A^2 in the denominator (A where it is not squared) the span contains B / A' for poles near the given ones, up
-    to the square of their error. The responses are cut after `longest` samples at the latest.
-    """
-    every = np.concatenate([poles, poles]) if squared else poles
-    a = np.asarray(np.real(np.poly(every)), dtype=float) if len(poles) else np.ones(1)
-    count = a.size + extra
-    response = lfilter([1.0], a, np.eye(1, max(longest, count + 1))[0])
-    large = np.flatnonzero(np.abs(response) > SETTLED * np.abs(response).max())
-    length = min(response.size, int(large[-1]) + 1 + count)
-    shifted = np.column_stack([np.concatenate([np.zeros(i), response[: length - i]]) for i in range(count)])
-    orthonormal = np.asarray(np.linalg.qr(shifted)[0], dtype=float)
-    return np.concatenate([np.zeros((delay, count)), orthonormal])
-
-
-def convolved(values: Array, filters: Array) -> Array:
-    """Filter every column of values (T, P) with every response of filters (L, J) where it fits: (T - L + 1, J, P)."""
-    size = next_fast_len(len(values), real=True)
-    spectra = np.asarray(rfft(values, size, axis=0))
-    found = np.empty((len(values) - len(filters) + 1, filters.shape[1], values.shape[1]))
-    for j, response in enumerate(filters.T):
-        whole = np.asarray(irfft(spectra * np.asarray(rfft(response, size))[:, None], size, axis=0))
-        found[:, j] = whole[len(filters) - 1 : len(values)]
-    return found
-
-
-def _signals(data: Data, delay: int) -> tuple[Sequence[Array], Expansion]:
-    """Raw channels [u | y], the outputs that many samples earlier, and their expansion in a few functions."""
-    # windows without a gap would be few; interpolation does not move the poles
-    records = [interpolated(np.hstack([e.u[: e.n_samples - delay], e.y[delay:]])) for e in data.experiments]
-    families: Any = tuple(Family.of(data, c, FEW, 0) for c in range(data.m))
-    return records, Expansion(families, (), data.inputs, data.outputs)
-
-
-def _statistics(records: Sequence[Array], signals: Expansion, rows: int) -> HankelStatistics:
-    long = [record for record in records if len(record) >= rows]
-    return hankel_statistics(long or records, rows, signals, names=signals.names, centre="mean")
-
-
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The signals and filters of the columns of all regressions."""
+    """One output, and the functions of all inputs through the filters of its process.
+
+    Attributes:
+        data: the record.
+        inputs: (N, m) per experiment, complete.
+        output: (N,) per experiment, centred and over its spread, zero where missing.
+        centre, spread: of the output.
+        families: functions by input.
+        poles, lags: of the filters, by input.
+        banks: by input, filters of its functions, (N, J, P) per experiment.
+        regression: rows that count, level and decays.
+    """
 
     data: Data
-    u: tuple[Array, ...]  # inputs of the record, missing samples interpolated, one array per experiment
-    families: tuple[Family, ...]  # functions of each input
-    fine: tuple[Family, ...]  # more of them
-    filters: Array  # (L, J) orthonormal impulse responses, of these poles, which begin after the delay
-    heavy: int  # samples after a missing input until most of its effect has passed
-    poles: NDArray[np.complex128]
-    delay: int
-    kept: tuple[int, ...]  # experiments of the given record that are long enough, those of `data`
+    inputs: list[Array]
+    output: Sequence[Array]
+    centre: float
+    spread: float
+    families: tuple[Family, ...]
+    poles: tuple[Poles, ...]
+    lags: tuple[int, ...]
+    banks: list[list[Array]]
+    regression: Regression
 
     @classmethod
-    def of(cls, data: Data) -> "Design":
-        """Estimate delay and poles, and place the functions; a record without a long experiment is a `RankError`."""
-        delay = delay_of(data)
-        longest = int(np.clip(data.n_samples // 5, 20, LONGEST))
-        poles = poles_of(data, delay)
-        filters = orthonormal_filters(poles, EXTRA, delay, longest)
-        kept = tuple(i for i, e in enumerate(data.experiments) if e.n_samples >= len(filters))
-        if not kept:
-            raise RankError(f"No experiment has {len(filters)} samples, which the responses last: use longer ones.")
-        data = data.select(experiments=kept)
-        energy = np.cumsum(np.sum(filters**2, axis=1))
-        each = data.n_samples // data.m
-        hats, fine = int(np.clip(each // SAMPLES, 0, HATS)), int(np.clip(each // FINE_SAMPLES, 2, FINE_HATS))
-        return cls(
-            data, tuple(interpolated(e.u) for e in data.experiments),
-            families=tuple(Family.of(data, c, DEGREE, hats) for c in range(data.m)),
-            fine=tuple(Family.of(data, c, FINE_DEGREE, fine) for c in range(data.m)),
-            filters=filters, heavy=int(np.searchsorted(energy, PRESENT * energy[-1])) + 1, poles=poles,
-            delay=delay, kept=kept)
+    def of(cls, data: Data, o: int, process: Process) -> "Design":
+        """Lay out the columns for output o; a record that moves too little for them is a `RankError`."""
+        inputs = [held(e.u) for e in data.experiments]
+        families = tuple(Family.of(data, c) for c in range(data.m))
+        _refuse_still_inputs(data, inputs)
+        measured = [e.y[:, o] for e in data.experiments]
+        whole = np.concatenate(measured)
+        centre, spread = float(np.nanmean(whole)), float(np.nanstd(whole)) or 1.0
+        longest = max(e.n_samples for e in data.experiments)
+        poles = tuple(_within(r.poles, longest) for r in process.responses)
+        lags = tuple(max(r.nk - 1, 0) for r in process.responses)  # one too short costs a column, one too long is wrong
+        banks = [[filtered(f.values(u[:, c]) - f.values(u[:1, c]), p, lag) for u in inputs]
+                 for c, (f, p, lag) in enumerate(zip(families, poles, lags))]
+        decays = [filtered(np.eye(longest, 1), p, 0, pulses=0)[:, :, 0] for p in poles]
+        # until then an output answers to inputs from before its experiment, and afterwards it decays
+        past = max(lag + bank[0].shape[1] for lag, bank in zip(lags, banks))
+        present, nuisance = [], []
+        for e, y in zip(data.experiments, measured):
+            first = min(past, e.n_samples // EARLY)
+            here = ~np.isnan(y) & (np.arange(len(y)) >= first)
+            for c, (response, lag) in enumerate(zip(decays, lags)):
+                here &= ~_touched(np.isnan(e.u[:, c]), response, lag + PULSES)
+            columns = np.hstack(decays)[: len(y) - first, : max(len(y) // DECAYS, 1)]
+            present.append(here)
+            nuisance.append(np.column_stack([np.ones(len(y)), np.pad(columns, ((first, 0), (0, 0)))]))
+        output = [np.nan_to_num((y - centre) / spread) for y in measured]
+        return cls(data, inputs, output, centre, spread, families, poles, lags, banks,
+                   Regression(tuple(present), tuple(nuisance), np.ones(1)))
 
-    @property
-    def blocks(self) -> tuple[tuple[int, int], ...]:
-        """Functions and filters by input."""
-        return tuple((family.size, self.filters.shape[1]) for family in self.families)
 
-    @property
-    def cut(self) -> float:
-        """Share of the energy of the slowest response that lies behind the end of the filters."""
-        slowest = float(np.max(np.abs(self.poles), initial=0.0))
-        return slowest ** (2 * (len(self.filters) - self.delay))
+def filtered(x: Array, poles: Poles, lag: int, pulses: int = PULSES, twice: bool = True) -> Array:
+    """Filter the columns of x (N, P), zero before it begins, by J rational functions: (N, J, P).
 
-    def stretches(self, o: int, before: int = 0
-                  ) -> Iterator[tuple[int, slice, Array, Array, NDArray[np.bool_]]]:
-        """Yield experiment, rows, inputs (L - 1 + T, m), output o (T,) and which of its samples count, (T,).
+    They span q^-lag B(q) / A(q)^2 for the given poles, 1 / A unless `twice`, with `pulses` more coefficients in B than
+    poles in the denominator: B / A' for poles near the given ones is contained up to the square of their error. A chain
+    of all-pass filters keeps them apart (Takenaka 1925, Malmquist 1925).
+    """
+    stage = np.column_stack([delayed(column, lag) for column in x.T])
+    found = []
+    for _ in range(pulses):
+        found.append(stage)
+        stage = _later(stage)
+    for a in denominators(poles) * (2 if twice else 1):
+        state = lfilter([1.0], a, stage)
+        found += [state, _later(state)][: a.size - 1]
+        stage = lfilter(a[::-1], a, stage)
+    return np.stack(found, axis=1) if found else np.zeros((len(x), 0, x.shape[1]))
 
-        The first `before` rows of every stretch are those before it, once more. Rows count from sample L - 1.
-        """
-        reach = len(self.filters) - 1
-        for i, (e, u) in enumerate(zip(self.data.experiments, self.u)):
-            lost = np.isnan(e.u).any(axis=1).astype(float)
-            valid = (np.convolve(lost, np.ones(self.heavy))[: len(u)] < 0.5) & ~np.isnan(e.y[:, o])
-            for start in range(reach + before, len(u), CHUNK):
-                rows = slice(start - before, min(start + CHUNK, len(u)))
-                counted = slice(rows.start - reach, rows.stop - reach)
-                yield i, counted, u[rows.start - reach : rows.stop], e.y[rows, o], valid[rows]
 
-    def additive(self, u: Array) -> Array:
-        """Return [1, filters of functions], (T, 1 + sum P_c J); per input, filters outermost."""
-        rows = len(u) - len(self.filters) + 1
-        parts = [convolved(f.values(u[:, c]), self.filters).reshape(rows, -1) for c, f in enumerate(self.families)]
-        return np.hstack([np.ones((rows, 1)), *parts])
+def denominators(poles: Poles) -> list[Array]:
+    """Return the real factors [1, a1, ...] of the polynomial with these poles, the slowest first."""
+    upper = poles[poles.imag >= 0]
+    return [np.real(np.poly([p] if p.imag == 0 else [p, p.conjugate()])) for p in upper[np.argsort(-np.abs(upper))]]
 
-    def finer(self, u: Array, lines: list[Array]) -> Array:
-        """Return the fine functions of every input c through its response lines[c] (L,), (T, sum P_c)."""
-        return np.hstack([convolved(f.values(u[:, c]), lines[c][:, None])[:, 0] for c, f in enumerate(self.fine)])
 
-    def filtered(self, u: Array, responses: Array) -> Array:
-        """Filter the standardised inputs (T + L - 1, m) with responses (L, q, m) and add them up, (T, q)."""
-        return np.sum([convolved((u[:, [c]] - f.centre) / f.spread, responses[:, :, c])[:, :, 0]
-                       for c, f in enumerate(self.families)], axis=0)
+def _later(x: Array) -> Array:
+    return np.concatenate([np.zeros((1, x.shape[1])), x[:-1]])
+
+
+def _within(poles: Poles, samples: int) -> Poles:
+    """Contract poles on and beyond the unit circle, to time constants of a few lengths of the record."""
+    return poles * np.minimum(1.0, np.exp(-1 / (LONGEST * samples)) / np.maximum(np.abs(poles), 1e-300))
+
+
+def _touched(lost: NDArray[np.bool_], response: Array, lag: int) -> NDArray[np.bool_]:
+    """Mark the samples in which most of the effect of a missing input has not passed."""
+    energy = np.cumsum(np.sum(response**2, axis=1))
+    after = lag + int(np.searchsorted(energy, PRESENT * energy[-1]))
+    return np.convolve(lost, np.ones(after + 1))[: lost.size] > 0.5
+
+
+def _refuse_still_inputs(data: Data, inputs: Sequence[Array]) -> None:
+    """Raise `RankError` if all inputs move too few times to compare the responses to their moves."""
+    counts = [sum(_moves(u[:, c], MOVE * float(np.ptp(np.concatenate([v[:, c] for v in inputs])))) for u in inputs)
+              for c in range(data.m)]
+    if max(counts) < MOVES:
+        name, most = data.inputs[int(np.argmax(counts))], max(counts)
+        raise RankError(f"input {name!r} moves {'once' if most == 1 else f'{most} times'} by more than "
+                        f"{100 * MOVE:.0f} % of its range; at least {MOVES} moves are compared with each other")
+
+
+def _moves(u: Array, size: float) -> int:
+    """Count, up to `MOVES`, how often a signal has moved from where it was by more than a size."""
+    count, first = 0, 0
+    while count < MOVES and (away := np.flatnonzero(np.abs(u[first:] - u[first]) > size)).size:
+        first += int(away[0])
+        count += 1
+    return count
