@@ -42,7 +42,7 @@ def heater(seed: int = 0, n: int = 1500) -> Example:
     %, from 20 degC with the heater off. Settings are held for 25 samples of 5 s: off, full, then whole percents drawn
     uniformly. The sensor adds white noise of 0.3 degC and shows two decimals.
     """
-    rng = np.random.default_rng([seed, 3])
+    rng = np.random.default_rng([seed, 1])
     u = np.round(signals.uniform_levels(n, 0.0, 100.0, hold=25, seed=seed))
     u[:25], u[25:50] = 0.0, 100.0
     pole = np.exp(-5.0 / 120.0)
