@@ -8,7 +8,7 @@ import optid
 from optid.errors import DataError
 from optid.examples import example
 from optid.identify.informativity import informativity, processes
-from optid.identify.informativity.signals import Regression, Signals, respond
+from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, respond
 
 
 def staircase(rng, samples, held=25, levels=None):
@@ -134,7 +134,7 @@ def test_least_squares_with_missing_rows_agree_with_plain_ones():
     rng = np.random.default_rng(7)
     x, y = rng.normal(size=(80, 2)), rng.normal(size=80)
     there = rng.random(80) > 0.2
-    energy, theta, _, free = Regression((y,), (there,), np.ones(1)).solve([x], 0.9)
+    energy, theta, _, free = WhitenedRegression((y,), (there,), np.ones(1)).solve([x], 0.9)
     whole = np.column_stack([x, np.ones(80), 0.9 ** np.arange(80)])[there]
     plain, rest, *_ = np.linalg.lstsq(whole, y[there])
     assert theta == pytest.approx(plain[:2]) and energy == pytest.approx(rest[0]) and free == 2
@@ -253,4 +253,4 @@ def test_findings_of_a_record_lead_the_printed_fit_and_the_search():
 
 def test_signals_keep_the_first_of_many_experiments():
     data = optid.Data([u0[:50]] * 60, [y0[:50]] * 60)
-    assert len(Signals.of(data).y) == 40
+    assert len(RecordSignals.of(data).y) == 40

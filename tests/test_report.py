@@ -61,8 +61,8 @@ def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):
         assert words in text
     sections = {value for tag, name, value in page.attributes if tag == "section" and name == "id"}
     assert sections == {
-        "trust", "dynamics", "optimum", "model", "figures", "constraints", "certificate", "validation", "data", "solver",
-        "reproduce",
+        "trust", "dynamics", "optimum", "model", "figures", "constraints", "certificate", "validation", "data",
+        "solver", "reproduce",
     }
     charts = json.loads(re.search(r'id="charts-data">(.*?)</script>', pages["thruster"], re.DOTALL)[1])
     assert pages["thruster"].count("<figure>") == len(charts) == 10

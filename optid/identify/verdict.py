@@ -136,7 +136,7 @@ def _residuals(model: Any, data: Data, predicted: Sequence[Array]) -> list[Findi
     for name, kind in (("independence of the inputs", "cross_correlations"), ("whiteness", "autocorrelations")):
         failed = [test for test in tests[kind].values() if not test.passed]
         known = any(np.isfinite(test.p_value) for test in tests[kind].values())
-        words = ", ".join(f"{test.output} {'on ' + test.input if kind[0] == 'c' else 'on its past'}" for test in failed)
+        words = ", ".join(f"{test.output} {f'on {test.input}' if kind[0] == 'c' else 'on its past'}" for test in failed)
         found.append(Finding(name, words or ("kept" if known else UNKNOWN), not failed, known))
     return found
 

@@ -56,7 +56,8 @@ def _solution(fit: "Fit") -> Banner:
 def search_html(found: "Identification") -> str:
     """Show the best structures by class above the fit."""
     fit = found.fit
-    return _html("", [*_record(fit.record_findings), search_table(found)]) + fit_html(fit, found.verdict, findings=False)
+    above = _html("", [*_record(fit.record_findings), search_table(found)])
+    return above + fit_html(fit, found.verdict, findings=False)
 
 
 def parameters_html(found: "Parameters") -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from optid.arrays import Array
-from optid.identify.informativity.signals import Regression, respond, whitened
+from optid.identify.informativity.signals import WhitenedRegression, respond, whitened
 
 SLOWEST, FASTEST, COUNT = 0.5, 0.8, 15  # time constants: share of the longest experiment, samples, their number
 FLAT = 1e-9  # share of its energy that a response must keep beside the level to count
@@ -33,7 +33,7 @@ def bank(longest: int) -> Array:
     return np.concatenate([[0.0], np.exp(-1 / taus)])
 
 
-def scan(regression: Regression, drive: Sequence[Array], longest: int, order: int) -> list[Start]:
+def scan(regression: WhitenedRegression, drive: Sequence[Array], longest: int, order: int) -> list[Start]:
     """Return for every delay up to `longest` the best one or two poles of the bank, the best delay first."""
     poles = bank(max(len(u) for u in drive))
     if order == 2:
@@ -66,7 +66,8 @@ def _products(white: Array, single: Array, first: NDArray[np.intp], second: NDAr
     """Return sum y(k) v(k - d), and the energy of v(k - d) beside its mean, for every combination v and delay d."""
     samples = len(white)
     size = next_fast_len(2 * samples, real=True)
-    correlation = np.asarray(irfft(rfft(white, size) * np.conj(rfft(single, size, axis=1)), size, axis=1))
+    spectra = np.asarray(rfft(single, size, axis=1))
+    correlation = np.asarray(irfft(np.asarray(rfft(white, size)) * np.conj(spectra), size, axis=1))
     lags = np.arange(min(longest, samples - 1) + 1)
     shape = (first.size, longest + 1)
     inner, energy = np.zeros(shape), np.zeros(shape)

@@ -11,8 +11,8 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
-from optid.identify.informativity.process import Process, Response
-from optid.identify.informativity.signals import Regression, Signals, delayed, respond
+from optid.identify.informativity.process import DelayedResponse, Process
+from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.recursions import lfilter
 from optid.statistics.coloured import autoregression
 
@@ -43,13 +43,13 @@ class Effect:
         return self.p_value <= LEVEL
 
 
-def effect(signals: Signals, c: int, o: int, process: Process, names: tuple[str, str], least: int = 0, seed: int = 0
-           ) -> Effect:
+def effect(signals: RecordSignals, c: int, o: int, process: Process, names: tuple[str, str], least: int = 0,
+           seed: int = 0) -> Effect:
     """Test the effect of input c on output o, whose names are given, from a lag on: 1 in a loop."""
     na = memory(signals, o) + 2
     latest = int(LATEST * signals.longest)
     more = [_bank(u[:, c], signals.levels(c), least, latest) for u in signals.u]
-    others = [np.column_stack([np.ones(len(u)), *(x for i in range(u.shape[1]) if i != c
+    others: list[Array] = [np.column_stack([np.ones(len(u)), *(x for i in range(u.shape[1]) if i != c
                                                   for x in _others(u[:, i], process.responses[i], least, latest).T)])
               for u in signals.u]
 
@@ -73,7 +73,7 @@ def effect(signals: Signals, c: int, o: int, process: Process, names: tuple[str,
     return Effect(*names, p_value, share)
 
 
-def _simulated(signals: Signals, o: int, outputs: tuple[Array, ...], others: list[Array], p_value: float,
+def _simulated(signals: RecordSignals, o: int, outputs: tuple[Array, ...], others: list[Array], p_value: float,
                tested: Callable[[tuple[Array, ...]], tuple[float, float, int]], seed: int) -> float:
     """Return the share of simulated outputs without the effect whose p value is as small."""
     smooth, noise, spread = _without_effect(signals, o, outputs, others)
@@ -87,11 +87,11 @@ def _simulated(signals: Signals, o: int, outputs: tuple[Array, ...], others: lis
     return (1 + below) / (DRAWS + 1)
 
 
-def _without_effect(signals: Signals, o: int, outputs: tuple[Array, ...], others: list[Array]
+def _without_effect(signals: RecordSignals, o: int, outputs: tuple[Array, ...], others: list[Array]
                     ) -> tuple[list[Array], Array, float]:
     """Return level, decay and other inputs as a smooth part, the noise polynomial, and its innovations' spread."""
     present = tuple(there[:, o] for there in signals.present)
-    regression = Regression(outputs, present, np.ones(1))
+    regression = WhitenedRegression(outputs, present, np.ones(1))
     smooth: list[Array] = []
     for _ in range(2):
         found = []
@@ -114,7 +114,7 @@ def _bank(x: Array, levels: int, least: int, latest: int) -> Array:
     return np.column_stack([delayed(v, lag) for v in responses for lag in lags])
 
 
-def _others(x: Array, response: Response, least: int, latest: int) -> Array:
+def _others(x: Array, response: DelayedResponse, least: int, latest: int) -> Array:
     """Return the past of another input: its bank, first lags, and response."""
     first = [delayed(x - x[0], least + j) for j in range(LAGS)]
     shaped = respond(response.poles, x)

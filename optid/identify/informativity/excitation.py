@@ -13,7 +13,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.identify.design.rules import LONGEST, Check, many_lines, remaining_shares
-from optid.identify.informativity.signals import Signals
+from optid.identify.informativity.signals import RecordSignals
 
 ONE_MOVE = 4  # numbers that one move determines
 MOST_LINES, LINES = 3, 1e-4  # sinusoids that are looked for; share of the variance that they must leave at most
@@ -24,7 +24,7 @@ AFTER = 3  # samples that must follow the first move
 
 
 @dataclass(frozen=True)
-class Excitation:
+class InputExcitation:
     """How an input moves.
 
     Attributes:
@@ -62,12 +62,12 @@ class Excitation:
         return ""
 
 
-def excitation(signals: Signals, c: int, name: str) -> Excitation:
+def excitation(signals: RecordSignals, c: int, name: str) -> InputExcitation:
     """Describe how input c moves."""
     records = signals.inputs(c)
     moves = sum(int(np.count_nonzero(np.diff(u))) for u in records)
     x = max(records, key=len)[:LONGEST]
-    return Excitation(name, signals.levels(c), moves, 2 * moves < signals.samples, _lines(x),
+    return InputExcitation(name, signals.levels(c), moves, 2 * moves < signals.samples, _lines(x),
                       moves > 1 and all(map(_even, records)))
 
 
@@ -86,15 +86,15 @@ def _even(x: Array) -> bool:
     return len(x) > 2 and bool(rest @ rest <= 1e-8 * float((x - x.mean()) @ (x - x.mean()))) and bool(np.ptp(x) > 0)
 
 
-def check_numbers(signals: Signals, inputs: tuple[str, ...], arguments: Mapping[str, Any]) -> Check | None:
+def check_numbers(signals: RecordSignals, inputs: tuple[str, ...], arguments: Mapping[str, Any]) -> Check | None:
     """Compare the coefficients of a linear model with the numbers that the inputs determine; None for other models.
 
     The check is fine where an input determines many.
     """
     na, nb, nx = (arguments.get(name) for name in ("na", "nb", "nx"))
-    each = [nb] * len(inputs) if isinstance(nb, int) else nb
-    listed = isinstance(each, list | tuple) and len(each) == len(inputs) and all(isinstance(b, int) for b in each)
-    if isinstance(na, int) and na > 0 and listed:
+    given = [nb] * len(inputs) if isinstance(nb, int) else nb if isinstance(nb, list | tuple) else []
+    each = [b for b in given if isinstance(b, int)]
+    if isinstance(na, int) and na > 0 and len(given) == len(each) == len(inputs):
         asked, words = na + sum(each), f"na {na} and nb {' '.join(map(str, each))}"
     elif isinstance(nx, int):
         asked, words = nx * (1 + len(inputs)), f"nx {nx}"
@@ -109,7 +109,7 @@ def check_numbers(signals: Signals, inputs: tuple[str, ...], arguments: Mapping[
                  "input more often")
 
 
-def hopeless(signals: Signals, inputs: tuple[str, ...], found: list[Excitation]) -> str:
+def hopeless(signals: RecordSignals, inputs: tuple[str, ...], found: list[InputExcitation]) -> str:
     """Return why nothing can be learned from an input, however the outputs answer, "" where something can."""
     for c, one in enumerate(found):
         if not one.moves:
@@ -158,7 +158,7 @@ class Copy:
                 "column of the actuator")
 
 
-def copies(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Iterator[Copy]:
+def copies(signals: RecordSignals, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Iterator[Copy]:
     """Yield the inputs that are outputs."""
     for (c, name), (o, output) in product(enumerate(inputs), enumerate(outputs)):
         if (found := _copied(signals, c, o)) is not None:
@@ -166,7 +166,7 @@ def copies(signals: Signals, inputs: tuple[str, ...], outputs: tuple[str, ...]) 
             yield Copy(name, output, late, factor * float(signals.u_scale[c] / signals.y_scale[o]))
 
 
-def _copied(signals: Signals, c: int, o: int) -> tuple[int, float] | None:
+def _copied(signals: RecordSignals, c: int, o: int) -> tuple[int, float] | None:
     """Return how many samples after output o an equal input c comes, and its factor; None where it does not."""
     i = int(np.argmax([len(u) for u in signals.u]))
     u, y = signals.u[i][:, c], signals.y[i][:, o]

@@ -14,7 +14,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
 from optid.identify.informativity.process import Process
-from optid.identify.informativity.signals import Signals, delayed, respond
+from optid.identify.informativity.signals import RecordSignals, delayed, respond
 
 LEVEL = 1e-3  # of the test of one input, shared by the outputs
 LEADS, LAGS, SHAPED = 6, 12, 4  # future and past samples of an input; samples of its response
@@ -42,7 +42,7 @@ class Loop:
     output: str = ""
 
 
-def loop(signals: Signals, c: int, processes: tuple[Process, ...], names: tuple[str, ...]) -> Loop:
+def loop(signals: RecordSignals, c: int, processes: tuple[Process, ...], names: tuple[str, ...]) -> Loop:
     """Test whether outputs act on input c; the processes have an input act at the next sample at the earliest."""
     found = [_tested(signals, c, o, process) for o, process in enumerate(processes)]
     level = LEVEL / len(found)
@@ -55,7 +55,7 @@ def loop(signals: Signals, c: int, processes: tuple[Process, ...], names: tuple[
     return Loop("open", min(p for p, _, _ in found), free)
 
 
-def _tested(signals: Signals, c: int, o: int, process: Process) -> tuple[float, float, bool]:
+def _tested(signals: RecordSignals, c: int, o: int, process: Process) -> tuple[float, float, bool]:
     """Return p values of the future of input c and of its present, and whether the latter has the sign of the gain."""
     lags, leads = min(LAGS, signals.longest // 12), min(LEADS, signals.longest // 25)
     if leads < 1 or lags < 1:
@@ -89,13 +89,13 @@ def _tested(signals: Signals, c: int, o: int, process: Process) -> tuple[float, 
     return ahead.p_value, present.p_value, slope * sign > 0
 
 
-def setpoint(signals: Signals, c: int) -> int | None:
+def setpoint(signals: RecordSignals, c: int) -> int | None:
     """Return another input that, with the outputs, determines input c: the set-point of its controller, if any."""
     others = [other for other in range(len(signals.u_scale)) if other != c]
     return next((other for other in others if outside(signals, c, beside=(other,)) < TIED), None)
 
 
-def outside(signals: Signals, c: int, order: int = 12, beside: tuple[int, ...] = ()) -> float:
+def outside(signals: RecordSignals, c: int, order: int = 12, beside: tuple[int, ...] = ()) -> float:
     """Return the share of the innovations of input c, beyond its own past, that past and present outputs leave.
 
     The outputs, and the inputs `beside` them.
@@ -112,5 +112,5 @@ def outside(signals: Signals, c: int, order: int = 12, beside: tuple[int, ...] =
     return 1.0 - added(u, own, outputs).share
 
 
-def _moving(signals: Signals, c: int) -> float:
+def _moving(signals: RecordSignals, c: int) -> float:
     return float(np.mean(np.concatenate([np.diff(u) != 0 for u in signals.inputs(c)])))

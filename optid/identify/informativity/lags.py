@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import fdtrc
 
 from optid.arrays import Array
-from optid.identify.informativity.signals import Signals
+from optid.identify.informativity.signals import RecordSignals
 
 DISTINCT = 1e-4  # smallest singular value of further columns, of norm one, beside the others that is a direction
 ROUNDING = 1e-26  # share of the energy of an output below which the rest of a regression is rounding
@@ -51,7 +51,7 @@ def lagged(x: Array, lags: Iterable[int], first: int, last: int) -> Array:
     return np.column_stack([x[first - lag : last - lag] for lag in lags] or [np.zeros((last - first, 0))])
 
 
-def stacked(signals: Signals, before: int, after: int, build: Callable[[int, int, int], Sequence[Array]]
+def stacked(signals: RecordSignals, before: int, after: int, build: Callable[[int, int, int], Sequence[Array]]
             ) -> list[Array]:
     """Stack what `build(experiment, first, last)` returns over all experiments that are longer than both margins."""
     found = [build(i, before, len(y) - after) for i, y in enumerate(signals.y) if len(y) > before + after + 1]
@@ -63,7 +63,7 @@ def powers(x: Array, levels: int, most: int = 3) -> list[Array]:
     return [x**p for p in range(1, (most if levels > POWERS else 1) + 1)]
 
 
-def memory(signals: Signals, o: int, most: int = 12) -> int:
+def memory(signals: RecordSignals, o: int, most: int = 12) -> int:
     """Return the order of an autoregression of an output by Akaike's criterion, over common rows."""
     most = max(min(most, signals.longest // 12), 1)
     columns = stacked(signals, most, 0, lambda i, first, last: (
@@ -74,7 +74,7 @@ def memory(signals: Signals, o: int, most: int = 12) -> int:
     count = len(now)
     whole = np.column_stack([np.ones(count), past, now])
     best, least = 1, np.inf
-    triangle = np.linalg.qr(whole, mode="r")
+    triangle = np.asarray(np.linalg.qr(whole, mode="r"), dtype=float)
     for order in range(1, most + 1):  # columns of [1 | past] in order: the rest of the last column below a row
         energy = float(np.sum(triangle[order + 1 :, -1] ** 2))
         criterion = count * np.log(max(energy / count, 1e-300)) + 2 * (order + 1)

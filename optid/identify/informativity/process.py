@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.identify.informativity.bank import scan
-from optid.identify.informativity.signals import Poles, Regression, Signals, delayed, respond
+from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.roots import roots_of
 from optid.statistics.coloured import autoregression
 
@@ -37,7 +37,7 @@ ENOUGH = 1e-3  # fall of twice the log likelihood at which a descent ends
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
+class DelayedResponse:
     """The response of an output to an input: ``q^-nk B(q) / A(q)``, in the units of the record.
 
     Attributes:
@@ -86,7 +86,7 @@ class Process:
     """
 
     output: str
-    responses: tuple[Response, ...]
+    responses: tuple[DelayedResponse, ...]
     noise: Array
     residuals: tuple[Array, ...] = field(repr=False)
     explained: float
@@ -167,12 +167,12 @@ def processes(data: Data, least: int = 0) -> tuple[Process, ...]:
         data: the record; of a long one the first 30,000 samples are read.
         least: smallest lag of an input; 1 where the input answers the output without delay, in a loop.
     """
-    signals = Signals.of(data)
+    signals = RecordSignals.of(data)
     return tuple(_process(signals, o, name, least) for o, name in enumerate(data.outputs))
 
 
-def _process(signals: Signals, o: int, name: str, least: int) -> Process:
-    regression = Regression(signals.outputs(o), tuple(there[:, o] for there in signals.present), np.ones(1))
+def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
+    regression = WhitenedRegression(signals.outputs(o), tuple(there[:, o] for there in signals.present), np.ones(1))
     inputs = range(len(signals.u_scale))
     longest = max(int(LATEST * signals.longest), min(least, signals.longest - 1))
     points: list[_Point | None] = [None for _ in inputs]
@@ -208,7 +208,7 @@ def _process(signals: Signals, o: int, name: str, least: int) -> Process:
                    sum(p.criterion for p in known))
 
 
-def _found(regression: Regression, u: tuple[Array, ...], levels: int, least: int, longest: int,
+def _found(regression: WhitenedRegression, u: tuple[Array, ...], levels: int, least: int, longest: int,
            before: _Point | None) -> _Point:
     """Return the best response to one input, whose f is bent where that pays."""
     straight = _Drive(u)
@@ -237,7 +237,7 @@ def _found(regression: Regression, u: tuple[Array, ...], levels: int, least: int
     return best
 
 
-def _searched(regression: Regression, drive: _Drive, least: int, longest: int, start: _Term | None,
+def _searched(regression: WhitenedRegression, drive: _Drive, least: int, longest: int, start: _Term | None,
               scanned: bool = True) -> _Point:
     """Refine the best of the scan, and then neighbouring structures as long as the criterion falls."""
     tried: dict[tuple[int, ...], _Point] = {}
@@ -287,7 +287,7 @@ def _neighbours(term: _Term, least: int, longest: int, drive: _Drive) -> Iterato
         yield replace(term, taus=tuple(t for t in term.taus if t != slow), integrates=True)
 
 
-def _oscillating(regression: Regression, drive: _Drive, term: _Term) -> Iterator[_Term]:
+def _oscillating(regression: WhitenedRegression, drive: _Drive, term: _Term) -> Iterator[_Term]:
     """Yield structures with the complex pairs of a longer autoregression with the delayed input."""
     n = 2 * LARGEST
     rows, targets = [], []
@@ -320,7 +320,7 @@ def _slowest(poles: Poles) -> complex:
     return 1.0 if np.any(poles == 1) else complex(np.max(np.abs(poles), initial=0.0))
 
 
-def _refined(regression: Regression, drive: _Drive, term: _Term) -> _Point:
+def _refined(regression: WhitenedRegression, drive: _Drive, term: _Term) -> _Point:
     """Descend over the poles of one response by Gauss-Newton steps, each along coefficients and poles together."""
     most = np.log(20 * max(len(u) for u in drive.values))
     at = term
@@ -351,12 +351,12 @@ def _refined(regression: Regression, drive: _Drive, term: _Term) -> _Point:
     return _Point(at, drive, energy, theta, float(rows * np.log(spread) + count * np.log(rows)))
 
 
-def _solved(regression: Regression, drive: _Drive, term: _Term) -> tuple[float, Array, int]:
+def _solved(regression: WhitenedRegression, drive: _Drive, term: _Term) -> tuple[float, Array, int]:
     energy, theta, _, free = regression.solve(_columns(term, drive.values), _slowest(term.poles))
     return energy, theta, free
 
 
-def _bent(regression: Regression, drive: _Drive, term: _Term, nodes: Array) -> _Drive | None:
+def _bent(regression: WhitenedRegression, drive: _Drive, term: _Term, nodes: Array) -> _Drive | None:
     """Fit f, piecewise linear between nodes, through a response; with slope one on average."""
     hats = [np.column_stack([np.interp(u, nodes, one) for one in np.eye(nodes.size)[1:]]) for u in drive.values]
     columns = [np.column_stack([delayed(respond(term.poles, h), term.lag) for h in hat.T]) for hat in hats]
@@ -370,7 +370,7 @@ def _bent(regression: Regression, drive: _Drive, term: _Term, nodes: Array) -> _
     return _Drive(tuple(np.interp(u, nodes, heights) for u in drive.values), nodes, heights)
 
 
-def _completed(regression: Regression, point: _Point, u: tuple[Array, ...], lost: Sequence[NDArray[np.bool_]]
+def _completed(regression: WhitenedRegression, point: _Point, u: tuple[Array, ...], lost: Sequence[NDArray[np.bool_]]
                ) -> tuple[Array, ...]:
     """Estimate a few missing samples of an input from what they do to the output; more of them stay as they are."""
     places = [(i, k) for i, one in enumerate(lost) for k in np.flatnonzero(one).tolist() if k]
@@ -398,7 +398,7 @@ def _without(y: Sequence[Array], points: Sequence[_Point]) -> tuple[Array, ...]:
     return tuple(rest)
 
 
-def _joint(regression: Regression, points: Sequence[_Point]) -> tuple[list[Array], Array, complex]:
+def _joint(regression: WhitenedRegression, points: Sequence[_Point]) -> tuple[list[Array], Array, complex]:
     """Return the columns of all responses, their coefficients together, and the slowest pole."""
     each = [_columns(p.term, p.drive.values) for p in points]
     columns = [np.hstack(several) for several in zip(*each)]
@@ -406,7 +406,7 @@ def _joint(regression: Regression, points: Sequence[_Point]) -> tuple[list[Array
     return columns, regression.solve(columns, slowest)[1], slowest
 
 
-def _interval(regression: Regression, point: _Point, least: int, longest: int) -> tuple[int, int]:
+def _interval(regression: WhitenedRegression, point: _Point, least: int, longest: int) -> tuple[int, int]:
     """Return the delays that the likelihood does not exclude, poles and coefficients refitted at each."""
     ends = []
     for step in (-1, 1):
@@ -421,7 +421,7 @@ def _interval(regression: Regression, point: _Point, least: int, longest: int) -
     return ends[0], ends[1]
 
 
-def _response(signals: Signals, c: int, o: int, point: _Point, interval: tuple[int, int]) -> Response:
+def _response(signals: RecordSignals, c: int, o: int, point: _Point, interval: tuple[int, int]) -> DelayedResponse:
     """Write a response in the units of the record."""
     term, drive = point.term, point.drive
     poles = term.poles
@@ -434,4 +434,4 @@ def _response(signals: Signals, c: int, o: int, point: _Point, interval: tuple[i
         nodes = drive.nodes * signals.u_scale[c]
         heights = drive.heights / slope * signals.u_scale[c]
     b = point.theta * unit * slope * signals.y_scale[o] / signals.u_scale[c]
-    return Response(poles, term.lag, b, interval, nodes, heights)
+    return DelayedResponse(poles, term.lag, b, interval, nodes, heights)

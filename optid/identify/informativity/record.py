@@ -8,10 +8,10 @@ import numpy as np
 from optid.data.channels import interval_text
 from optid.data.record import Data
 from optid.identify.informativity.effect import Effect, effect
-from optid.identify.informativity.excitation import Excitation, copies, excitation, hopeless
+from optid.identify.informativity.excitation import InputExcitation, copies, excitation, hopeless
 from optid.identify.informativity.feedback import TIED, Loop, loop, outside, setpoint
 from optid.identify.informativity.process import Process, processes
-from optid.identify.informativity.signals import Signals
+from optid.identify.informativity.signals import RecordSignals
 from optid.registry import Rendered
 
 PAIRS = 16  # inputs times outputs up to which a record is examined
@@ -38,7 +38,7 @@ class Informativity(Rendered):
     outputs: tuple[str, ...]
     loops: tuple[Loop, ...] = field(default=(), repr=False)
     effects: tuple[Effect, ...] = field(default=(), repr=False)
-    excitations: tuple[Excitation, ...] = field(default=(), repr=False)
+    excitations: tuple[InputExcitation, ...] = field(default=(), repr=False)
     processes: tuple[Process, ...] = field(default=(), repr=False)
     reason: str = ""
     findings: tuple[str, ...] = ()
@@ -97,14 +97,14 @@ def _examined(data: Data) -> Informativity:
         return _untested(data, f"{m} inputs by {l} outputs are more than {PAIRS} pairs")
     if max(e.n_samples for e in data.experiments) < SHORTEST:
         return _untested(data, f"no experiment has {SHORTEST} samples")
-    signals = Signals.of(data)
+    signals = RecordSignals.of(data)
     if not signals.y or any(np.ptp(np.concatenate(signals.outputs(o))) == 0 for o in range(l)):
         return _untested(data, "an output does not move")
     moves = [excitation(signals, c, name) for c, name in enumerate(data.inputs)]
     copy = next(copies(signals, data.inputs, data.outputs), None)
     if reason := hopeless(signals, data.inputs, moves) or ("" if copy is None else copy.sentence):
-        regulated = copy is not None and copy.controller
-        loops = tuple(Loop("regulated" if regulated and copy.input == name else "open") for name in data.inputs)
+        regulated = copy.input if copy is not None and copy.controller else None
+        loops = tuple(Loop("regulated" if name == regulated else "open") for name in data.inputs)
         return Informativity(data.inputs, data.outputs, loops, excitations=tuple(moves), reason=reason,
                              findings=(reason,))
     found, loops = _loops(data, signals)
@@ -117,7 +117,7 @@ def _examined(data: Data) -> Informativity:
                          tuple(_findings(whole, data, reason)))
 
 
-def _loops(data: Data, signals: Signals) -> tuple[tuple[Process, ...], tuple[Loop, ...]]:
+def _loops(data: Data, signals: RecordSignals) -> tuple[tuple[Process, ...], tuple[Loop, ...]]:
     """Return processes and loops: in a loop the input acts one sample later at the earliest."""
     inputs = range(len(data.inputs))
     tied = any(outside(signals, c) < TIED for c in inputs)
@@ -144,7 +144,7 @@ def _regulated(found: Informativity) -> str:
     return ""
 
 
-def _led(found: Informativity, signals: Signals) -> str:
+def _led(found: Informativity, signals: RecordSignals) -> str:
     """Say where an input is a set-point that acts through another one."""
     for c, (name, one) in enumerate(zip(found.inputs, found.loops)):
         if one.word == "closed" and (leader := setpoint(signals, c)) is not None:

@@ -22,7 +22,7 @@ Poles = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
-class Signals:
+class RecordSignals:
     """Inputs and outputs of a record, each centred and over its spread, one array per experiment.
 
     Attributes:
@@ -41,7 +41,7 @@ class Signals:
     y_scale: Array
 
     @classmethod
-    def of(cls, data: Data) -> "Signals":
+    def of(cls, data: Data) -> "RecordSignals":
         """Read the beginning of a record."""
         data = data.raw()
         if data.n_samples > 1.1 * SAMPLES:
@@ -113,7 +113,7 @@ def whitened(noise: Array, x: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Regression:
+class WhitenedRegression:
     """Least squares of one output on columns, with a noise model and what is projected out of every experiment.
 
     Attributes:
@@ -126,7 +126,7 @@ class Regression:
     present: tuple[NDArray[np.bool_], ...]
     noise: Array
 
-    def with_noise(self, noise: Array) -> "Regression":
+    def with_noise(self, noise: Array) -> "WhitenedRegression":
         """Return the regression with another noise model."""
         return replace(self, noise=noise)
 
@@ -146,11 +146,12 @@ class Regression:
         """The whitened output."""
         return tuple(whitened(self.noise, y)[rows] for y, rows in zip(self.y, self.rows))
 
-    def projected(self, columns: Sequence[Array], slowest: complex) -> tuple[Array, Array]:
+    def projected(self, columns: Sequence[Array], slowest: complex) -> tuple[Array, int]:
         """Return [columns | output], (rows, k + 1), whitened and beside level and decay, and their free parameters."""
-        found, free = [], 0
+        found: list[Array] = []
+        free = 0
         for x, y, rows in zip(columns, self.white, self.rows):
-            both = np.column_stack([whitened(self.noise, x)[rows], y])
+            both: Array = np.column_stack([whitened(self.noise, x)[rows], y])
             k = np.arange(len(rows), dtype=float)[rows]
             decay = k if slowest == 1 else np.abs(slowest) ** k
             for one in (np.ones(len(both)), decay - decay.mean() if decay.size else decay):

@@ -14,7 +14,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.identify.informativity import Informativity
 from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
-from optid.identify.informativity.signals import Signals, delayed, held, respond
+from optid.identify.informativity.signals import RecordSignals, delayed, held, respond
 
 LEVEL = 1e-3
 TAUS = (0.0, 1.0, 3.0, 10.0, 30.0, 100.0)  # time constants of the bank, in samples
@@ -60,7 +60,7 @@ def systematic(data: Data, runs: Sequence[Array], told: Informativity) -> System
 
 
 def _measured(raw: Data, errors: list[Array], runs: list[Array], told: Informativity, o: int) -> Systematic | None:
-    whole = Signals.of(raw)
+    whole = RecordSignals.of(raw)
     kept = len(whole.y)
     present = [np.isfinite(e[: len(y)])[:, None] for e, y in zip(errors[:kept], whole.y)]
     y = [held(e[: len(y)][:, None]) for e, y in zip(errors[:kept], whole.y)]
@@ -86,7 +86,7 @@ def _measured(raw: Data, errors: list[Array], runs: list[Array], told: Informati
     return Systematic(float(np.sqrt(explained) / spread) if spread > 0 else np.inf, p_value, "")
 
 
-def _columns(u: Array, signals: Signals, told: Informativity, o: int) -> Array:
+def _columns(u: Array, signals: RecordSignals, told: Informativity, o: int) -> Array:
     """Return the inputs behind the dynamics of the record, then behind the bank, the most telling columns first."""
     first: list[Array] = []
     more: list[Array] = []
