@@ -144,7 +144,8 @@ def draw_plant(rng: np.random.Generator, recipe: Recipe, n: int, units: Units) -
     if recipe.other == "Wiener-Hammerstein":
         plant = replace(plant, last=replace(draw_linear(rng, "first order", n, (0, 0)), numerator=np.ones(1)))
     if recipe.other == "feedback":
-        plant = replace(plant, feedback=lambda x: 0.3 * np.clip(size * x, -2, 2) ** 3)
+        sign = np.sign(linear.numerator[-1])  # negative feedback for a gain of either sign
+        plant = replace(plant, feedback=lambda x: 0.5 * sign * np.clip(size * x, -2, 2) ** 3)
     if recipe.other == "drift":
         t, phase, size = np.linspace(0, 1, n), rng.uniform(), rng.uniform(0.3, 0.8)
         course = (np.sin(2 * np.pi * (t + phase)), t, np.where(t > 0.2 + 0.6 * phase, 1.0, 0.0))[rng.integers(3)]
