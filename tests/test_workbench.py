@@ -78,6 +78,13 @@ def written(path):
     return path.read_text()
 
 
+def test_a_page_begins_with_the_formulation_that_an_example_suggests():
+    assert source().start["formulation"] == "hammerstein_arx.exact"
+    begun = source("heater")
+    shown = Bench(begun).answer("fit", {"state": begun.start})
+    assert begun.start["formulation"] == "hammerstein_oe.exact" and shown["word"] == "locally optimal (not proved)"
+
+
 def test_strangers_are_refused():
     with served(source()) as server:
         first, second = server.opened(), server.opened()

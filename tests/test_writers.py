@@ -1,5 +1,7 @@
 """A record that is written as a text table is read back as it was."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -39,7 +41,8 @@ def test_dates_fractions_gaps_and_experiments_are_kept(dt, start, tmp_path):
     u = [rng.standard_normal((n, 2)) * 10.0 ** rng.integers(-9, 9) for n in (30, 20)]
     y = [rng.standard_normal((n, 1)) for n in (30, 20)]
     u[0][:2], y[0][:2], u[1][-1], y[1][-1] = np.nan, np.nan, np.nan, np.nan
-    names = {"inputs": ["valve, main", "Größe"], "outputs": ['a "b"'], "input_units": ["%", ""], "output_units": ["°C"]}
+    names: dict[str, Any] = {"inputs": ["valve, main", "Größe"], "outputs": ['a "b"'], "input_units": ["%", ""],
+                             "output_units": ["°C"]}
     single = optid.Data(u[0], y[0], dt, start=start, **names)
     assert equal(again(single, tmp_path / "one.csv"), single)
     both = optid.Data(u, y, dt, start=start, **names)

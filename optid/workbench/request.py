@@ -121,7 +121,8 @@ def suggested(data: Data, suggestion: Mapping[str, Any]) -> dict[str, Any]:
         rule = named_constraint(text)
         constraints.append({"word": text.partition(":")[0], "name": rule.name, "arguments": bound(rule.call)})
     return {"inputs": list(data.inputs), "outputs": list(data.outputs), "window": [0, shortest(data)],
-            "formulation": "hammerstein_arx.exact", "arguments": arguments, "constraints": constraints}
+            "formulation": suggestion.get("formulation_name", "hammerstein_arx.exact"), "arguments": arguments,
+            "constraints": constraints}
 
 
 def bound(call: tuple[str, str, tuple[Any, ...], Mapping[str, Any]]) -> dict[str, Any]:

@@ -243,7 +243,8 @@ def input_functions(ladder: Ladder) -> Rung:
            for word in ("polynomial:2", "polynomial:5", "triangular:4", "triangular:10")]
     a = ladder.arguments(INPUTS)
     near = [[max(k + step, 0) for k in a["nk"]] for step in (-1, 1)]
-    yield [model(a["na"], nk, a["basis"]) for nk in near if nk != a["nk"]]
+    low = [structure(INPUTS, "hammerstein_oe.exact", **_orders(p), basis=a["basis"]) for p in ladder.told.processes]
+    yield [*low, *(model(a["na"], nk, a["basis"]) for nk in near if nk != a["nk"])]  # a better basis needs fewer lags
 
 
 def feedback(ladder: Ladder) -> Rung:
