@@ -18,6 +18,7 @@ from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.informativity import processes
 from optid.identify.validation import validate
+from optid.identify.validation.checks import record_structure
 from optid.identify.validation.score_tests import FTest, Regression, orthonormal, score_test
 from optid.identify.validation.structure import structure_test
 from optid.identify.validation.structure_alternatives import PRODUCTS, RANK, alternatives
@@ -277,6 +278,29 @@ def test_validation_uses_it():
     y = model.simulate(u)
     y = y + 0.1 * y.std() * np.random.default_rng(0).normal(size=y.shape)
     assert validate(model, Data(u, y, dt=0.1)).structure == structure_test(Data(u, y, dt=0.1))
+
+
+@pytest.mark.parametrize("gain, moved, outcome", [(0.8, True, "not tested: feedback"), (0.0, True, "tested"),
+                                                  (0.8, False, "not tested: feedback")])
+def test_a_closed_loop_is_not_tested(gain, moved, outcome):
+    rng = np.random.default_rng(0)
+    setpoint, moves = moved * np.repeat(rng.uniform(-1, 1, 40), 20), np.repeat(rng.uniform(-1, 1, 40), 20)
+    e, y, u = 0.1 * rng.normal(size=800), np.zeros(800), np.zeros(800)
+    e, total = lfilter([1.0], [1.0, -0.9], e), 0.0
+    for k in range(800):
+        y[k] = e[k] + sum(0.15 * 0.9**i * u[k - 2 - i] for i in range(min(k - 1, 60)))
+        total += 0.05 * (setpoint[k] - y[k])
+        u[k] = gain * (setpoint[k] - y[k]) + total if gain else moves[k]
+    notes = []
+    found = record_structure(siso(Polynomial(3)), Data(u, y, dt=0.1), notes)
+    assert (found is not None and found.passed) if outcome == "tested" else found is None
+    assert any(outcome in note for note in notes) or outcome == "tested"
+
+
+def test_nothing_is_concluded_from_numbers_that_are_not_finite():
+    data = hammerstein(400)
+    with pytest.raises(RankError, match="not available"):
+        structure_test(data, [np.where(np.arange(400) < 300, 0 * data.y[:, 0], np.nan)[:, None]])
 
 
 def test_a_long_record_is_read_in_part(monkeypatch):
