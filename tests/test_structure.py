@@ -107,12 +107,13 @@ def test_alternatives_by_hand():
     z = (predicted[0] - whole.mean()) / whole.std()
     bent, time = 2 * np.tanh(z / 2), np.linspace(-1, 1, 501)[:-1]
     found = {words: columns(hypothesis)[0] for words, columns in alternatives(hypothesis).items()}
-    assert found["functions of the output"] == pytest.approx(np.column_stack([bent**2, bent**3, np.abs(bent)]))
+    assert found["functions of the output"] == pytest.approx(np.column_stack([
+        bent**2, bent**3, np.abs(bent), bent * np.abs(bent)]))
     drift = found["a gain that changes with time"]  # within experiments, and from one to the next
     assert drift[:, :2] == pytest.approx(np.column_stack([time * z, (1.5 * time**2 - 0.5) * z]))
     assert drift[:, 4:] == pytest.approx(np.column_stack([z, 0 * z]))
     # fed back: square, cube and modulus, by what begins one sample later and decays with the pole 0.8
-    fed = found["functions of the output that are fed back"].reshape(500, -1, 3)
+    fed = found["functions of the output that are fed back"].reshape(500, -1, 4)
     echo = lfilter([0, 1], [1, -0.8], bent**2 - bent[0] ** 2)
     assert np.linalg.norm(echo - fed[:, :, 0] @ np.linalg.lstsq(fed[:, :, 0], echo)[0]) < 1e-10
     assert "functions of 'u' behind poles at 0.8" in found and list(found)[:2] == [PRODUCTS, RANK]
