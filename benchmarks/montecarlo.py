@@ -1,5 +1,6 @@
 """What the Monte Carlo benchmarks share: the simulation example with its truth in the basis, and a pool of workers."""
 
+import multiprocessing
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
@@ -53,11 +54,14 @@ def share(count: int, of: int) -> str:
     return f"{100 * count / of:5.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def mapped(function: Callable[[Any], Any], jobs: Iterable[Any], workers: int) -> list[Any]:
-    """Apply a function to all jobs in processes with one thread each; results in order."""
+def worker_pool(workers: int) -> ProcessPoolExecutor:
+    """Return a pool of processes with one thread each."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ[name] = "1"
-    import multiprocessing
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
 
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+
+def mapped(function: Callable[[Any], Any], jobs: Iterable[Any], workers: int) -> list[Any]:
+    """Apply a function to all jobs in processes with one thread each; results in order."""
+    with worker_pool(workers) as pool:
         return list(pool.map(function, jobs, chunksize=10))

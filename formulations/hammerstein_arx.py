@@ -22,7 +22,7 @@ from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.gauges import FIXED, in_gauge, scale_fixed
+from optid.identify.gauges import FIXED, in_gauge, scale_fixed, signs_are_fixed
 from optid.models import HammersteinTF
 from optid.program.expressions import flat
 from optid.program.judging import measure_violation
@@ -99,7 +99,7 @@ def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> P
         structural=frozenset({"residual", "gauge"}),
         structure=RankOneStructure(problem.problem, linear, pairs, gauge), certify=certify_rank_one,
         scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
-    if gauge == "norm" and builders and _has_signed_factors(program, pairs):
+    if gauge == "norm" and signs_are_fixed(program, pairs):
         return replace(program, recover=partial(recover, signed=True), start=_signed_start(program, pairs))
     return program
 
@@ -111,17 +111,8 @@ def _start(problem: EquationError, pairs: Sequence[tuple[str, str]], gauge: str)
     start = problem.linear_part(point.w)
     for c, (names, channel) in enumerate(zip(pairs, problem.layout.inputs)):
         b = point.bs[c].reshape(problem.b_shape(c), order="F")
-        start.update(zip(names, in_gauge(gauge, point.mus[c], b, start.get("a"), channel)))
+        start.update(zip(names, in_gauge(gauge, point.mus[c], b, problem.past(start), channel)))
     return start
-
-
-def _has_signed_factors(program: Program, pairs: Sequence[tuple[str, str]]) -> bool:
-    """Whether a constraint contains a mu or a b itself, not ``mu bᵀ`` alone, and thereby fixes their sign."""
-    stand_in = {id(theta): cp.Variable(theta.shape) for name, theta in program.view.inner.items()
-                if name.partition("[")[0] == "Theta"}
-    factors = {program.variables[name].id for pair in pairs for name in pair}
-    return any(v.id in factors for group in program.user_constraints.values() for member in group
-               for v in member.tree_copy(stand_in).variables())
 
 
 def _signed_start(program: Program, pairs: Sequence[tuple[str, str]]) -> Mapping[str, np.ndarray]:
@@ -221,6 +212,6 @@ def _relaxed(problem: EquationError, builders: Sequence[Any], gauge: str, weight
 def _rank_one_model(problem: EquationError, gauge: str, svd: str, values: Values) -> HammersteinTF:
     """Return the model of the leading singular pair of every Theta."""
     pairs = leading_pairs(problem.problem.core, problem.matrices(values), svd == "whitened")
-    mus, bs = zip(*(in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), values.get("a"), channel)
+    mus, bs = zip(*(in_gauge(gauge, mu, b.reshape(problem.b_shape(c), order="F"), problem.past(values), channel)
                     for c, ((mu, b), channel) in enumerate(zip(pairs, problem.layout.inputs))))
     return problem.model(values, mus, bs, gauge=gauge, flip=gauge == "norm")

@@ -215,8 +215,11 @@ class _Fit(TangentFit):
         return transfer_model(self.criterion, values)
 
 
-def transfer_model(criterion: TransferErrors, values: Values) -> HammersteinTF:
-    """Return the model of named values in the units of the record: the plant, and C/D where there is a noise filter."""
+def transfer_model(criterion: TransferErrors, values: Values, signed: bool = True) -> HammersteinTF:
+    """Return the model of named values in the units of the record: the plant, and C/D where there is a noise filter.
+
+    The signs of f and B are those of the values; without `signed` f rises where the output rises.
+    """
     layout, part = criterion.unknowns.layout, {name: np.asarray(value, dtype=float) for name, value in values.items()}
     mus = [part.get(criterion.key("mu", c), np.ones(1)) for c in range(layout.m)]
     a, levels = part.get("a", np.zeros(0)), None
@@ -228,6 +231,7 @@ def transfer_model(criterion: TransferErrors, values: Values) -> HammersteinTF:
         nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(layout.bases, mus)), nk=layout.nk,
         offset=part.get("offset", np.zeros(1)), levels=levels, gauge=criterion.gauge, c=part.get("c", np.zeros(0)),
         d=part.get("d", np.zeros(0)) if criterion.unknowns.apart else None, **model_meta(criterion.data))
+    model = model if signed else model.turned(model.gain_signs)
     if criterion.shifts is not None:
         model = model.with_output_levels(criterion.shifts)
     return model.with_transform(criterion.units)

@@ -20,6 +20,7 @@ without it here and are for some hundred samples. Longer records are refused; ``
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -33,11 +34,10 @@ from optid.bases import Bases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import check_offset
-from optid.identify.gauges import FIXED, scale_fixed
+from optid.identify.gauges import FIXED, scale_fixed, signs_are_fixed
 from optid.identify.prediction_error.search import arx_start, iterated
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
-from optid.models.gauges import leading_sign
 from optid.program.program import Program
 from optid.program.solution import Bound
 from optid.program.units import outer_bases
@@ -83,6 +83,7 @@ class _Shooting:
         self.key, self.places = criterion.key, Places.of(criterion)
         self.variables = self.places.variables()
         self.variables.pop("x0", None)  # the first outputs are the initial state
+        self.pairs = [(self.key("mu", c), self.key("b", c)) for c in range(self.layout.m)]
 
     def program(self, constraints: Sequence[Any]) -> Program:
         """Return the programme under the user's constraints."""
@@ -113,8 +114,10 @@ class _Shooting:
         program = Program("hammerstein_oe.shooting", objective, structural, self.variables, start,
                           partial(transfer_model, self.criterion), view, frozenset(structural), derived=derived,
                           scale=self.criterion.energy, certify=lambda program, values, duals: (bound, None),
-                          note=NO_BOUND, unit=self.criterion.unit)
-        return program.subject_to(*constraints)
+                          note=NO_BOUND, unit=self.criterion.unit).subject_to(*constraints)
+        if gauge != "norm" or signs_are_fixed(program, self.pairs):
+            return program
+        return replace(program, recover=partial(transfer_model, self.criterion, signed=False))
 
     def _experiment(self, i: int, label: str) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the structural constraints and the derived variables of one experiment."""
@@ -168,8 +171,8 @@ class _Shooting:
         best = min([found, *(one for one in others if one is not None)], key=lambda one: one.value)
         x = criterion.normalised(best.x)
         start = self.places.values(x)
-        for mu, b in [(self.key("mu", c), self.key("b", c)) for c in range(self.layout.m)]:
-            sign = leading_sign(start[b]) if criterion.gauge == "norm" else 1.0
+        for c, (mu, b) in enumerate(self.pairs):
+            sign = criterion.gain_sign(x, f"b{c}") if criterion.gauge == "norm" else 1.0
             start |= {mu: sign * start[mu], b: sign * start[b]}
         start |= zip([f"x{label}" for label in self.labels], criterion.simulate(criterion.unknowns.unpack(x)))
         level, start["kappa"] = start.get("a", np.zeros(0)), np.zeros(self.layout.na)

@@ -26,13 +26,32 @@ class Example:
         truth: of a Hammerstein-ARX system a (na,), b (one (nb,) array per input), f (one function per input), sigma
             (standard deviation of the equation error e), noise_free (N, l) output; of a simulated plant f, the number
             of states n, and noise_free where the noise is not fed back.
-        suggestion: arguments of `fit`: na, nb, nk, basis (text, as on the command line), constraints (texts), and nx
-            and feedback_basis for state-space formulations.
+        suggestion: arguments of `fit`: na, nb, nk, basis (text, as on the command line), constraints (texts), nx and
+            feedback_basis for state-space formulations, and formulation_name where it is not the default.
     """
 
     data: Data
     truth: dict[str, Any]
     suggestion: dict[str, Any]
+
+
+def heater(seed: int = 0, n: int = 1500) -> Example:
+    """Return a simulated electric heater, dated: setting in % to temperature in degC.
+
+    The power saturates at 70 %; the temperature follows it 20 s later, with a time constant of 120 s and 0.6 degC per
+    %, from 20 degC with the heater off. Settings are held for 25 samples of 5 s: off, full, then whole percents drawn
+    uniformly. The sensor adds white noise of 0.3 degC and shows two decimals.
+    """
+    rng = np.random.default_rng([seed, 1])
+    u = np.round(signals.uniform_levels(n, 0.0, 100.0, hold=25, seed=seed))
+    u[:25], u[25:50] = 0.0, 100.0
+    pole = np.exp(-5.0 / 120.0)
+    clean = 20.0 + _filter(np.r_[np.zeros(5), 1.0 - pole], np.array([-pole]), _limited(u))
+    data = Data(u, np.round(clean + 0.3 * rng.standard_normal(n), 2), 5.0, inputs="heater", outputs="temperature",
+                input_units="%", output_units="degC", name="heater", start="2024-03-01T08:00")
+    suggestion = {"formulation_name": "hammerstein_oe.exact", "na": 1, "nb": 1, "nk": 5, "basis": "triangular:10",
+                  "constraints": ["monotone:increasing"]}
+    return Example(data, {"n": 1, "f": (_limited,), "noise_free": clean[:, None]}, suggestion)
 
 
 def dead_zone(seed: int = 0, n: int = 1000, noise: float | None = None) -> Example:
@@ -131,7 +150,7 @@ def two_tanks(seed: int = 0, n: int = 600) -> Example:
 
 EXAMPLES: dict[str, Callable[..., Example]] = {
     function.__name__: function for function in (
-        thruster, broken_thruster, dead_zone, two_inputs, pendulum, vanderpol, two_tanks)
+        heater, thruster, broken_thruster, dead_zone, two_inputs, pendulum, vanderpol, two_tanks)
 }
 """The built-in records by the name that the command line takes."""
 
@@ -215,6 +234,10 @@ def _saturation(u: np.ndarray) -> np.ndarray:
 
 def _power(u: np.ndarray) -> np.ndarray:
     return u**2 / 4
+
+
+def _limited(u: np.ndarray) -> np.ndarray:
+    return 0.6 * np.minimum(u, 70.0)
 
 
 def _thrust(u: np.ndarray) -> np.ndarray:

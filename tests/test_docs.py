@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 from optid.errors import DataWarning
+from optid.identify import verdict
+from optid.identify.informativity import effect, excitation, feedback, process, record
 
 DOCS = Path(__file__).parent.parent / "docs"
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
@@ -26,6 +28,16 @@ def test_the_blocks_of_a_page_run_in_their_order(page, tmp_path, monkeypatch):
         warnings.simplefilter("ignore", DataWarning)
         for block in BLOCK.findall(page.read_text(encoding="utf-8")):
             exec(compile(block, str(page), "exec"), space)
+
+
+def test_the_page_on_records_states_the_levels_and_thresholds_that_are_used():
+    text = " ".join((DOCS / "record.md").read_text(encoding="utf-8").split())
+    for sentence in (f"Level {100 * feedback.LEVEL:g} % for each input", f"Level {100 * effect.LEVEL:g} %.",
+                     f"more than {record.PAIRS} pairs", f"fit is below {verdict.USELESS_FIT:g} %",
+                     f"*poor* below {verdict.POOR_FIT:g} %", f"*good* from {verdict.GOOD_FIT:g} % on, with "
+                     f"{verdict.GOOD_BLOCK:g} % in the worst block"):
+        assert sentence in text
+    assert (excitation.ONE_MOVE, process.LATEST, process.LIKELY) == (4, 0.25, 3.84)
 
 
 @pytest.mark.slow

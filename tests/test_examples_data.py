@@ -4,6 +4,7 @@ import pytest
 from optid.data.record import Data
 from optid.errors import LookupFailed
 from optid.examples import EXAMPLES, dead_zone, example, thruster
+from optid.identify.fitting import fit
 
 ARX = [name for name, make in EXAMPLES.items() if "a" in make(n=100).truth]
 
@@ -40,6 +41,9 @@ def test_suggestions_have_the_orders_of_the_truth(name):
     elif name in ARX:
         assert set(ex.suggestion) == {"na", "nb", "nk", "basis", "constraints"}
         assert (ex.suggestion["na"], ex.suggestion["nb"]) == (ex.truth["a"].size, ex.truth["b"][0].size)
+    elif name == "heater":
+        assert set(ex.suggestion) == {"formulation_name", "na", "nb", "nk", "basis", "constraints"}
+        assert ex.suggestion["na"] == ex.truth["n"]
     else:
         more = "equations" if name == "two_tanks" else "feedback_basis"
         assert set(ex.suggestion) == {"na", "nb", "nk", "basis", "nx", more}
@@ -83,6 +87,32 @@ def test_thruster_is_the_rig_described():
     ratios = [np.sum(t.truth["noise_free"] ** 2) / np.sum((t.data.y - t.truth["noise_free"]) ** 2)
               for t in (thruster(seed=s) for s in range(30))]
     assert np.median(ratios) == pytest.approx(30, rel=0.15)
+
+
+def test_heater_is_the_plant_described():
+    ex = EXAMPLES["heater"](seed=2, n=6000)
+    u, y, clean = ex.data.u[:, 0], ex.data.y[:, 0], ex.truth["noise_free"][:, 0]
+    assert (ex.data.input_units, ex.data.output_units) == (("%",), ("degC",))
+    assert (ex.data.dt, str(ex.data.time[12])) == (5.0, "2024-03-01T08:01:00.000000000")
+    # The differential equation 120 s dx/dt = 0.6 min(u, 70) - x, 20 s late, in steps of 0.05 s.
+    x, expected = 0.0, []
+    for level in np.r_[np.zeros(4), u][:600]:
+        expected.append(20 + x)
+        for _ in range(100):
+            x += 0.05 / 120 * (0.6 * min(level, 70) - x)
+    np.testing.assert_allclose(clean[:600], expected, atol=0.01)
+    np.testing.assert_array_equal(u, np.round(u))
+    assert u[0] == 0 and u.max() == 100 and np.std(y - clean) == pytest.approx(0.3, rel=0.03)
+    np.testing.assert_array_equal(y, np.round(y, 2))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_heater_as_suggested_is_a_good_model_whose_intervals_cover_the_truth(seed):
+    ex = EXAMPLES["heater"](seed=seed)
+    found = fit(ex.data, **ex.suggestion)
+    pole = found.params["a1"]
+    assert found.verdict.word == "good" and not found.verdict.failed
+    assert -np.exp(-5 / 120) == pytest.approx(pole.estimate, abs=3 * pole.error)
 
 
 def test_unknown_example_names_the_nearest():

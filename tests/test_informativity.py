@@ -6,6 +6,7 @@ from scipy.signal import lfilter
 
 import optid
 from optid.errors import DataError
+from optid.examples import example
 from optid.identify.informativity import informativity, processes
 from optid.identify.informativity.signals import Regression, Signals, respond
 
@@ -96,6 +97,13 @@ def test_a_saturation_is_seen_and_does_not_hide_the_dead_time():
     assert abs(found.nk - 7) <= 1 and found.nodes is not None
     f = np.interp([0.1, 0.5, 0.7, 0.95], found.nodes + u.mean(), found.values)
     assert abs(f[3] - f[2]) < 0.2 * abs(f[1] - f[0])
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_a_saturation_found_once_is_kept_when_the_noise_model_changes(seed):
+    (response,) = processes(example("heater", seed=seed).data)[0].responses
+    assert (response.nk, response.lag_interval, response.values is None) == (5, (5, 5), False)
+    np.testing.assert_allclose(response.poles, np.exp(-5 / 120), atol=5e-4)
 
 
 def test_an_integrator_is_told_and_its_slope():

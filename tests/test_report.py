@@ -61,11 +61,11 @@ def test_the_verdict_the_figures_and_the_prices_are_on_the_page(pages):
         assert words in text
     sections = {value for tag, name, value in page.attributes if tag == "section" and name == "id"}
     assert sections == {
-        "trust", "optimum", "model", "figures", "constraints", "certificate", "validation", "data", "solver",
+        "trust", "dynamics", "optimum", "model", "figures", "constraints", "certificate", "validation", "data", "solver",
         "reproduce",
     }
     charts = json.loads(re.search(r'id="charts-data">(.*?)</script>', pages["thruster"], re.DOTALL)[1])
-    assert pages["thruster"].count("<figure>") == len(charts) == 9
+    assert pages["thruster"].count("<figure>") == len(charts) == 10
     assert "Bode diagram: phase" in text and "PASS (p = " in text
     assert text.index("The model on this record") < text.index("Optimal (proved)".lower())
 

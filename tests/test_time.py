@@ -16,10 +16,12 @@ from optid import report
 from optid.data.timeline import Timeline
 from optid.errors import DataError
 from optid.faults import diagnose, load_diagnosis
+from optid.identify.responses import responses
 from optid.models import HammersteinTF
 from optid.show import charts, printing
 from optid.show.notebook import fit_html, search_html
 from optid.show.page import coded
+from optid.show.responses import curve_charts
 
 FINDING = "no time column: 1 sample = 1; pass dt= (seconds)"
 DATE = "2024-05-01T06:00"
@@ -152,7 +154,9 @@ def test_other_sampling_is_refused_with_units():
 
 
 def titles(model):
-    return [(chart.x.title) for chart in charts.dynamics_charts({"": model})[:3]]
+    levels = [(0.0, 1.0)]
+    step = curve_charts({"": responses(model, levels)[0]}, [model], None)[-1].chart
+    return [chart.x.title for chart in (*charts.dynamics_charts({"": model}, levels)[:2], step)]
 
 
 def test_frequencies_and_responses_have_a_unit():

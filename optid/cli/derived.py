@@ -38,6 +38,7 @@ class FittingCommand(Command):
             if type(error).__name__ != "NoSuchOption" or not option or not option.startswith("--"):
                 raise
             raise _refused(LookupFailed(unknown(name, option))) from None
+        ctx.params["formulation"] = name
         values = {p.name: ctx.params.pop(p.name) for p in self.params if getattr(p, "derived", False) and p.name}
         words = [f"{key}={_json(key, value)}" for key, value in values.items() if value not in (None, (), [])]
         ctx.params["settings"] = [*words, *(ctx.params.get("settings") or ())] or None
@@ -50,14 +51,19 @@ def _refused(error: LookupFailed) -> typer.Exit:
 
 
 def chosen(args: Sequence[str]) -> str:
-    """Return the formulation named on the command line, or the default."""
-    found = DEFAULT
+    """Return the formulation named on the command line, or that of the example, or the default."""
+    found = example = None
     for word, following in zip(args, [*args[1:], ""]):
-        if word in ("--formulation", "-f"):
-            found = following
-        elif word.startswith("--formulation="):
-            found = word.partition("=")[2]
-    return found
+        key, equals, value = word.partition("=")
+        if key in ("--formulation", "-f"):
+            found = value if equals else following
+        elif key == "--example":
+            example = value if equals else following
+    if found is None and example is not None:
+        from optid.examples import EXAMPLES
+
+        found = EXAMPLES[example]().suggestion.get("formulation_name") if example in EXAMPLES else None
+    return DEFAULT if found is None else found
 
 
 def derived_options(name: str, taken: set[str]) -> list[Any]:

@@ -240,6 +240,20 @@ class Data(Ports):
         return frames[0] if len(frames) == 1 else pd.concat(
             frames, keys=range(1, len(frames) + 1), names=["experiment", "time"])
 
+    def to_csv(self, path: Any) -> Any:
+        """Write the samples as a CSV file that `optid.read` reads back, and return its path.
+
+        The columns are time, as dates where the record is dated, and the channels; a row after the header holds the
+        units, NaN marks missing samples. Several experiments have a column "experiment"
+        (``optid.read(..., experiment="experiment")``); a record without a unit of time has no column of time.
+
+        Raises:
+            DataError: a channel named "time" or "experiment", names or units that would be read as samples.
+        """
+        from optid.data.writers import write_csv
+
+        return write_csv(self, path)
+
     # -- parts -----------------------------------------------------------------------------------------------------
 
     def split(self, at: float | int) -> tuple["Data", "Data"]:

@@ -219,7 +219,7 @@ def _on_model(fit: Any) -> Iterator[Advice]:
     model, data = fit.model, fit.data.raw()
     yield from advise_on_poles(fit)
     for function, x, share in shares_outside(model, data):
-        if share > 0.01:
+        if share > 0.01 and function.family != "latent":
             yield Advice(f"{100 * share:.0f} % of {function.name} lies outside the interval of its basis",
                          f"--basis ...:interval={np.nanmin(x):.4g},{np.nanmax(x):.4g}")
     count = fit.data.n_samples * fit.data.l

@@ -26,7 +26,8 @@ from optid.errors import (
     nearest,
 )
 from optid.identify.arguments import violations
-from optid.identify.parameters import Parameters, criteria, parameters
+from optid.identify.dynamics import dynamics, input_levels
+from optid.identify.parameters import Parameters, criteria, parameters, uncertainty_or_reason
 from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
 from optid.program.prices import Price, price_constraints, price_earlier_steps
@@ -50,6 +51,7 @@ class Fit(Rendered):
         findings: of the checks of the record, one sentence each.
         seconds: wall time of the whole call.
         settings: solver, accuracy and other settings of the solve.
+        cross_validated: fits in % of the blocks that were left out when the structure was searched, and the pooled one.
     """
 
     outcome: Outcome = field(repr=False)
@@ -60,6 +62,7 @@ class Fit(Rendered):
     findings: tuple[str, ...] = ()
     seconds: float = 0.0
     settings: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    cross_validated: tuple[tuple[float, ...], float] | None = None
 
     @property
     def program(self) -> Program:
@@ -162,17 +165,15 @@ class Fit(Rendered):
     @cached_property
     def verdict(self) -> Any:
         """Tests of the model on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
-        return self.judged() if isinstance(self.data, Data) and self.model is not None else None
-
-    def judged(self, cross_validated: Sequence[float] | None = None, pooled: float | None = None) -> Any:
-        """Return the verdict on the model, by fits of blocks that were left out where there are some."""
         from optid.identify.verdict import verdict
 
+        if not isinstance(self.data, Data) or self.model is None:
+            return None
         try:
             known = self.uncertainty
         except OptidError:
             known = None
-        return verdict(self.model, self._record(), cross_validated, pooled, known)
+        return verdict(self.model, self.data, *(self.cross_validated or (None, None)), known)
 
     @cached_property
     def advice(self) -> tuple[Any, ...]:
@@ -192,6 +193,15 @@ class Fit(Rendered):
     def params(self) -> Parameters:
         """Estimates with standard errors and 95 % intervals, by name: ``fit.params["a1"]``."""
         return parameters(self)
+
+    @cached_property
+    def dynamics(self) -> Parameters:
+        """Time constants, damping, dead time and static gain with their units, by name: ``fit.dynamics["dead time"]``.
+
+        See `optid.identify.dynamics.dynamics` for what is counted as dead time, and for models that integrate.
+        """
+        record = self.data.raw() if isinstance(self.data, Data) else None
+        return dynamics(self.model, input_levels(self.model, record), *uncertainty_or_reason(self))
 
     def conf_int(self, level: float = 0.95) -> Parameters:
         """Return the parameters with intervals of this level."""

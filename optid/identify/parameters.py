@@ -13,25 +13,36 @@ from optid.registry import Rendered
 
 
 class Parameter(NamedTuple):
-    """An estimate; an unknown error or interval is NaN."""
+    """An estimate; an unknown error or interval is NaN, an unknown unit "".
+
+    Coefficients, whose units follow from those of the channels, are listed without.
+    """
 
     name: str
     estimate: float
     error: float = np.nan
     lower: float = np.nan
     upper: float = np.nan
+    unit: str = ""
 
 
 @dataclass(frozen=True, repr=False)
 class Parameters(Rendered, Sequence):
     """Estimated parameters in their order, by position or by name: ``fit.params["a1"].estimate``.
 
-    An interval contains the truth with probability `level`; without standard errors `reason` is the reason.
+    Attributes:
+        rows: the parameters.
+        level: probability that an interval contains the truth.
+        reason: why there are no standard errors, "" where there are.
+        title: what the table is called.
+        notes: what they mean, and why some have no error, one sentence each.
     """
 
     rows: tuple[Parameter, ...]
     level: float = 0.95
     reason: str = ""
+    title: str = "Parameters"
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -71,16 +82,22 @@ def parameters(fit: Any, level: float = 0.95) -> Parameters:
     Of a state-space model, whose matrices depend on the choice of the states, these are poles and static gain.
     """
     check_probability(level, "level")
-    try:
-        known, reason = fit.uncertainty.at_level(level), ""
-    except OptidError as error:
-        known, reason = None, str(error)
+    known, reason = uncertainty_or_reason(fit)
+    known = None if known is None else known.at_level(level)
     rows = [Parameter(name, value) for name, value in fit.model.coefficients()] if known is None else [
         Parameter(*row) for row in known.table()]
     for function in static_functions(fit.model):
         if not function.is_linear:
             rows += function_parameters(function, known)
     return Parameters(tuple(rows), level, reason)
+
+
+def uncertainty_or_reason(fit: Any) -> tuple[Any, str]:
+    """Return the uncertainty of a fit, or None and the reason why there is none."""
+    try:
+        return fit.uncertainty, ""
+    except OptidError as error:
+        return None, str(error)
 
 
 def function_parameters(function: StaticFunction, known: Any) -> list[Parameter]:

@@ -136,19 +136,24 @@ class Uncertainty:
         found = self.of(lambda model: getattr(model, family)[channel](points) + (model.c0 if with_offset else 0.0))
         return replace(found, at=points)
 
-    def frequency_response(self, w: ArrayLike | None = None) -> tuple[Interval, Interval]:
+    def frequency_response(self, w: ArrayLike | None = None, factors: Quantity | None = None
+                           ) -> tuple[Interval, Interval]:
         """Return the bands (k, l, m) of magnitude and phase (radians, unwrapped along w) of the linear part A^-1 B.
 
         They are in the gauge of the model, at frequencies w (k,) in radians per unit of time; 200 up to the Nyquist
         frequency when not given. The magnitude is treated on a logarithmic scale, so that its band is positive.
+        `factors`, a function of the model, gives what every input (m,) is multiplied with, such as a slope of f.
         """
+        def response(model: Any) -> Array:
+            return model.frequency_response(points) * (1.0 if factors is None else np.asarray(factors(model)))
+
         nyquist = np.pi / self.model.dt
         points = np.linspace(nyquist / 200, nyquist, 200) if w is None else np.atleast_1d(np.asarray(w, dtype=float))
-        reference = self.model.frequency_response(points)
+        reference = response(self.model)
         phase = np.unwrap(np.angle(reference), axis=0)
         with np.errstate(all="ignore"):  # a response of zero has no logarithm, and a wide band may have no upper end
-            log = self.of(lambda model: np.log(np.abs(model.frequency_response(points))))
-            turn = self.of(lambda model: phase + np.angle(model.frequency_response(points) / reference))
+            log = self.of(lambda model: np.log(np.abs(response(model))))
+            turn = self.of(lambda model: phase + np.angle(response(model) / reference))
             value = np.exp(log.value)
             size = Interval(value, value * log.error, np.exp(log.lower), np.exp(log.upper), points)
         return size, replace(turn, at=points)
@@ -248,9 +253,4 @@ def aligned(model: Any, reference: Any) -> Any:
     """Give every f and B of a model the sign nearest to that of a reference; predictions do not change."""
     signs = np.array([-1.0 if float(np.sum(f.mu * other.mu)) < 0 else 1.0
                       for f, other in zip(model.nonlinearities, reference.nonlinearities)])
-    if np.all(signs > 0):
-        return model
-    turned = tuple(replace(f, mu=sign * f.mu) for sign, f in zip(signs, model.nonlinearities))
-    if model.structure == "ss":
-        return replace(model, B=model.B * signs, D=model.D * signs, nonlinearities=turned)
-    return replace(model, b=tuple(sign * b for sign, b in zip(signs, model.b)), nonlinearities=turned)
+    return model if np.all(signs > 0) else model.turned(signs)

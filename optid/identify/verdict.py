@@ -24,6 +24,7 @@ from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
+UNKNOWN = "not available"  # how a value begins that is not
 GOOD_FIT, GOOD_BLOCK, POOR_FIT, USELESS_FIT = 85.0, 75.0, 65.0, 20.0
 """Fits in % from which on, and below which, a model is called so; the second is that of its worst block."""
 OVERFIT = 12.0  # points that the cross-validated fit may be below that on the record itself
@@ -45,6 +46,11 @@ class Finding:
     value: str
     passed: bool
     counts: bool = True
+
+    @property
+    def outcome(self) -> str:
+        """PASS, FAIL, or "-" where there was nothing to test."""
+        return "-" if self.value.startswith(UNKNOWN) else "PASS" if self.passed else "FAIL"
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ class Verdict:
 
     def __str__(self) -> str:
         return f"{self.word}: " + "; ".join(
-            f"{part.name} {part.value}: {'PASS' if part.passed else 'FAIL'}" for part in self.parts)
+            f"{part.name} {part.value}: {part.outcome}" for part in self.parts)
 
 
 def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = None, pooled: float | None = None,
@@ -124,14 +130,14 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
 def _residuals(model: Any, data: Data, predicted: Sequence[Array]) -> list[Finding]:
     """Say what the residual tests find, those of a page too."""
     if all(np.isnan(p).all() for p in predicted):
-        return [Finding("residuals", "not available: no one-step prediction", True, counts=False)]
+        return [Finding("residuals", f"{UNKNOWN}: no one-step prediction", True, counts=False)]
     tests = tested_residuals(model, data, predicted)
     found = []
     for name, kind in (("independence of the inputs", "cross_correlations"), ("whiteness", "autocorrelations")):
         failed = [test for test in tests[kind].values() if not test.passed]
         known = any(np.isfinite(test.p_value) for test in tests[kind].values())
         words = ", ".join(f"{test.output} {'on ' + test.input if kind[0] == 'c' else 'on its past'}" for test in failed)
-        found.append(Finding(name, words or ("kept" if known else "not available"), not failed, known))
+        found.append(Finding(name, words or ("kept" if known else UNKNOWN), not failed, known))
     return found
 
 
@@ -143,7 +149,7 @@ def _response(model: Any, data: Data, runs: Sequence[Array], told: Informativity
         return _beside_low_order(model, data, runs, told)
     found = systematic(data, runs, told)
     if found is None:
-        return [Finding("error that the inputs explain", "not available: too few samples", True, counts=False)]
+        return [Finding("error that the inputs explain", f"{UNKNOWN}: too few samples", True, counts=False)]
     where = f" ({found.output})" if data.l > 1 else ""
     size = f"{100 * found.share:.2g} % of the response{where}" if found.found else f"none visible{where}"
     return [Finding("error that the inputs explain", f"{size} (p = {found.p_value:.2g})",
@@ -172,7 +178,7 @@ def _uncertain(model: Any, data: Data, known: Any) -> list[Finding]:
     """Say how well the record determines the response to a step over the range of every input."""
     if known is None or has_feedback(model) or getattr(model, "latent", ()):
         return []
-    length = step_length(model)
+    length = max(min(step_length(model), max(e.n_samples for e in data.experiments) // 3), 2)
     points = np.unique(np.geomspace(1, length, POINTS).astype(int)) - 1
     spans = []
     for c, f in enumerate(model.nonlinearities):
@@ -227,7 +233,9 @@ def _lags(model: Any, told: Informativity, harmless: bool) -> list[Finding]:
 
 
 def _ranges(model: Any, data: Data) -> list[Finding]:
-    found = [(share, f.name) for f, _, share in shares_outside(model, data) if not f.is_linear]
+    # a function of a latent signal was fitted on all its samples, wherever they lie
+    found = [(share, f.name) for f, _, share in shares_outside(model, data)
+             if not f.is_linear and f.family != "latent"]
     if not found:
         return []
     share, name = max(found)

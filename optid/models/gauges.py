@@ -1,4 +1,4 @@
-"""The scale between f and B."""
+"""The scale between f and B, and its sign: f rises where the output of the plant rises."""
 
 import numpy as np
 
@@ -6,18 +6,20 @@ from optid.arrays import Array
 from optid.errors import StructureError
 
 GAUGES = ("norm", "gain", "b0", "none")
+NEGLIGIBLE = 1e-9  # share of the size of its terms below which a gain counts as zero
 
 
 def gauge_factor(gauge: str, a: Array, b: Array, channel: str) -> float:
     """Return the factor by which B (nb,) or (nb, l) is divided, and f multiplied, for "norm", "gain" or "b0".
 
-    A gauge that sets a quantity to one which is zero is refused (`StructureError`).
+    A is (na,), or (na, l, l) of several outputs. A gauge that sets a quantity to one which is zero is refused
+    (`StructureError`).
     """
     size = float(np.linalg.norm(b))
     if size == 0:
         raise StructureError(f"B of input {channel!r} is zero: it has no gauge but 'none'.")
     if gauge == "norm":
-        return size * leading_sign(b)
+        return size * plant_sign(a, b)
     if gauge == "b0":
         scale, what = float(b.flat[0]), "first coefficient of B"
     else:
@@ -29,8 +31,37 @@ def gauge_factor(gauge: str, a: Array, b: Array, channel: str) -> float:
     return scale
 
 
-def leading_sign(b: Array, negligible: float = 1e-12) -> float:
-    """Sign of the first entry of B above a share of its largest; 1 where all are zero."""
-    entries = b.ravel(order="F")
-    large = np.flatnonzero(np.abs(entries) > negligible * np.abs(entries).max(initial=0.0))
-    return float(np.sign(entries[large[0]])) if large.size else 1.0
+def plant_sign(a: Array, b: Array) -> float:
+    """Return 1 where the output of B/A rises with what drives it, -1 where it falls; A, B as in `gauge_factor`."""
+    by_lag = b[:, None] if b.ndim == 1 else b
+    matrix = np.eye(by_lag.shape[1]) + np.reshape(a, (-1, by_lag.shape[1], by_lag.shape[1])).sum(axis=0)
+    return float(plant_signs(matrix, by_lag.sum(axis=0)[:, None], by_lag[:, :, None])[0])
+
+
+def plant_signs(matrix: Array, drive: Array, response: Array, seen: Array | None = None, direct: Array | None = None
+                ) -> Array:
+    """Return 1 for each of r drives with which the output rises, -1 where it falls, 1 where it has no effect.
+
+    The sign is that of ``seen adj(matrix) drive + det(matrix) direct``, for one output the numerator at z = 1, B(1). It
+    is the sign of the static gain of a stable plant, and of the slope with which a plant that integrates answers a
+    step; it does not turn as a pole passes one. Of several outputs that with the largest decides; where all are
+    negligible the largest entry of the response does.
+
+    Args:
+        matrix: (n, n) of the equations at rest.
+        drive: (n, r) what enters them.
+        response: (T, l, r) coefficients of B, or the impulse response.
+        seen: (l, n) what the outputs see of the solution; its identity where None.
+        direct: (l, r) what reaches the outputs directly; zero where None.
+    """
+    left, values, right = np.linalg.svd(matrix)
+    turned = np.linalg.det(left) * np.linalg.det(right)
+    last = values[-1] if values.size else 1.0  # adjugate and determinant, both divided by the other singular values
+    shares = np.divide(last, values, out=np.ones_like(values), where=values > 0)
+    adjugate, determinant = turned * (right.T * shares) @ left.T, turned * last
+    adjugate = adjugate if seen is None else seen @ adjugate
+    through = np.zeros((len(adjugate), drive.shape[1])) if direct is None else determinant * direct
+    gains, sizes = adjugate @ drive + through, np.abs(adjugate) @ np.abs(drive) + np.abs(through)
+    gains[np.abs(gains) <= NEGLIGIBLE * sizes] = 0.0
+    found = [gain if np.any(gain) else response[:, :, j].ravel() for j, gain in enumerate(gains.T)]
+    return np.array([-1.0 if one.size and one[np.argmax(np.abs(one))] < 0 else 1.0 for one in found])

@@ -18,7 +18,7 @@ from optid.errors import DataError, StructureError
 from optid.models import recursions, roots, text
 from optid.models.experiments import Record, check_inputs, samples_of, scaled_least_squares, signal_units
 from optid.models.files import KINDS
-from optid.models.gauges import GAUGES, gauge_factor
+from optid.models.gauges import GAUGES, gauge_factor, plant_sign
 from optid.models.layout import Layout
 from optid.models.model import Model, static_solution
 from optid.models.nonlinearity import Nonlinearity
@@ -214,6 +214,17 @@ class HammersteinTF(Model):
         if n:
             companion[: self.l] = -np.hstack(list(self.matrices))
         return roots.largest_first(np.linalg.eigvals(companion).astype(complex))
+
+    @property
+    def gain_signs(self) -> Array:
+        """Return 1 for every input with whose function the output rises, -1 where it falls; see `plant_signs`."""
+        return np.array([plant_sign(self.a, b) for b in self.b])
+
+    def turned(self, signs: ArrayLike) -> Self:
+        """Multiply f and B of every input by its sign (m,), 1 or -1; predictions do not change."""
+        pairs = list(zip(np.asarray(signs, dtype=float), self.b, self.nonlinearities))
+        return replace(self, b=tuple(sign * b for sign, b, _ in pairs),
+                       nonlinearities=tuple(f.scaled(sign) for sign, _, f in pairs))
 
     def _static_gain(self, points: Array) -> Array:
         return self._at_rest(self.numerators.sum(axis=0) * [f.slope(u) for f, u in zip(self.nonlinearities, points)])

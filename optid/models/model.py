@@ -315,8 +315,8 @@ class Model(Ports):
         """Fix the scale between f and B of every function, and of nonlinear feedback; predictions do not change.
 
         Args:
-            gauge: "norm" (norm of B one, its first coefficient that is not zero positive; in a state-space model of
-                [B; D] and the first Markov parameter), "gain" (unit static gain of the linear part; one output), "b0"
+            gauge: "norm" (norm of B one, of [B; D] in a state-space model; f rises where the output rises, see
+                `optid.models.gauges.plant_signs`), "gain" (unit static gain of the linear part; one output), "b0"
                 (first coefficient of B one; transfer functions only), "none" (as it is; linear channels get f(u) = u).
             signs: with False the gauge "norm" leaves the signs as they are.
 

@@ -16,7 +16,7 @@ from optid.errors import StructureError
 from optid.models import roots
 from optid.models.equilibria import equilibria
 from optid.models.feedback_tables import tabulated
-from optid.models.gauges import leading_sign
+from optid.models.gauges import plant_signs
 from optid.models.kalman import NoiseCovariances
 from optid.models.model import Model, frequency_response, impulse_response, static_solution
 from optid.models.nonlinearity import Nonlinearity
@@ -292,16 +292,34 @@ class StateSpace(Model):
             scales = np.array([f.unit_slope for f in self.nonlinearities])
         else:
             scales = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
-            scales = scales * _signs(self.impulse_response(self.nx + 1)) if signs else scales
+            scales = scales * self.gain_signs if signs else scales
         back = np.ones(self.E.shape[1])
         if gauge != "none":
             back = np.linalg.norm(self.E, axis=0)
-            response = impulse_response(self.A, self.E, self.C, np.zeros((self.l, back.size)), self.nx + 1)
-            back = back * _signs(response) if signs else back
+            back = back * self._signs(self.E, np.zeros((self.l, back.size))) if signs else back
         scales, back = np.where(scales == 0, 1.0, scales), np.where(back == 0, 1.0, back)
         return replace(self, B=self.B / scales, D=self.D / scales, E=self.E / back, gauge=gauge,
                        nonlinearities=tuple(f.scaled(s) for f, s in zip(self.nonlinearities, scales)),
                        feedback=tuple(g.scaled(s) for g, s in zip(self.feedback, back)))
+
+    @property
+    def gain_signs(self) -> Array:
+        """Return 1 for every function of an input with which the output rises, -1 where it falls; see `plant_signs`.
+
+        With one output feedback does not change them, as long as the whole is stable.
+        """
+        return self._signs(self.B, self.D)
+
+    def _signs(self, B: Array, D: Array) -> Array:
+        matrix = np.eye(self.nx) - self.A - self.L @ self.C
+        response = impulse_response(self.A, B, self.C, D, self.nx + 1)
+        return plant_signs(matrix, B + self.L @ D, response, self.C, D)
+
+    def turned(self, signs: ArrayLike) -> Self:
+        """Multiply every function of the inputs, and its columns of B and D, by its sign (r,), 1 or -1."""
+        factors = np.asarray(signs, dtype=float)
+        return replace(self, B=self.B * factors, D=self.D * factors,
+                       nonlinearities=tuple(f.scaled(sign) for f, sign in zip(self.nonlinearities, factors)))
 
     def _gains(self) -> Array:
         """Static gains (r,) of the linear part from every f to the output."""
@@ -375,11 +393,6 @@ class StateSpace(Model):
 
         noise = content["noise"] and NoiseCovariances(**read(content["noise"], COVARIANCES))
         return super().from_dict({**content, **read(content, MATRICES), "noise": noise}, functions)
-
-
-def _signs(response: Array) -> Array:
-    """Sign of the first Markov parameter (T, l, r) of every column that is not negligible."""
-    return np.array([leading_sign(response[:, :, j].ravel(), 1e-6) for j in range(response.shape[2])])
 
 
 def _shapes(*sizes: int) -> dict[str, tuple[int, ...]]:

@@ -9,10 +9,11 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning
+from optid.identify.dynamics import Levels, mean_slopes
 from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
 from optid.identify.validation.predictions import one_step_or_nan, simulated
-from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions, step_length
+from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions
 from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 MOST_EXPERIMENTS = 4
 COLOURS = tuple(f"c{k}" for k in range(10))
+FAMILIES = ("nonlinearities", "feedback", "latent")
 Lines = tuple[str, list[Array] | None, dict[str, Any]]
 
 
@@ -114,13 +116,16 @@ def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", ca
     return charts
 
 
-def nonlinearity_charts(fit: "Fit", linear: bool = False) -> list[Chart]:
-    """Every static function, or every nonlinear one, over its interval, its 95 % band, and the density of samples."""
+def nonlinearity_charts(fit: "Fit", linear: bool = False, families: Sequence[str] = FAMILIES) -> list[Chart]:
+    """Every static function, or every nonlinear one, over its interval, its 95 % band, and the density of samples.
+
+    Functions of inputs are in the gauge of the model; the families are attributes of the model.
+    """
     known, _ = uncertainty(fit)
     record = fit.data.raw() if isinstance(fit.data, Data) else None
     charts = []
     for function in static_functions(fit.model):
-        if function.is_linear and not linear:
+        if function.family not in families or function.is_linear and not linear:
             continue
         f = function.nonlinearity
         samples = visited(function, record)
@@ -148,18 +153,20 @@ def density(samples: Array, low: float, high: float) -> Series:
     return Series("density of the samples", edges[:-1], counts / max(counts.max(), 1), "bars", "muted", aside=True)
 
 
-def dynamics_charts(models: dict[str, Any], fit: "Fit | None" = None) -> list[Chart]:
-    """Bode magnitude and phase (with the bands of a fit), step response, and poles."""
+def dynamics_charts(models: dict[str, Any], levels: Levels, known: Any = None) -> list[Chart]:
+    """Bode magnitude and phase from input to output, with bands where the uncertainty is known, and poles.
+
+    A nonlinear f counts with its range over that of its input, between two levels of every input, so that the scale
+    between f and B has no effect.
+    """
     first = next(iter(models.values()))
     w = np.geomspace(np.pi / first.dt * 1e-3, np.pi / first.dt, 300)
     pairs = response_pairs(first)
-    known = uncertainty(fit)[0] if fit is not None else None
-    size, turn = (None, None) if known is None else known.frequency_response(w)
-    magnitude, phase, steps = [], [], []
+    size, turn = (None, None) if known is None else known.frequency_response(
+        w, lambda model: mean_slopes(model, levels))
+    magnitude, phase = [], []
     for m, (label, model) in enumerate(models.items()):
-        curves = model.frequency_response(w).reshape(w.size, -1)
-        response = model.step_response(step_length(model)).reshape(step_length(model), -1)
-        t = model.dt * np.arange(len(response))
+        curves = (model.frequency_response(w) * mean_slopes(model, levels)).reshape(w.size, -1)
         for k, (u, y) in enumerate(pairs):
             colour = COLOURS[(m * len(pairs) + k) % len(COLOURS)]
             name = " ".join(part for part in (label, f"{u} to {y}" if len(pairs) > 1 else "") if part) or "response"
@@ -171,13 +178,12 @@ def dynamics_charts(models: dict[str, Any], fit: "Fit | None" = None) -> list[Ch
                 phase.append(Series("95 % band" if len(pairs) == 1 else "", w, upper, "area", colour, lower))
             magnitude.append(Series(name, w, decibels(np.abs(curves[:, k])), colour=colour, width=2.0))
             phase.append(Series(name, w, np.degrees(np.unwrap(np.angle(curves[:, k]))), colour=colour, width=2.0))
-            steps.append(Series(name, t, response[:, k], colour=colour, width=2.0))
     frequency = Axis(frequency_title(first), log=True, low=float(w[0]), high=float(w[-1]))
-    caption = "The linear part, up to the Nyquist frequency" + ("; shaded: 95 % bands." if known is not None else ".")
+    bent = any(not function.is_linear for model in models.values() for function in static_functions(model))
+    caption = ("From input to output, up to the Nyquist frequency" + ", with the mean slope of f" * bent
+               + ("; shaded: 95 % bands." if known is not None else "."))
     return [Chart("Bode diagram: magnitude", caption, frequency, Axis("magnitude (dB)", unit="dB"), magnitude, "bode"),
             Chart("Bode diagram: phase", caption, frequency, Axis("phase (degrees)", unit="degrees"), phase, "bode"),
-            Chart("Step response", "Response of the linear part to a unit step of the function of the input.",
-                  response_axis(first), Axis("response"), steps),
             pole_chart({label: model.poles for label, model in models.items()})]
 
 

@@ -1,7 +1,7 @@
 """Documents of every result, most important facts first, which terminal, notebook and page render."""
 
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,11 +9,13 @@ import numpy as np
 from optid.data.description import RECORD
 from optid.data.record import Data
 from optid.errors import DataError
+from optid.identify.dynamics import input_levels
 from optid.identify.informativity import informativity
+from optid.identify.responses import Response
 from optid.identify.validation import Validation
 from optid.identify.validation.predictions import SIMULATION, prediction_fit
 from optid.identify.verdict import POOR_FIT, USELESS_FIT
-from optid.show import charts, checks, estimates, summary, wording
+from optid.show import charts, checks, estimates, responses, summary, wording
 from optid.show.record import informativity_table
 from optid.show.sections import (
     TONES,
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
     from optid.identify.validation import Comparison
     from optid.identify.verdict import Verdict
 
+Curves = Callable[[], tuple[list[Response], list[str]]]
+
 ORDERS = 12
 """Orders listed of a study, where the recommended one is not larger."""
 
@@ -58,13 +62,15 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
         advise: whether to say what would help a poor model, which takes time.
     """
     lead = " · ".join(part for part in (fit.formulation, fit.data.name, _length(fit.data)) if part)
+    curves = cache(lambda: responses.fit_responses(fit, estimates.uncertainty(fit)[0]))
     sections = [
         *_record(fit.record_findings),
         Section("trust", "", lambda: _trust(fit, fit.verdict if judged is None else judged, test, advise)),
+        Section("dynamics", "Dynamics", lambda: _dynamics(fit, curves)),
         Section("optimum", "", lambda: _optimum(fit)),
         Section("model", "Model", lambda: _model(fit)),
         Section("constraints", "Constraints and their prices", lambda: [summary.constraint_table(fit)]),
-        Section("figures", "Figures", lambda: _fit_charts(fit), page_only=True),
+        Section("figures", "Figures", lambda: _fit_charts(fit, curves), page_only=True),
         Section("validation", "Validation", lambda: _validations(fit, test), page_only=True),
         Section("certificate", "Certificate", lambda: [summary.certificate_facts(fit)], page_only=True),
         Section("data", "Data", lambda: [
@@ -80,20 +86,32 @@ def fit_document(fit: "Fit", test: Data | None = None, *, judged: "Verdict | Non
     return Document(summary.title(fit), lead, [one for one in sections if not left_out.get(one.id)])
 
 
+def _dynamics(fit: "Fit", curves: Curves) -> list[Any]:
+    """Return what the model does in the units of the record: dynamics, then characteristics at a few points."""
+    return [*attempt("The table of the dynamics", lambda: [estimates.parameters_table(fit.dynamics)]),
+            *attempt("The static characteristics", lambda: [
+                *responses.curve_tables(curves()[0], fit.model), *([Notes(curves()[1])] if curves()[1] else [])])]
+
+
 def _model(fit: "Fit") -> list[Any]:
-    """Return equation, facts, tables and intermediate results; each fails without the others."""
+    """Return equation, facts, tables and intermediate results; each fails without the others.
+
+    f itself, whose scale and sign are a matter of the gauge, is for those who ask: the page opens it on a click.
+    """
     tables = [*attempt("The table of the parameters", lambda: estimates.parameter_tables(fit)),
-              *attempt("The table of the nonlinearities", lambda: estimates.nonlinearity_tables(fit)),
+              *attempt("The table of the nonlinearities", lambda: estimates.nonlinearity_tables(fit, inputs=False)),
               *attempt("The fit on the estimation record", lambda: [summary.fit_table(fit)]),
               *attempt("The table of the noise", lambda: filter(None, [summary.noise_table(fit)]))]
     evidence = attempt("The intermediate results", lambda: filter(None, [summary.evidence_facts(fit)]))
-    coefficients = attempt("The coefficients of the basis", lambda: filter(None, [estimates.coefficient_table(fit)]))
+    gauged = [*attempt("The table of f", lambda: estimates.nonlinearity_tables(fit, inputs=True)),
+              *attempt("The coefficients of the basis", lambda: filter(None, [estimates.coefficient_table(fit)]))]
+    drawn = attempt("The figure of f", lambda: charts.nonlinearity_charts(fit, families=("nonlinearities",)))
     return [
         *attempt("The equation", lambda: [Code(fit.model.equation(), equation=True)]),
         *attempt("The facts about the model", lambda: [summary.model_facts(fit)]),
         Pair(tables),
         *([Heading("Intermediate results"), *evidence] if evidence else []),
-        *([Fold("Coefficients of the basis", coefficients)] if coefficients else [])]
+        *([Fold("f in its gauge", [*([Charts(drawn)] if drawn else []), *gauged])] if gauged else [])]
 
 
 def _record(findings: Sequence[str]) -> list[Section]:
@@ -155,14 +173,19 @@ def _optimum(fit: "Fit") -> list[Any]:
             *([Notes(fit.findings)] if fit.findings else [])]
 
 
-def _fit_charts(fit: "Fit") -> list[Any]:
+def _fit_charts(fit: "Fit", curves: Curves) -> list[Any]:
     parts: list[Any] = []
     data, models = fit.data, {"": fit.model}
+    record = data.raw() if isinstance(data, Data) else None
     if isinstance(data, Data):
         parts += attempt("The figure of the record", lambda: [Charts(charts.record_charts(models, data), wide=True)])
     several = [
-        *attempt("The figure of the nonlinearities", lambda: charts.nonlinearity_charts(fit)),
-        *attempt("The figure of the dynamics", lambda: charts.dynamics_charts(models, fit)),
+        *attempt("The figure of the responses", lambda: [
+            one.chart for one in responses.curve_charts({"fit": curves()[0]}, [fit.model], record)]),
+        *attempt("The figure of the nonlinearities", lambda: charts.nonlinearity_charts(
+            fit, families=charts.FAMILIES[1:])),
+        *attempt("The figure of the dynamics", lambda: charts.dynamics_charts(
+            models, input_levels(fit.model, record), estimates.uncertainty(fit)[0])),
         *attempt("The figure of Theta", lambda: charts.theta_charts(fit)),
         *attempt("The figure of the singular values", lambda: charts.spectrum_charts(fit)),
         *attempt("The figure of the noise", lambda: [charts.noise_chart(fit.model)] if summary.has_noise(fit.model)
@@ -245,17 +268,21 @@ def validation_document(checked: Validation) -> Document:
 def comparison_document(found: "Comparison", *, command: str = "") -> Document:
     """Return the document of several models on one record."""
     models = dict(zip(found.names, found.models))
-    several = len(models) > 1
+    several, alike = len(models) > 1, len({(m.l, m.m) for m in found.models}) == 1
+    curves = cache(lambda: responses.comparison_curves(found))
     title = f"{len(models)} models on one record" if several else f"Validation of a {found.models[0].title}"
     lead = " · ".join(part for part in (found.data.name, _length(found.data)) if part)
 
     def figures() -> list[Any]:
-        alike = len({(m.l, m.m) for m in found.models}) == 1
-        linear = attempt("The figure of the dynamics", lambda: charts.dynamics_charts(models) if alike else [
+        record = found.data.raw()
+        linear = attempt("The figure of the dynamics", lambda: charts.dynamics_charts(
+            models, responses.record_levels(record)) if alike else [
             charts.pole_chart({name: model.poles for name, model in models.items()})])
+        shown = attempt("The figure of the responses", lambda: [
+            one.chart for one in responses.curve_charts(curves()[0], found.models, record)])
         return [*attempt("The figure of the record", lambda: [
                     Charts(charts.record_charts(models, found.data, ahead=False), wide=True)]),
-                Charts([*charts.horizon_charts(found), *linear])]
+                Charts([*charts.horizon_charts(found), *shown, *linear])]
 
     def each() -> list[Any]:
         return [part for name, model, checked in zip(found.names, found.models, found.validations)
@@ -265,9 +292,17 @@ def comparison_document(found: "Comparison", *, command: str = "") -> Document:
     return Document(title, lead, [
         *_record(found.data.findings),
         Section("fits", "Fits", lambda: [checks.comparison_table(found), checks.facts_table(found)]),
+        Section("dynamics", "Dynamics", lambda: comparison_dynamics(found, curves())),
         Section("figures", "Figures", figures, page_only=True),
         Section("validation", "Each model by itself", each, page_only=True),
         Section("reproduce", "Reproduce", lambda: _reproduce(call, str(found)), page_only=True)])
+
+
+def comparison_dynamics(found: "Comparison", curves: tuple[Any, list[str]]) -> list[Any]:
+    """Return time constants, dead times and gains of models side by side, and what they do in output units."""
+    return [*attempt("The table of the dynamics", lambda: [responses.comparison_dynamics(found)]),
+            *attempt("The responses", lambda: responses.comparison_tables(curves[0], found.models[0])),
+            *([Notes(curves[1])] if curves[1] else [])]
 
 
 def order_document(study: "OrderStudy") -> Document:

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.bases.splines import Triangular
-from optid.errors import OptidError
 from optid.identify.parameters import Parameter, Parameters, function_parameters
+from optid.identify.parameters import uncertainty_or_reason as uncertainty
 from optid.models.functions import static_functions
 from optid.show.wording import Table, number
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
-    from optid.identify.uncertainty import Uncertainty
 
 MOST_NODES, EVEN = 20, 11
 """A piecewise linear f with fewer cells than the first is listed at its nodes, any other at so many points."""
@@ -22,20 +21,12 @@ MOST_ROWS, ABREAST = 12, 3
 """More coefficients than the first, without errors to show, are set in so many columns."""
 
 
-def uncertainty(fit: "Fit") -> tuple["Uncertainty | None", str]:
-    """Return the uncertainty of a fit, or None and the reason why there is none."""
-    try:
-        return fit.uncertainty, ""
-    except OptidError as error:
-        return None, str(error)
-
-
 def parameter_tables(fit: "Fit") -> list[Table]:
     """Estimates with their standard errors and 95 % intervals if available, then matrices without."""
     known, reason = uncertainty(fit)
     found = []
     if known is not None:
-        rows = [_interval_row(name, *row) for name, *row in known.table()]
+        rows = [interval_row(name, *row) for name, *row in known.table()]
         state_space = fit.model.structure == "ss"
         found.append(Table("Poles and static gain" if state_space else "Parameters",
                            ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows))
@@ -49,12 +40,15 @@ def parameter_tables(fit: "Fit") -> list[Table]:
     return [*found, Table(title, ("parameter", "estimate") * ABREAST, _abreast(rows), note)]
 
 
-def nonlinearity_tables(fit: "Fit") -> list[Table]:
-    """Values of every nonlinearity at a few points, with their pointwise bands where there are some."""
+def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:
+    """Values of nonlinearities at a few points, with their pointwise bands where there are some.
+
+    Those of the inputs, in the gauge of the model, or those of outputs that are fed back and of latent signals.
+    """
     found = []
     known, _ = uncertainty(fit)
     for function in static_functions(fit.model):
-        if function.is_linear:
+        if function.is_linear or inputs != (function.family == "nonlinearities"):
             continue
         f = function.nonlinearity
         basis: Any = f.basis
@@ -66,7 +60,7 @@ def nonlinearity_tables(fit: "Fit") -> list[Table]:
             band = known.band(function.index, points, family=function.family)
             numeric = zip(points, band.value, band.error, band.lower, band.upper)
             size = float(np.max(np.abs(band.value)))
-            rows = [_interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
+            rows = [interval_row(number(u, 4), *row, size=size) for u, *row in numeric]
             head = ("std. error", "95 % low", "95 % high")
         title = f"{function.what} {function.word}, basis {_basis(f.basis)}"
         found.append(Table(title, (label, function.word, *head), rows))
@@ -82,32 +76,39 @@ def coefficient_table(fit: "Fit") -> Table | None:
 
 
 def parameters_table(found: Parameters) -> Table:
-    """Every parameter with its interval."""
-    note = f"No standard errors: {found.reason.rstrip('.')}." if found.reason else ""
-    return _parameter_table("Parameters", found, bool(found.reason), found.level, note)
+    """Every parameter with its interval, and its unit where one is known."""
+    reason = [f"No standard errors: {found.reason.rstrip('.')}."] if found.reason else []
+    return _parameter_table(found.title, found, bool(found.reason), found.level, " ".join([*reason, *found.notes]))
 
 
 def _parameter_table(title: str, rows: Iterable[Parameter], bare: bool, level: float = 0.95, note: str = "") -> Table:
-    if bare:
-        return Table(title, ("parameter", "estimate"), [(row.name, number(row.estimate)) for row in rows], note)
-    ends = (f"{100 * level:g} % low", f"{100 * level:g} % high")
-    return Table(title, ("parameter", "estimate", "std. error", *ends), [_interval_row(*row) for row in rows])
+    listed, ends = list(rows), (f"{100 * level:g} % low", f"{100 * level:g} % high")
+    head = ("parameter", "estimate") if bare else ("parameter", "estimate", "std. error", *ends)
+    cells = [(row.name, number(row.estimate)) if bare else interval_row(*row[:5]) for row in listed]
+    if any(row.unit for row in listed):
+        head, cells = (*head, "unit"), [(*line, row.unit) for line, row in zip(cells, listed)]
+    return Table(title, head, cells, note)
 
 
-def _interval_row(
+def interval_row(
     name: str, value: float, error: float, lower: float, upper: float, size: float = 0.0
 ) -> tuple[str, ...]:
     """Write an estimate to the second digit of its standard error, as one reads it in a paper.
 
-    Errors far below `size` are roundoff: the gauge or the basis fixes the value.
+    Errors far below `size` are roundoff: the gauge or the basis fixes the value. An error that is not known is a dash,
+    an end that does not exist "none".
     """
     size = max(size, abs(value))
+    if np.isnan(error):
+        return name, number(value), "-", "-", "-"
     if not error > 1e-9 * size:
         return name, number(value if abs(value) > 1e-9 * size else 0.0), "fixed", "-", "-"
-    decimals = 1 - int(np.floor(np.log10(error)))
-    if decimals > 7 or max(abs(value), abs(lower), abs(upper)) >= 1e7:
-        return name, f"{value:.4e}", f"{error:.1e}", f"{lower:.4e}", f"{upper:.4e}"
-    return name, *(f"{x:.{max(decimals, 0)}f}" for x in (value, error, lower, upper))
+    decimals, cells = 1 - int(np.floor(np.log10(error))), (value, error, lower, upper)
+    if decimals > 7 or max(abs(x) for x in cells if np.isfinite(x)) >= 1e7:
+        written = [f"{x:.{1 if x is error else 4}e}" for x in cells]
+    else:
+        written = [f"{x:.{max(decimals, 0)}f}" for x in cells]
+    return name, *("none" if np.isinf(x) else word for x, word in zip(cells, written))
 
 
 def _basis(basis: Any) -> str:

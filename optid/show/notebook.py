@@ -36,6 +36,7 @@ def fit_html(fit: "Fit", judged: "Verdict | None" = None, *, findings: bool = Tr
         *attempt("The fit", lambda: [", ".join(f"{name} {percent(values)}" for name, values in (
             ("one step", fit.one_step_fit), ("simulation", summary.simulation_fit(fit))))]),
         *attempt("The equation", lambda: [("pre", fit.model.equation())]),
+        *attempt("The table of the dynamics", lambda: [estimates.parameters_table(fit.dynamics)]),
         *attempt("The table of the parameters", lambda: [estimates.parameters_table(fit.params)])])
 
 

@@ -11,10 +11,12 @@ from matplotlib.figure import Figure
 
 from optid.data.record import Data
 from optid.errors import DataError
+from optid.identify.dynamics import input_levels
 from optid.identify.validation import Validation
 from optid.lazy import public_names
 from optid.models.functions import static_functions
-from optid.show import charts, panels
+from optid.show import charts, panels, responses
+from optid.show.estimates import uncertainty
 from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, styled
 from optid.show.sections import Chart
 from optid.structures.least_squares import rank_one_of
@@ -34,7 +36,7 @@ THRESHOLD = 1e-8
 
 @styled
 def overview(fit: "Fit", test: Data | None = None) -> Figure:
-    """Draw the whole result on one page: fit over time, nonlinearities, residual tests, poles, frequency response.
+    """Draw the result on one page: fit over time, characteristics, residual tests, poles, frequency response.
 
     Args:
         fit: the fit.
@@ -54,7 +56,7 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     left, right = rows[1:3] if rows_of_f else rows[1].subfigures(1, 2, width_ratios=[1, 1.45]) if functions else (
         None, rows[1])
     if left is not None:
-        attempt_panels(left, "Nonlinearities", lambda part: _panels(part, charts.nonlinearity_charts(fit, linear=True)))
+        attempt_panels(left, "Characteristics", lambda part: _panels(part, _functions(fit)))
     attempt_panels(right, "The dynamics", lambda part: _dynamics_panels(part, fit))
     attempt_panels(rows[-1], "The residual tests", lambda part: _residual_panels(
         part, _validated(model, record), record, outputs=1, inputs=min(model.m, 2)))
@@ -81,7 +83,7 @@ def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
 
 @styled
 def nonlinearity(fit: "Fit") -> Figure:
-    """Draw every static nonlinearity, of inputs and of outputs fed back, with its 95 % band and where samples lie.
+    """Draw every static nonlinearity in the gauge of the model, with its 95 % band and where samples lie.
 
     Raises:
         DataError: the model has no static functions.
@@ -114,9 +116,10 @@ def residual_tests(fit: "Fit", data: Data | None = None, checked: Validation | N
 
 @styled
 def poles_and_response(fit: "Fit") -> Figure:
-    """Draw poles, frequency response (with 95 % bands) and step response of the linear part."""
-    figure = Figure(figsize=(10.0, 3.3), layout="constrained")
-    _dynamics_panels(figure, fit, step=True)
+    """Draw poles, and frequency response and step responses from input to output, with 95 % bands."""
+    figure = Figure(figsize=(10.0, 3.3 * -(-(2 + fit.model.m * fit.model.l) // 3)), layout="constrained")
+    steps = [one.chart for one in _drawn(fit) if one.curve.kind == "step"]
+    _panels(figure, [*_dynamics(fit), *steps])
     return figure
 
 
@@ -270,12 +273,29 @@ def _residual_panels(figure: Any, checked: Validation | str, record: Data, outpu
             ax.set_ylabel("" if k else plain(f"residual of {shorten(name)}"))
 
 
-def _dynamics_panels(figure: Any, fit: "Fit", step: bool = False) -> None:
-    """Poles, the magnitude of every input-output pair and, on request, the step responses."""
-    magnitude, _, steps, poles = charts.dynamics_charts({"": fit.model}, fit)
-    shown = [poles, magnitude, steps] if step else [poles, magnitude]
-    axes = figure.subplots(1, len(shown), width_ratios=[1.0, 1.45, 1.25] if step else [1.0, 1.7])
-    for ax, chart in zip(axes, shown):
+def _dynamics(fit: "Fit") -> list[Chart]:
+    """Poles, and the magnitude of every input-output pair."""
+    record = fit.data.raw() if isinstance(fit.data, Data) else None
+    magnitude, _, poles = charts.dynamics_charts({"": fit.model}, input_levels(fit.model, record), uncertainty(fit)[0])
+    return [poles, magnitude]
+
+
+def _drawn(fit: "Fit") -> list[responses.Drawn]:
+    """Characteristics and step responses in output units."""
+    record = fit.data.raw() if isinstance(fit.data, Data) else None
+    found, _ = responses.fit_responses(fit, uncertainty(fit)[0])
+    return responses.curve_charts({"fit": found}, [fit.model], record)
+
+
+def _functions(fit: "Fit") -> list[Chart]:
+    """Static characteristics, or rates, in output units, and functions of outputs fed back and of latent signals."""
+    shown = [one.chart for one in _drawn(fit) if one.curve.kind != "step"]
+    return shown + charts.nonlinearity_charts(fit, linear=True, families=charts.FAMILIES[1:])
+
+
+def _dynamics_panels(figure: Any, fit: "Fit") -> None:
+    shown = _dynamics(fit)
+    for ax, chart in zip(figure.subplots(1, len(shown), width_ratios=[1.0, 1.7]), shown):
         panels.draw_chart(ax, chart)
 
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from optid.show import checks, documents, estimates, summary
+from optid.show import checks, documents, estimates, responses, summary
 from optid.show.sections import Notes, attempt
 from optid.show.terminal import WIDTH, facts_lines, findings_lines, part_lines, set_table, text, wrapped
 
@@ -57,7 +57,9 @@ def describe_horizons(curve: "HorizonCurve") -> str:
 
 def describe_comparison(found: "Comparison") -> str:
     """Return the comparison of several models as text, at most 80 columns wide."""
-    return "\n".join([*findings_lines(found.data.findings), *set_table(checks.comparison_table(found))])
+    parts = attempt("The dynamics", lambda: documents.comparison_dynamics(found, responses.comparison_curves(found)))
+    return "\n".join([*findings_lines(found.data.findings), *set_table(checks.comparison_table(found)),
+                      *(line for part in parts for line in ("", *part_lines(part)))])
 
 
 def describe_parameters(found: "Parameters") -> str:

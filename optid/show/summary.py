@@ -70,7 +70,7 @@ def judgement(found: "Verdict") -> str:
 
 def verdict_table(found: "Verdict") -> Table:
     """The tests behind the verdict on a model, each with its value and outcome."""
-    rows = [(part.name, part.value, "PASS" if part.passed else "FAIL") for part in found.parts]
+    rows = [(part.name, part.value, part.outcome) for part in found.parts]
     return Table("", ("test", "value", "outcome"), rows)
 
 
@@ -242,15 +242,18 @@ def model_facts(fit: "Fit") -> Facts:
 
 def _gauge(model: Any) -> str:
     """Say how the scale between f and the linear part is fixed; "" without a gauge."""
-    positive = all(b.flat[0] >= 0 for b in getattr(model, "b", ()))
-    sign = "its first coefficient positive" if positive else "its sign follows from the constraints"
     known = {
-        "norm": f"norm of b is one, {sign}",
+        "norm": "norm of b is one",
         "gain": "static gain of the linear part is one",
         "b0": "first coefficient of b is one",
         "none": "",
     }
-    return known.get(model.gauge, str(model.gauge))
+    words = known.get(model.gauge, str(model.gauge))
+    if model.gauge != "norm":
+        return words
+    functions = [function for function in static_functions(model) if function.family == "nonlinearities"]
+    falls = [function.word for function, sign in zip(functions, model.gain_signs) if sign < 0]
+    return f"{words}; the output {'falls' if falls else 'rises'} with {_and(falls) if falls else 'f'}"
 
 
 def has_noise(model: Any) -> bool:

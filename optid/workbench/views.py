@@ -9,17 +9,19 @@ import numpy as np
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import OptidError
+from optid.identify import responses
+from optid.identify.dynamics import input_levels
 from optid.identify.uncertainty import uncertainty
-from optid.models.functions import step_length
 from optid.show import charts, summary
 from optid.show.page import coded
-from optid.show.sections import TONES, Chart, Series
+from optid.show.responses import curve_charts, longest
+from optid.show.sections import TONES
 
 SHOWN = 1400
 """Samples of a curve that are drawn; of a longer one the extremes of half as many stretches."""
 
-POINTS, STEPS, DRAWS = 41, 60, 1000
-"""Points of a characteristic; most samples of a step response; draws for a band under constraints."""
+DRAWS = 1000
+"""Draws for a band under constraints."""
 
 
 def quick(fit: Any, run: list[Array] | None, output: str | None = None) -> dict[str, Any]:
@@ -53,45 +55,18 @@ def time_chart(record: Data, run: list[Array] | None, experiment: int = 0,
 
 def characteristics(fit: Any, record: Data, output: str | None = None) -> list[dict[str, Any]]:
     """Return the static characteristic and the step response of an output to every input, with bands if known."""
-    model, found, several = fit.model, [], len(record.outputs) > 1
+    model, several = fit.model, len(record.outputs) > 1
     o = 0 if output is None else record.outputs.index(output)
-    name, unit = record.outputs[o], record.output_units[o]
     known = None
     with suppress(OptidError):  # some fits have no intervals
         known = uncertainty(fit, draws=DRAWS)
-    count = min(step_length(model), STEPS)
-    for c, channel in enumerate(record.inputs):
-        basis = model.nonlinearities[c].basis
-        samples = np.concatenate([e.u[:, c] for e in record.experiments])
-        low, high = basis.interval or (float(np.nanmin(samples)), float(np.nanmax(samples)))
-        points = np.unique(np.append(np.linspace(low, high, POINTS), getattr(basis, "nodes", [])))
-        span = np.array([low, high])
-
-        def shown(model: Any, c: int = c, points: Array = points, span: Array = span) -> Array:
-            f = model.nonlinearities[c]
-            step = model.step_response(count).reshape(count, model.l, -1)[:, o, c] * np.diff(f(span))
-            rest = np.full(points.size, np.nan)
-            with suppress(OptidError):  # a plant that integrates, or one without an equilibrium at some input
-                rest = model.static_curve(c, points)[:, o]
-            return np.concatenate([rest, step])
-
-        value = shown(model)
-        band = None if known is None else known.of(shown)
-        bars = charts.density(samples[np.isfinite(samples)], low, high)
-        for what, at, x, extra in (
-                ("static", points, charts.channel_axis(channel, record.input_units[c]), [bars]),
-                ("step", model.dt * np.arange(count), charts.response_axis(model), [])):
-            part = slice(0, points.size) if what == "static" else slice(points.size, None)
-            if np.isnan(value[part]).all():
-                continue
-            series = [] if band is None else [Series("95 % band", at, band.upper[part], "area", lows=band.lower[part])]
-            title = f"Static characteristic of {f'{name} against ' if several else ''}{channel}"
-            if what == "step":
-                title = f"Step response {f'of {name} ' if several else ''}to {channel} from {low:.3g} to {high:.3g}"
-            y = charts.channel_axis(name, unit)
-            chart = Chart(title, "", x, y, [*series, Series("fit", at, value[part], width=2.2), *extra], height=300)
-            found.append(coded(chart) | {"tool": what, "channel": channel if model.m > 1 else None,
-                                         "output": name if several else None, "dt": model.dt, "interval": [low, high]})
+    curves, _ = responses.responses(model, input_levels(model, record), known, longest(record))
+    found = []
+    for one in curve_charts({"fit": [curve for curve in curves if curve.output == o]}, [model], record):
+        curve, channel = one.curve, record.inputs[one.curve.input]
+        found.append(coded(one.chart) | {
+            "tool": "" if curve.kind == "rate" else curve.kind, "channel": channel if model.m > 1 else None,
+            "output": record.outputs[o] if several else None, "dt": model.dt, "interval": list(curve.levels)})
     return found
 
 

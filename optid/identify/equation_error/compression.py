@@ -22,7 +22,6 @@ from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.arguments import Offset, check_offset, per_channel
 from optid.models import HammersteinTF, Nonlinearity
-from optid.models.gauges import leading_sign
 from optid.program.compressed import Spread, white_spread
 from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
@@ -129,14 +128,9 @@ class EquationError:
               gauge: str, flip: bool = True) -> HammersteinTF:
         """Build the model in the units of the record from one (mu, b) per input, b of shape `b_shape`.
 
-        The values hold ``a`` and ``offset``; the gauge is the one to report in, and `flip` makes the first non-zero of
-        every b positive.
+        The values hold ``a`` and ``offset``; the gauge is the one to report in, and `flip` turns every f that does not
+        rise where the output rises.
         """
-        ny, na = self.layout.l, self.layout.na
-        a = np.asarray(values.get("a", np.zeros(0)))
-        if ny > 1:
-            a = np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
-        signs = [leading_sign(np.asarray(b)) if flip else 1.0 for b in bs]
         levels = None
         if self.means is not None:
             pairs = zip(self.keys("mu"), mus, self.keys("b"), bs)
@@ -144,14 +138,21 @@ class EquationError:
             linear = {name: values[name] for name in ("a", "offset") if name in values}
             levels = self.means.constants(self.regression({**linear, **point}))
         model = HammersteinTF(
-            a=a, b=tuple(s * np.asarray(b) for s, b in zip(signs, bs)),
-            nonlinearities=tuple(Nonlinearity(basis, s * np.asarray(mu), None)
-                                 for s, basis, mu in zip(signs, self.layout.bases, mus)),
-            nk=self.layout.nk, offset=np.asarray(values["offset"], dtype=float), levels=levels, gauge=gauge,
-            **self.meta)
+            a=self.past(values), b=tuple(map(np.asarray, bs)),
+            nonlinearities=tuple(map(Nonlinearity, self.layout.bases, mus)), nk=self.layout.nk,
+            offset=np.asarray(values["offset"], dtype=float), levels=levels, gauge=gauge, **self.meta)
+        model = model.turned(model.gain_signs) if flip else model
         if self.shifts is not None:
             model = model.with_output_levels(self.shifts)
         return model.with_transform(self.units)
+
+    def past(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return the coefficients of A as models have them, (na,) or (na, l, l), from the variable ``a``, if any."""
+        ny, na = self.layout.l, self.layout.na
+        a = np.asarray(values.get("a", np.zeros(0)))
+        if ny == 1:
+            return a
+        return np.stack([a[:, i * ny : (i + 1) * ny] for i in range(na)]) if na else np.zeros((0, ny, ny))
 
 
 def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int],

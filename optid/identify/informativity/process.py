@@ -31,6 +31,7 @@ LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice t
 UNIT = 0.5  # share of the longest experiment beyond which a time constant is compared with an integrator
 FILLED = 20  # missing samples of an input up to which they are estimated
 ROUNDING = 1e-13
+EXACT = 1e-16  # mean square of errors, over the variance of the output, at which a response is exact
 STEPS, FARTHEST, NUDGE = 12, 1.0, 1e-6  # of a descent; longest step in a logarithm; step of a difference
 ENOUGH = 1e-3  # fall of twice the log likelihood at which a descent ends
 
@@ -194,7 +195,8 @@ def _process(signals: Signals, o: int, name: str, least: int) -> Process:
         change = np.pad(noise, (0, size - noise.size)) - np.pad(regression.noise, (0, size - regression.noise.size))
         same = before == [(p.term.lag, p.term.order, p.term.zeros) for p in known]
         whole = not any(lost.any() for lost in signals.lost)
-        if np.max(np.abs(change)) < SETTLED and (same or (turn == 0 and whole)):
+        exact = all(p.energy <= EXACT * regression.count for p in known)
+        if exact or np.max(np.abs(change)) < SETTLED and (same or (turn == 0 and whole)):
             break
         regression = regression.with_noise(noise)
     spread = float(np.nanvar(np.concatenate(errors)))
@@ -218,19 +220,20 @@ def _found(regression: Regression, u: tuple[Array, ...], levels: int, least: int
     nodes = np.unique(np.quantile(whole, np.linspace(0, 1, NODES)))
     if nodes.size < 4:
         return best
-    term = best.term
+    starts = [best.term] if before is None or before.drive.nodes is None else [before.term, best.term]
     squares = _Drive(tuple((u - whole.mean()) ** 2 for u in straight.values))
     even = scan(regression, squares.values, longest, 1)
     if even and even[0].energy < 0.9 * best.energy and even[0].lag >= least:  # f is nearly even
-        term = _Term.of(even[0].poles, even[0].lag)
-    for _ in range(2):
-        bent = _bent(regression, straight, term, nodes)
-        if bent is None:
-            return best
-        found = _searched(regression, bent, least, longest, term, scanned=False)
-        term = found.term
-        if found.criterion < best.criterion:
-            best = found
+        starts[-1] = _Term.of(even[0].poles, even[0].lag)
+    for term in dict.fromkeys(starts):  # that of a straight f may be far from the one found for a bent f
+        for _ in range(2):
+            bent = _bent(regression, straight, term, nodes)
+            if bent is None:
+                break
+            found = _searched(regression, bent, least, longest, term, scanned=False)
+            term = found.term
+            if found.criterion < best.criterion:
+                best = found
     return best
 
 
@@ -250,13 +253,15 @@ def _searched(regression: Regression, drive: _Drive, least: int, longest: int, s
         lags = [one for one in scan(regression, drive.values, longest, order) if one.lag >= least]
         terms += [_Term.of(one.poles, one.lag) for one in lags[: KEPT if start is None else 2]]
     best = min(map(fitted, terms), key=lambda p: p.criterion)
+    exact = EXACT * regression.count
     oscillating = list(_oscillating(regression, drive, best.term)) if scanned else []
-    while True:
+    while best.energy > exact:
         near = [fitted(term) for term in (*oscillating, *_neighbours(best.term, least, longest, drive))]
         better = min(near, key=lambda p: p.criterion)
         if not better.criterion < best.criterion - 1e-6:
-            return best
+            break
         best, oscillating = better, []
+    return best
 
 
 def _neighbours(term: _Term, least: int, longest: int, drive: _Drive) -> Iterator[_Term]:

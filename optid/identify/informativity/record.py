@@ -9,7 +9,7 @@ from optid.data.channels import interval_text
 from optid.data.record import Data
 from optid.identify.informativity.effect import Effect, effect
 from optid.identify.informativity.excitation import Excitation, copies, excitation, hopeless
-from optid.identify.informativity.feedback import Loop, loop, setpoint
+from optid.identify.informativity.feedback import TIED, Loop, loop, outside, setpoint
 from optid.identify.informativity.process import Process, processes
 from optid.identify.informativity.signals import Signals
 from optid.registry import Rendered
@@ -107,13 +107,7 @@ def _examined(data: Data) -> Informativity:
         loops = tuple(Loop("regulated" if regulated and copy.input == name else "open") for name in data.inputs)
         return Informativity(data.inputs, data.outputs, loops, excitations=tuple(moves), reason=reason,
                              findings=(reason,))
-    found = processes(data)
-    if any(r.nk == 0 for p in found for r in p.responses):
-        later = processes(data, 1)
-        loops = tuple(loop(signals, c, later, data.outputs) for c in range(m))
-        found = later if any(one.word != "open" for one in loops) else found  # what acts at once is a controller
-    else:
-        loops = tuple(loop(signals, c, found, data.outputs) for c in range(m))
+    found, loops = _loops(data, signals)
     least = int(any(one.word != "open" for one in loops))
     effects = tuple(effect(signals, c, o, found[o], (u, y), least) for o, y in enumerate(data.outputs)
                     for c, u in enumerate(data.inputs))
@@ -121,6 +115,20 @@ def _examined(data: Data) -> Informativity:
     reason = _regulated(whole) or _led(whole, signals) or _ineffective(whole)
     return Informativity(data.inputs, data.outputs, loops, effects, tuple(moves), found, reason,
                          tuple(_findings(whole, data, reason)))
+
+
+def _loops(data: Data, signals: Signals) -> tuple[tuple[Process, ...], tuple[Loop, ...]]:
+    """Return processes and loops: in a loop the input acts one sample later at the earliest."""
+    inputs = range(len(data.inputs))
+    tied = any(outside(signals, c) < TIED for c in inputs)
+    found = () if tied else processes(data)
+    if not tied and all(r.nk for p in found for r in p.responses):
+        return found, tuple(loop(signals, c, found, data.outputs) for c in inputs)
+    later = processes(data, 1)
+    loops = tuple(loop(signals, c, later, data.outputs) for c in inputs)
+    if any(one.word != "open" for one in loops):  # what acts at once is a controller
+        return later, loops
+    return found or processes(data), loops
 
 
 def _untested(data: Data, why: str) -> Informativity:

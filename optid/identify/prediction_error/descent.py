@@ -101,6 +101,11 @@ class Criterion(ABC):
         """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge: its norm."""
         return float(np.linalg.norm(x[self.unknowns.slices[b]]))
 
+    def gain_sign(self, x: Array, b: str) -> float:
+        """Return the sign that part b of x, and its mu, are given: here that of its largest entry."""
+        part = x[self.unknowns.slices[b]]
+        return -1.0 if part[np.argmax(np.abs(part))] < 0 else 1.0
+
     def normalised(self, x: Array) -> Array:
         """Return the same model in the gauge."""
         x, at = np.array(x), self.unknowns.slices

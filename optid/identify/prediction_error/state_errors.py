@@ -104,6 +104,10 @@ class StateErrors(Criterion):
             return False
         return not self.checks or not any(check(self.at(point)) for check in self.checks)
 
+    def gain_sign(self, x: Array, b: str) -> float:
+        """Return the sign of the gain from an input, or of the largest entry of what a latent signal adds."""
+        return float(self._placed(x)[1].gain_signs[int(b[1:])]) if b.startswith("b") else super().gain_sign(x, b)
+
     def gauge_rows(self, x: Array) -> Array:
         """Orthonormal directions (rows, shared) of theta that a step does not take, since they change no output."""
         at, rows = self.unknowns.slices, list(self.unknowns.similarity(x))

@@ -20,7 +20,6 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.descent import STEPS, Criterion, Descent
-from optid.models.gauges import leading_sign
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
 from optid.program.solution import Bound, Solution, Status
@@ -106,7 +105,7 @@ class TangentFit(ABC):
         return Places.of(self.criterion)
 
     def signed(self, x: Array) -> Array:
-        """Turn the signs of mu and b to where the constraints are violated least.
+        """Turn the signs of mu and b to where constraints are violated least; without, f rises where the output does.
 
         A monotone f or a sign of the gain says which of the two equal descriptions is meant; where it asks for the
         opposite characteristic, mu or b alone is turned, since no tangent step leads through zero.
@@ -117,7 +116,7 @@ class TangentFit(ABC):
             if mu.startswith("nu"):  # the signs of feedback functions stay
                 continue
             best, chosen = np.inf, x
-            first = leading_sign(x[at[b]])
+            first = self.criterion.gain_sign(x, b)
             signs = (first, first), (-first, -first), (-first, first), (first, -first)
             for mu_sign, b_sign in signs if mu.startswith("mu") else signs[:2]:
                 turned = np.array(x)
@@ -130,6 +129,19 @@ class TangentFit(ABC):
                     break
             x = chosen
         return x
+
+    def turns(self, x: Array, errors: Linearised) -> Array:
+        """Return -1 for every input whose f falls where the output rises, if the constraints allow the opposite signs.
+
+        1 for the others; (m,). A descent under constraints may end with other signs than it began with.
+        """
+        at, found = self.criterion.unknowns.slices, np.ones(self.criterion.data.m)
+        for mu, b in self.criterion.unknowns.products if self.criterion.gauge == "norm" else ():
+            if mu.startswith("mu") and self.criterion.gain_sign(x, b) < 0:
+                turned = np.array(x)
+                turned[at[mu]], turned[at[b]] = -x[at[mu]], -x[at[b]]
+                found[int(b[1:])] = -1.0 if violation(self.pose(turned, errors, 0.0)) <= INSIDE else 1.0
+        return found
 
 
 def violation(program: Program) -> float:
@@ -216,7 +228,9 @@ class _Iterate:
     def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
         bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
         values, value = self.fit.places.values(self.x), self.fit.criterion.unit * self.at.value
-        return Evidence(self.fit.recover(values), value, bound, status, reason, figures, values=values)
+        model, turns = self.fit.recover(values), self.fit.turns(self.x, self.at) if self.fit.constraints else np.ones(1)
+        model = model.turned(turns) if np.any(turns < 0) else model
+        return Evidence(model, value, bound, status, reason, figures, values=values)
 
 
 def _constrained(here: _Iterate, figures: Mapping[str, Any]) -> Procedure:

@@ -15,7 +15,7 @@ from optid.data.stretches import with_whole_inputs
 from optid.identify.arguments import Offset, check_offset, enough_rows, one_output, outputs_present, per_channel
 from optid.identify.prediction_error.descent import Criterion
 from optid.models import recursions, roots
-from optid.models.gauges import gauge_factor
+from optid.models.gauges import gauge_factor, plant_sign
 from optid.models.layout import Layout
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.statistics.blocks import check_lengths
@@ -86,6 +86,11 @@ class TransferErrors(TransferPredictor, Criterion):
             return super().scale(x, b)
         at, channel = self.unknowns.slices, self.unknowns.layout.inputs[int(b[1:])]
         return 1.0 if self.gauge == "none" else gauge_factor(self.gauge, x[at["a"]], x[at[b]], channel)
+
+    def gain_sign(self, x: Array, b: str) -> float:
+        """Return the sign of the static gain from what part b of x takes in; see `plant_sign`."""
+        at = self.unknowns.slices
+        return plant_sign(x[at["a"]], x[at[b]])
 
     def gauge_rows(self, x: Array) -> Array:
         """Gradients (inputs, p) of the gauge: directions that a step does not take."""

@@ -3,8 +3,8 @@
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,18 @@ from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
-from optid.identify.search.ladder import CLEAR, EQUAL, FEEDBACK, KINDS, LATENT, LINEAR, RUNGS, Ladder, few_levels
+from optid.identify.search.ladder import (
+    CLEAR,
+    EQUAL,
+    FEEDBACK,
+    INPUTS,
+    KINDS,
+    LATENT,
+    LINEAR,
+    RUNGS,
+    Ladder,
+    few_levels,
+)
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import Candidate, Trial, spared, tried
 from optid.identify.verdict import Verdict
@@ -58,11 +69,10 @@ class Identification(Rendered):
         """The model, in raw units."""
         return self.fit.model
 
-    @cached_property
+    @property
     def verdict(self) -> Verdict:
-        """The quality of the model on the record, by cross-validation."""
-        assert isinstance(self.fit.data, Data)
-        return self.fit.judged(self.chosen.by_block.tolist(), self.chosen.score)
+        """The quality of the model on the record, by cross-validation; that of the fit."""
+        return self.fit.verdict
 
 
 def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, blocks: int = 4,
@@ -135,6 +145,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     if chosen is None:
         raise _nothing(list(ladder.trials.values()))
     found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
+    found = replace(found, cross_validated=(tuple(chosen.by_block.tolist()), chosen.score))
     why = reasons(ladder, best)
     if ladder.levels is not None:
         why.append(str(ladder.levels))
@@ -169,15 +180,19 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: 
            ) -> bool:
     """Try batch after batch until no class has more, or the time is over, which returns False.
 
-    Linear models come first, for so many seconds; then the class that has had the least time.
+    The low orders found in the record come first, without and with functions of the inputs; then linear models, for so
+    many seconds; then the class that has had the least time.
     """
+    early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes]
     rungs = {kind: RUNGS[kind](ladder) for kind in kinds}
     waiting: dict[str, list[Candidate]] = {}
     spent = dict.fromkeys(kinds, 0.0)
     while rungs:
-        if ladder.choice() is not None and time.monotonic() > end:
+        if not early and ladder.choice() is not None and time.monotonic() > end:
             return False
-        kind = LINEAR if LINEAR in rungs and spent[LINEAR] < first else min(rungs, key=spent.__getitem__)
+        deadline = np.inf if early else end  # a loaded machine tries the low orders, too
+        kind = early.pop(0) if early else (
+            LINEAR if LINEAR in rungs and spent[LINEAR] < first else min(rungs, key=spent.__getitem__))
         batch = waiting.pop(kind) if kind in waiting else next(rungs[kind], None)
         if batch is None:
             del rungs[kind]
@@ -185,8 +200,8 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: 
         batch = [ladder.levelled(candidate) for candidate in batch]
         clock, rival = time.monotonic(), ladder.rival(kind)
         fresh = [c for c in {c.key: c for c in batch}.values() if c.key not in ladder.trials]
-        last = end if rival else np.inf  # the first are waited for
-        for candidate, trial in zip(fresh, pool.run([(c, rival, end) for c in fresh], last, told)):
+        last = deadline if rival else np.inf  # the first are waited for
+        for candidate, trial in zip(fresh, pool.run([(c, rival, deadline) for c in fresh], last, told)):
             if trial is None:
                 ladder.trials[candidate.key] = Trial(candidate, reason="out of time")
         spent[kind] += time.monotonic() - clock

@@ -100,7 +100,10 @@ class Realisation:
         matrices = form.a, np.column_stack([b[:n] for b in bs[:m]]), form.c, np.column_stack(direct)
         found = state_model(x, data, matrices, mus[:m], mus[m:], np.column_stack([np.zeros((n, 0)), *bs[m:]]),
                             offset=np.asarray(values["offset"]) if form.offset else np.zeros(l))
-        return replace(found, gauge="norm") if any(basis.size > 1 for basis in x.inputs) else found
+        if not any(basis.size > 1 for basis in x.inputs):
+            return found
+        signs = np.where([isinstance(basis, Linear) for basis in x.inputs], 1.0, found.gain_signs)
+        return replace(found.turned(signs), gauge="norm")
 
 
 def observer_problem(records: Sequence[Array], form: ObserverForm, targets: Sequence[Array] | None = None
