@@ -8,7 +8,11 @@ to 0.99, two inputs and two outputs. Others: Wiener, Wiener-Hammerstein, Hammers
 Goals: at most 2 % of the Hammerstein systems are rejected; of every other kind at least 95 % at 2,000 samples and 70 %
 at 400. Every share stands with its 95 % interval (Clopper and Pearson).
 
-    python benchmarks/structure.py [--systems 50] [--samples 400 2000] [--seed 0] [--long]
+    python benchmarks/structure.py [--systems 50] [--samples 400 2000] [--seed 0] [--plants] [--long]
+
+With --plants, records of 150 to 600 samples of slow plants with dead time, as operators make them: steps, bumps, a few
+levels, staircases, saturated or bent ones, binary and smooth inputs, far from zero, with 1 to 20 % white or AR(0.9)
+noise, first and second order or resonant. All are Hammerstein systems; records that are not tested count as kept.
 
 With --long, Wiener-Hammerstein systems (linear, saturation, linear) of 100,000 samples and six pole patterns.
 """
@@ -24,6 +28,7 @@ from montecarlo import share
 from scipy.signal import butter, lfilter
 
 import optid
+from optid.errors import RankError
 from optid.identify.validation.structure import structure_test
 
 Array = np.ndarray
@@ -145,6 +150,8 @@ HAMMERSTEIN = {
 }
 OTHERS = {"Wiener": wiener, "Wiener-Hammerstein": wiener_hammerstein, "Hammerstein-Wiener": hammerstein_wiener,
           "bilinear": bilinear, "Duffing": duffing, "changing gain": changing_gain}
+PLANTS = ("step", "bump", "few levels", "few levels, saturated", "staircase", "staircase, saturated", "staircase, bent",
+          "staircase, resonant", "binary", "binary, resonant", "smooth", "smooth, saturated")
 
 
 def record(kind: str, seed: int, n: int) -> optid.Data:
@@ -155,6 +162,49 @@ def record(kind: str, seed: int, n: int) -> optid.Data:
     shape = NOISES[str(rng.choice(list(NOISES)))]
     v = lfilter(*shape, rng.normal(size=(n + SETTLING, y.shape[1])), axis=0)[SETTLING:]
     return optid.Data(u, y + v / v.std(axis=0) * y.std(axis=0) / np.sqrt(RATIO))
+
+
+def plant_input(rng: np.random.Generator, kind: str, n: int) -> Array:
+    """Draw an input of an ordinary record."""
+    k = np.arange(n)
+    if kind == "step":
+        return np.where(k < rng.integers(n // 20, n // 5), 0.0, 1.0)
+    if kind == "bump":
+        return np.where((k >= rng.integers(n // 10, n // 4)) & (k < rng.integers(n // 2, 3 * n // 4)), 1.0, 0.0)
+    if kind == "few levels":
+        moves = np.sort(rng.choice(np.arange(n // 12, n - 10), rng.integers(5, 9), replace=False))
+        return rng.choice([0.0, 0.5, 1.0, 2.0], moves.size + 1)[np.searchsorted(moves, k, side="right")]
+    if kind == "smooth":
+        return lfilter([0.02], [1.0, -1.8, 0.82], rng.normal(size=n + SETTLING))[SETTLING:]
+    hold = int(rng.integers(3, 12) if kind == "binary" else rng.integers(10, 35))
+    levels = rng.choice([-1.0, 1.0], n // hold + 1) if kind == "binary" else rng.uniform(0, 1, n // hold + 1)
+    return np.repeat(levels, hold)[:n]
+
+
+def plant_record(kind: str, seed: int) -> optid.Data:
+    """Return an ordinary record of a plant; the kind is an input and, after a comma, what the plant is beside slow."""
+    rng = np.random.default_rng([seed, PLANTS.index(kind)])
+    drive, _, trait = kind.partition(", ")
+    n, delay = int(rng.choice([150, 200, 300, 400, 600])), int(rng.choice([0, 1, 2, 5, 8, 12, 20, 30]))
+    u = plant_input(rng, drive, n)
+    x = (u - u.min()) / np.ptp(u)
+    f = np.minimum(x, rng.uniform(0.5, 0.8)) if trait == "saturated" else x + 2 * x**2 if trait == "bent" else x
+    tau = rng.uniform(5, 30, rng.integers(1, 3))
+    poles = np.exp(-1 / tau)
+    if trait == "resonant":
+        poles = rng.uniform(0.85, 0.97) * np.exp(1j * rng.uniform(0.1, 1) * np.array([1, -1]))
+    a = np.real(np.poly(poles))
+    clean = lfilter(np.r_[np.zeros(delay + 1), rng.choice([-2.0, 0.8]) * a.sum()], a, f - f[0])
+    v = lfilter([1.0], [1.0, -rng.choice([0.0, 0.9])], rng.normal(size=n + SETTLING))[SETTLING:]
+    return optid.Data(35 + 5 * u, 71.3 + clean + rng.choice([0.01, 0.02, 0.05, 0.1, 0.2]) * clean.std() * v / v.std())
+
+
+def is_rejected(data: optid.Data) -> bool:
+    """Whether a record is tested and rejected."""
+    try:
+        return not structure_test(data).passed
+    except RankError:
+        return False
 
 
 def long_records(seed: int) -> None:
@@ -178,16 +228,21 @@ def main() -> None:
     parser.add_argument("--systems", type=int, default=50, help="of every kind")
     parser.add_argument("--samples", type=int, nargs="+", default=[400, 2000])
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--plants", action="store_true")
     parser.add_argument("--long", action="store_true")
     options = parser.parse_args()
     if options.long:
         return long_records(options.seed)
     seeds = range(options.seed, options.seed + options.systems)
+    if options.plants:
+        for kind in PLANTS:
+            rejected = sum(is_rejected(plant_record(kind, seed)) for seed in seeds)
+            print(f"{kind:<24}rejected {share(rejected, options.systems)}", flush=True)
+        return None
     for n in options.samples:
         total, start = 0, time.process_time()
         for kind in (*HAMMERSTEIN, *OTHERS):
-            found = [structure_test(record(kind, seed, n)) for seed in seeds]
-            rejected = sum(not one.passed for one in found)
+            rejected = sum(is_rejected(record(kind, seed, n)) for seed in seeds)
             total += rejected if kind in HAMMERSTEIN else 0
             print(f"N = {n:<6}{kind:<24}rejected {share(rejected, options.systems)}", flush=True)
             if kind == list(HAMMERSTEIN)[-1]:

@@ -18,6 +18,7 @@ from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.informativity import processes
 from optid.identify.validation import validate
+from optid.identify.validation.checks import record_structure
 from optid.identify.validation.score_tests import FTest, Regression, orthonormal, score_test
 from optid.identify.validation.structure import structure_test
 from optid.identify.validation.structure_alternatives import PRODUCTS, RANK, alternatives
@@ -106,12 +107,13 @@ def test_alternatives_by_hand():
     z = (predicted[0] - whole.mean()) / whole.std()
     bent, time = 2 * np.tanh(z / 2), np.linspace(-1, 1, 501)[:-1]
     found = {words: columns(hypothesis)[0] for words, columns in alternatives(hypothesis).items()}
-    assert found["functions of the output"] == pytest.approx(np.column_stack([bent**2, bent**3, np.abs(bent)]))
+    assert found["functions of the output"] == pytest.approx(np.column_stack([
+        bent**2, bent**3, np.abs(bent), bent * np.abs(bent)]))
     drift = found["a gain that changes with time"]  # within experiments, and from one to the next
     assert drift[:, :2] == pytest.approx(np.column_stack([time * z, (1.5 * time**2 - 0.5) * z]))
     assert drift[:, 4:] == pytest.approx(np.column_stack([z, 0 * z]))
     # fed back: square, cube and modulus, by what begins one sample later and decays with the pole 0.8
-    fed = found["functions of the output that are fed back"].reshape(500, -1, 3)
+    fed = found["functions of the output that are fed back"].reshape(500, -1, 4)
     echo = lfilter([0, 1], [1, -0.8], bent**2 - bent[0] ** 2)
     assert np.linalg.norm(echo - fed[:, :, 0] @ np.linalg.lstsq(fed[:, :, 0], echo)[0]) < 1e-10
     assert "functions of 'u' behind poles at 0.8" in found and list(found)[:2] == [PRODUCTS, RANK]
@@ -277,6 +279,29 @@ def test_validation_uses_it():
     y = model.simulate(u)
     y = y + 0.1 * y.std() * np.random.default_rng(0).normal(size=y.shape)
     assert validate(model, Data(u, y, dt=0.1)).structure == structure_test(Data(u, y, dt=0.1))
+
+
+@pytest.mark.parametrize("gain, moved, outcome", [(0.8, True, "not tested: feedback"), (0.0, True, "tested"),
+                                                  (0.8, False, "not tested: feedback")])
+def test_a_closed_loop_is_not_tested(gain, moved, outcome):
+    rng = np.random.default_rng(0)
+    setpoint, moves = moved * np.repeat(rng.uniform(-1, 1, 40), 20), np.repeat(rng.uniform(-1, 1, 40), 20)
+    e, y, u = 0.1 * rng.normal(size=800), np.zeros(800), np.zeros(800)
+    e, total = lfilter([1.0], [1.0, -0.9], e), 0.0
+    for k in range(800):
+        y[k] = e[k] + sum(0.15 * 0.9**i * u[k - 2 - i] for i in range(min(k - 1, 60)))
+        total += 0.05 * (setpoint[k] - y[k])
+        u[k] = gain * (setpoint[k] - y[k]) + total if gain else moves[k]
+    notes = []
+    found = record_structure(siso(Polynomial(3)), Data(u, y, dt=0.1), notes)
+    assert (found is not None and found.passed) if outcome == "tested" else found is None
+    assert any(outcome in note for note in notes) or outcome == "tested"
+
+
+def test_nothing_is_concluded_from_numbers_that_are_not_finite():
+    data = hammerstein(400)
+    with pytest.raises(RankError, match="not available"):
+        structure_test(data, [np.where(np.arange(400) < 300, 0 * data.y[:, 0], np.nan)[:, None]])
 
 
 def test_a_long_record_is_read_in_part(monkeypatch):

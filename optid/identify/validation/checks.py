@@ -240,8 +240,6 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
     if known.loop.word != "open":
         reason = (f"feedback: output {known.loop.output!r} acts on an input, so that functions of the inputs depend on "
                   "the noise")
-    elif runs is not None and not all(np.isfinite(y).all() for y in runs):
-        reason = "the simulation of the model is not available for every sample"
     if not reason:
         try:
             with warnings.catch_warnings():

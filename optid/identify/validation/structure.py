@@ -90,6 +90,8 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None, found: 
     for o, (name, process) in enumerate(zip(data.outputs, found)):
         design = Design.of(data, o, process)
         runs = simulated and [simulated[i][: e.n_samples, o] for i, e in zip(kept, data.experiments)]
+        if runs and not all(np.isfinite(run).all() for run in runs):
+            raise RankError(f"the test of output {name!r} is not available: its simulation is not finite")
         try:
             hypothesis = given_model(design, runs) if runs else fit_hammerstein(design, process.noise)
             tests[name] = _test(hypothesis)
@@ -98,7 +100,7 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None, found: 
         ratios.append(hypothesis.ratios)
     every = [(test, words) for each in tests.values() for words, test in each.items()]
     if not all(np.isfinite(test.p_value) for test, _ in every):
-        raise RankError("the test is not available: a simulated output or a function of the inputs is not finite")
+        raise RankError("the test is not available: a p value is not finite")
     best, words = min(every, key=lambda pair: (pair[0].p_value, -pair[0].saving))
     return Structure(dict(zip(data.inputs, np.max(ratios, axis=0).tolist())), min(1.0, len(every) * best.p_value),
                      best.saving, words,

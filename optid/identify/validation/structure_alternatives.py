@@ -100,9 +100,9 @@ def behind(hypothesis: Hypothesis, c: int, denominator: Array) -> list[Array]:
 
 
 def _bent(x: Array) -> Array:
-    """Square, cube and modulus of a standardised signal, which saturates, (N, 3)."""
+    """Square, cube, modulus and signed square of a standardised signal, which saturates, (N, 4)."""
     bent = 2 * np.tanh(x / 2)
-    return np.column_stack([bent**2, bent**3, np.abs(bent)])
+    return np.column_stack([bent**2, bent**3, np.abs(bent), bent * np.abs(bent)])
 
 
 def _through(values: Array, poles: Poles, lag: int) -> Array:

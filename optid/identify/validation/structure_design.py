@@ -13,12 +13,14 @@ from optid.identify.informativity.process import Process
 from optid.identify.informativity.signals import delayed, held
 from optid.identify.validation.score_tests import Regression
 from optid.models.recursions import lfilter
+from optid.models.roots import roots_of
 
 DEGREE, HATS, SAMPLES = 3, 5, 250  # coarse: powers and hats (at most) of an input; samples per hat and input
 FINE_DEGREE, SPLIT = 7, 4  # fine: powers; parts of every interval between the nodes of the coarse hats
 PULSES = 8  # lags of an input beside its poles
 LONGEST = 5  # time constant of a filter, at most, in lengths of the longest experiment
 MOVE, MOVES = 0.1, 4  # share of its range that an input covers in a move; moves that can be compared
+VISIBLE = 0.1  # share of the variance that a process must explain for its poles and lags to be those of the plant
 PRESENT = 0.9  # share of the energy of the filters that must have passed after a missing input before rows count
 EARLY, DECAYS = 4, 12  # an experiment gives up a 4th of its rows, at most, for its past, and a 12th for its decays
 Poles = NDArray[np.complex128]
@@ -107,8 +109,10 @@ class Design:
         whole = np.concatenate(measured)
         centre, spread = float(np.nanmean(whole)), float(np.nanstd(whole)) or 1.0
         longest = max(e.n_samples for e in data.experiments)
-        poles = tuple(_within(r.poles, longest) for r in process.responses)
-        lags = tuple(max(r.nk - 1, 0) for r in process.responses)  # one too short costs a column, one too long is wrong
+        known = process.explained > VISIBLE  # or else what the output does has the poles of its noise model
+        poles = tuple(_within(r.poles if known else roots_of(process.noise[1:]), longest) for r in process.responses)
+        # a lag too few costs a column, one too many is wrong
+        lags = tuple(max(r.nk - 1, 0) if known else 0 for r in process.responses)
         banks = [[filtered(f.values(u[:, c]) - f.values(u[:1, c]), p, lag) for u in inputs]
                  for c, (f, p, lag) in enumerate(zip(families, poles, lags))]
         decays = [filtered(np.eye(longest, 1), p, 0, pulses=0)[:, :, 0] for p in poles]
