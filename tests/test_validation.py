@@ -208,4 +208,4 @@ def test_refusals():
 def test_nothing_is_warned_without_reason():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        validate(mimo(), record(mimo(), 600))
+        validate(mimo(), record(mimo(), 2000))

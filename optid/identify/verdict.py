@@ -18,7 +18,7 @@ from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.informativity import Informativity, informativity
-from optid.identify.validation.checks import record_structure, shares_outside, tested_residuals
+from optid.identify.validation.checks import NOT_TESTED, record_structure, shares_outside, tested_residuals
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
@@ -245,10 +245,12 @@ def _ranges(model: Any, data: Data) -> list[Finding]:
 
 def _structure(model: Any, data: Data) -> list[Finding]:
     """Say whether the record has the structure of the model; what saves hardly anything leaves a model good."""
+    notes: list[str] = []
     with np.errstate(all="ignore"):
-        found = record_structure(model, data)
+        found = record_structure(model, data, notes)
     if found is None:
-        return []
+        why = [note.removeprefix(NOT_TESTED).partition(":")[0].rstrip(".") for note in notes]
+        return [Finding("structure", f"{UNKNOWN}: {why[0]}", True, counts=False)] if why else []
     saved = "" if found.passed else f", which saves {100 * found.saving:.2g} % of the residual variance"
     word = "not rejected" if found.passed else found.finding
     return [Finding("structure", f"{word}{saved} (p = {found.p_value:.2g})", found.passed,

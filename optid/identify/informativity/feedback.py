@@ -17,6 +17,7 @@ from optid.identify.informativity.process import Process
 from optid.identify.informativity.signals import RecordSignals, delayed, respond
 
 LEVEL = 1e-3  # of the test of one input, shared by the outputs
+SUPPORTED = 0.05  # of the future of one of several inputs, where its present has the sign of a controller
 LEADS, LAGS, SHAPED = 6, 12, 4  # future and past samples of an input; samples of its response
 TIED = 1e-3  # share of the innovations of an input that outputs do not explain, below which nothing else moved it
 EXACT = 1e-6  # the same for an input that answers at once
@@ -48,7 +49,9 @@ def loop(signals: RecordSignals, c: int, processes: tuple[Process, ...], names: 
     level = LEVEL / len(found)
     free = outside(signals, c)
     for o, (future, now, same) in enumerate(found):
-        answered = now < level and (not same or (free < EXACT and _moving(signals, c) > MOVING))
+        # of several inputs one may act at once with another sign than later: its future must support the answer
+        against = not same and (signals.u[0].shape[1] == 1 or future < SUPPORTED)
+        answered = now < level and (against or (free < EXACT and _moving(signals, c) > MOVING))
         if future < level or answered:
             return Loop("regulated" if free < TIED else "closed", min(future, now) if answered else future, free,
                         names[o])

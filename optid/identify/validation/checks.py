@@ -34,6 +34,7 @@ LAGS = 25
 KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent signal"}  # arguments of static functions
 SLIGHT = 0.05  # error of the response, over its spread, up to which a correlation with an input is negligible
 SLIGHT_COLOUR = 0.1  # correlation of residuals with their past up to which they count as white
+NOT_TESTED = "Structure of the record: not tested: "
 ROUNDING = 1e-12  # an error below this share of the largest output is rounding
 
 
@@ -248,7 +249,7 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
         except RankError as error:
             reason = str(error)
     if reason:
-        notes.append(f"Structure of the record: not tested: {reason}.")
+        notes.append(f"{NOT_TESTED}{reason}.")
         return None
     if not found.passed:
         notes.append(

@@ -21,6 +21,7 @@ PULSES = 8  # lags of an input beside its poles
 LONGEST = 5  # time constant of a filter, at most, in lengths of the longest experiment
 MOVE, MOVES = 0.1, 4  # share of its range that an input covers in a move; moves that can be compared
 VISIBLE = 0.1  # share of the variance that a process must explain for its poles and lags to be those of the plant
+HALF = 0.5  # the same where there are several inputs
 PRESENT = 0.9  # share of the energy of the filters that must have passed after a missing input before rows count
 EARLY, DECAYS = 4, 12  # an experiment gives up a 4th of its rows, at most, for its past, and a 12th for its decays
 Poles = NDArray[np.complex128]
@@ -102,6 +103,9 @@ class Design:
     @classmethod
     def of(cls, data: Data, o: int, process: Process) -> "Design":
         """Lay out the columns for output o; a record that moves too little for them is a `RankError`."""
+        if data.m > 1 and process.explained < HALF:  # whose dynamics are wrong for one input at least
+            raise RankError(f"the low-order dynamics found explain {100 * process.explained:.0f} % of output "
+                            f"{data.outputs[o]!r}, too little to compare structures of several inputs")
         inputs = [held(e.u) for e in data.experiments]
         families = tuple(Family.of(data, c) for c in range(data.m))
         _refuse_still_inputs(data, inputs)
