@@ -25,6 +25,7 @@ SHARES = (1.0, 0.3, 0.1)  # of a step that are tried
 RIDGE = 1e-7  # share of its length added to every column, for functions that the record does not tell apart
 LAGS, SLOW = 16, (0.8, 0.9, 0.95, 0.98, 0.99)  # single lags and poles that complete the filters of f
 ROOM = 20  # samples by input for every column of these
+CUT = 1e-4  # standard deviation of residuals, over that of the output, that filters of nearly right poles leave
 ROUNDING = 1e-12  # standard deviation of residuals, over the largest output, that is rounding
 
 
@@ -39,7 +40,7 @@ class Hypothesis:
         tangent: (R, n) orthonormal basis of the directions in which the hypothesis can move.
         carriers: signals whose products are tested, (N, q) per experiment; none of a given model.
         ratios: second over first singular value of filters times functions, by input.
-        rounding: whether nothing but rounding is left.
+        rounding: whether nothing but rounding, and what the filters cut off, is left.
     """
 
     design: Design
@@ -143,7 +144,7 @@ def _whiten(design: Design, predicted: Sequence[Array]) -> tuple[Regression, Seq
 
 def _is_rounding(design: Design, predicted: Sequence[Array]) -> bool:
     left = np.concatenate([(y - p)[here] for y, p, here in zip(design.output, predicted, design.regression.present)])
-    return float(left.std()) <= ROUNDING * max(1.0, abs(design.centre) / design.spread)
+    return float(left.std()) <= max(CUT, ROUNDING * max(1.0, abs(design.centre) / design.spread))
 
 
 def _tangent(design: Design, point: _Point) -> list[list[Array]]:
