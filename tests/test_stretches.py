@@ -70,7 +70,7 @@ def test_fits_with_missing_inputs_are_those_of_a_record_cut_by_hand(name, orders
         assert fit.solution.bound.value == pytest.approx(hand.solution.bound.value, rel=1e-8)
     after = slice(50, None)  # what a state of zero is depends on the levels of the record
     assert fit.model.simulate(u)[after] == pytest.approx(hand.model.simulate(u)[after], abs=1e-3)
-    assert np.isnan(fit.simulation_fit).all()  # a simulation runs through
+    assert fit.simulation_fit > 60  # from one gap to the next, each with a state of its own
 
 
 def test_fits_of_detrended_records_with_missing_inputs_are_in_raw_units():

@@ -176,7 +176,7 @@ def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Infor
 
 def _uncertain(model: Any, data: Data, known: Any) -> list[Finding]:
     """Say how well the record determines the response to a step over the range of every input."""
-    if known is None or has_feedback(model) or getattr(model, "latent", ()):
+    if known is None or has_feedback(model) or getattr(model, "latent", ()) or len(model.nonlinearities) != data.m:
         return []
     length = max(min(step_length(model), max(e.n_samples for e in data.experiments) // 3), 2)
     points = np.unique(np.geomspace(1, length, POINTS).astype(int)) - 1

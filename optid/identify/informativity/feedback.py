@@ -17,6 +17,7 @@ from optid.identify.informativity.process import Process
 from optid.identify.informativity.signals import RecordSignals, delayed, respond
 
 LEVEL = 1e-3  # of the test of one input, shared by the outputs
+LED = 0.9  # share of the innovations of one of several inputs that outputs must leave at most, if its future is silent
 SUPPORTED = 0.05  # of the future of one of several inputs, where its present has the sign of a controller
 LEADS, LAGS, SHAPED = 6, 12, 4  # future and past samples of an input; samples of its response
 TIED = 1e-3  # share of the innovations of an input that outputs do not explain, below which nothing else moved it
@@ -49,8 +50,9 @@ def loop(signals: RecordSignals, c: int, processes: tuple[Process, ...], names: 
     level = LEVEL / len(found)
     free = outside(signals, c)
     for o, (future, now, same) in enumerate(found):
-        # of several inputs one may act at once with another sign than later: its future must support the answer
-        against = not same and (signals.u[0].shape[1] == 1 or future < SUPPORTED)
+        # one of several inputs may act at once with another sign than later: its future or a large share must support
+        # that this is an answer
+        against = not same and (signals.u[0].shape[1] == 1 or future < SUPPORTED or free < LED)
         answered = now < level and (against or (free < EXACT and _moving(signals, c) > MOVING))
         if future < level or answered:
             return Loop("regulated" if free < TIED else "closed", min(future, now) if answered else future, free,
