@@ -1,5 +1,7 @@
 """What a record tells: dead time, feedback, effects of inputs, excitation; each on plants whose truth is known."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -95,6 +97,7 @@ def test_a_saturation_is_seen_and_does_not_hide_the_dead_time():
     u = staircase(np.random.default_rng(4), 1000)
     found = processes(optid.Data(u, driven(np.minimum(u, 0.6), dead=6)))[0].responses[0]
     assert abs(found.nk - 7) <= 1 and found.nodes is not None
+    assert found.values is not None
     f = np.interp([0.1, 0.5, 0.7, 0.95], found.nodes + u.mean(), found.values)
     assert abs(f[3] - f[2]) < 0.2 * abs(f[1] - f[0])
 
@@ -228,7 +231,9 @@ def test_sinusoids_determine_two_numbers_each():
 def test_one_step_determines_no_richer_structure():
     u = np.where(np.arange(200) < 20, 0.0, 1.0)
     data = optid.Data(u, driven(u, dead=2, noise=0.01))
-    for formulation, orders in (("arx", {"na": 3, "nb": 3}), ("oe.exact", {"na": 2, "nb": 4}), ("ss.exact", {"nx": 4})):
+    asked: list[tuple[str, dict[str, Any]]] = [("arx", {"na": 3, "nb": 3}), ("oe.exact", {"na": 2, "nb": 4}),
+                                               ("ss.exact", {"nx": 4})]
+    for formulation, orders in asked:
         with pytest.raises(DataError, match="moves once: a step determines gain, time constants and dead time"):
             optid.fit(data, formulation, **orders)
     found = optid.identify(data, workers=1, progress=lambda sentence: None)
