@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 import optid
 from optid.errors import DataError
 from optid.examples import example
 from optid.identify.informativity import informativity, processes
 from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, respond
+from optid.models.recursions import lfilter
 
 
 def staircase(rng, samples, held=25, levels=None):
