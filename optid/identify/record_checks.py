@@ -13,7 +13,6 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning
 from optid.identify.design.rules import Check, check_condition, check_instruments, check_levels, check_lines
 from optid.identify.informativity.excitation import check_numbers
-from optid.identify.informativity.signals import RecordSignals
 from optid.identify.outliers import find_outliers
 
 LEAST_KEPT = 0.5
@@ -49,7 +48,7 @@ def examine(data: Data, bases: Sequence[Basis], arguments: Mapping[str, Any] | N
             found += _sentences(replace(check, severity="warning") if forced and check.severity == "error" else check)
         found += list_outside("input", name, float(np.mean(basis.is_outside(u))), basis)
         found += _outliers("input", name, records, arguments)
-    if (check := check_numbers(RecordSignals.of(data), data.inputs, arguments)) is not None:
+    if (check := check_numbers(data, arguments)) is not None:
         found += _sentences(replace(check, severity="warning") if forced and check.severity == "error" else check)
     for o, name in enumerate(data.outputs):
         records = [e.y[:, o] for e in data.experiments]

@@ -69,7 +69,7 @@ def _added(total: Array, filtered: Array, root: Array) -> Array:
     return rows.T @ rows + (total if total.size else 0.0)
 
 
-def autoregression(errors: Sequence[Array], most: int) -> Array:
+def short_autoregression(errors: Sequence[Array], most: int) -> Array:
     """Fit [1, a_1, ...] to errors (N,) per experiment, NaN = missing, by Yule and Walker; its order by Akaike."""
     from scipy.linalg import solve_toeplitz
 

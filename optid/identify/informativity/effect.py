@@ -14,7 +14,7 @@ from optid.identify.informativity.lags import added, lagged, memory, powers, sta
 from optid.identify.informativity.process import DelayedResponse, Process
 from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.recursions import lfilter
-from optid.statistics.coloured import autoregression
+from optid.statistics.coloured import short_autoregression
 
 LEVEL = 0.005
 TAUS = (0.2, 3.0, 12.0, 50.0)  # time constants in samples
@@ -102,7 +102,7 @@ def _without_effect(signals: RecordSignals, o: int, outputs: tuple[Array, ...], 
         _, pole, theta = min(found, key=lambda one: one[0])
         errors = regression.residuals([x[:, 1:] for x in others], theta, pole)
         smooth = [y - np.nan_to_num(e) for y, e in zip(outputs, errors)]
-        regression = regression.with_noise(autoregression(errors, min(12, signals.samples // SAMPLES)))
+        regression = regression.with_noise(short_autoregression(errors, min(12, signals.samples // SAMPLES)))
     _, _, white, _ = regression.solve([x[:, 1:] for x in others], pole)
     return smooth, regression.noise, float(np.std(white))
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
+from optid.data.record import Data
 from optid.identify.design.rules import LONGEST, Check, many_lines, remaining_shares
 from optid.identify.informativity.signals import RecordSignals
 
@@ -29,7 +30,6 @@ class InputExcitation:
 
     Attributes:
         input: its name.
-        levels: distinct values.
         moves: samples at which it changes, all experiments together.
         held: whether it is held at most samples.
         lines: sinusoids that it consists of; None where they are many.
@@ -37,7 +37,6 @@ class InputExcitation:
     """
 
     input: str
-    levels: int
     moves: int
     held: bool
     lines: int | None
@@ -67,7 +66,7 @@ def excitation(signals: RecordSignals, c: int, name: str) -> InputExcitation:
     records = signals.inputs(c)
     moves = sum(int(np.count_nonzero(np.diff(u))) for u in records)
     x = max(records, key=len)[:LONGEST]
-    return InputExcitation(name, signals.levels(c), moves, 2 * moves < signals.samples, _lines(x),
+    return InputExcitation(name, moves, 2 * moves < signals.samples, _lines(x),
                       moves > 1 and all(map(_even, records)))
 
 
@@ -86,11 +85,12 @@ def _even(x: Array) -> bool:
     return len(x) > 2 and bool(rest @ rest <= 1e-8 * float((x - x.mean()) @ (x - x.mean()))) and bool(np.ptp(x) > 0)
 
 
-def check_numbers(signals: RecordSignals, inputs: tuple[str, ...], arguments: Mapping[str, Any]) -> Check | None:
+def check_numbers(data: Data, arguments: Mapping[str, Any]) -> Check | None:
     """Compare the coefficients of a linear model with the numbers that the inputs determine; None for other models.
 
     The check is fine where an input determines many.
     """
+    inputs = data.inputs
     na, nb, nx = (arguments.get(name) for name in ("na", "nb", "nx"))
     given = [nb] * len(inputs) if isinstance(nb, int) else nb if isinstance(nb, list | tuple) else []
     each = [b for b in given if isinstance(b, int)]
@@ -100,6 +100,7 @@ def check_numbers(signals: RecordSignals, inputs: tuple[str, ...], arguments: Ma
         asked, words = nx * (1 + len(inputs)), f"nx {nx}"
     else:
         return None
+    signals = RecordSignals.of(data)
     found = [excitation(signals, c, name) for c, name in enumerate(inputs)]
     numbers = [one.numbers for one in found]
     if None in numbers or (most := sum(n for n in numbers if n)) >= asked or not most:

@@ -18,7 +18,7 @@ from optid.data.record import Data
 from optid.identify.informativity.bank import scan
 from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.roots import roots_of
-from optid.statistics.coloured import autoregression
+from optid.statistics.coloured import short_autoregression
 
 LATEST = 0.25  # longest delay as a share of the longest experiment
 KEPT = 4  # delays of the scan that are refined
@@ -190,7 +190,7 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
             u[c] = _completed(rest, known[c], u[c], [lost[:, c] for lost in signals.lost])
         columns, theta, slowest = _joint(regression, known)
         errors = regression.residuals(columns, theta, slowest)
-        noise = autoregression(errors, min(NOISE, regression.count // 30))
+        noise = short_autoregression(errors, min(NOISE, regression.count // 30))
         size = max(noise.size, regression.noise.size)
         change = np.pad(noise, (0, size - noise.size)) - np.pad(regression.noise, (0, size - regression.noise.size))
         same = before == [(p.term.lag, p.term.order, p.term.zeros) for p in known]

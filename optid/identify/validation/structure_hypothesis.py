@@ -14,7 +14,7 @@ from optid.identify.informativity.signals import delayed
 from optid.identify.validation.score_tests import Regression, orthonormal, solve
 from optid.identify.validation.structure_design import PULSES, Design
 from optid.models.recursions import lfilter
-from optid.statistics.coloured import autoregression
+from optid.statistics.coloured import short_autoregression
 from optid.structures.bilinear import minimise
 from optid.structures.rank_one import RankOne, matrices
 
@@ -139,7 +139,7 @@ def _whiten(design: Design, predicted: Sequence[Array]) -> tuple[Regression, Seq
     while most > 1 and complete ** (most + 1) < KEPT:  # a row is lost with any of its samples
         most -= 1
     left = [np.where(here, y - p, np.nan) for y, p, here in zip(design.output, whole, design.regression.present)]
-    return replace(design.regression, noise=autoregression(left, most)), whole
+    return replace(design.regression, noise=short_autoregression(left, most)), whole
 
 
 def _is_rounding(design: Design, predicted: Sequence[Array]) -> bool:
