@@ -15,7 +15,6 @@ from test_monitor import plant, stream
 
 from optid import Format
 from optid.data.reading.rows import RowReader
-from optid.errors import DataError
 
 NAMES = ["u1", "u2", "y1", "y2"]
 QUICK = ["--arl0", "300", "--window", "30", "--kinds", "bias", "loss"]
@@ -233,8 +232,12 @@ def test_reading_goes_on_where_it_stopped():
     again.resume(json.loads(json.dumps(first.memory)))
     found = again.read(["1.0,1,2"])  # one row, of which no stamp is known, lies between
     assert found.error == "" and found.lines.tolist() == [4]
-    with pytest.raises(DataError, match="not the delimiter"):
-        reader(how=Format(delimiter=",", decimal=","))
+
+
+def test_a_decimal_mark_that_is_the_delimiter_needs_quotes():
+    comma = reader(how=Format(delimiter=",", decimal=","))
+    found = comma.read(["t,u,y", '0,"0,5",2', "1,0,5,2"])
+    assert found.u.ravel().tolist() == [0.5] and [line for line, _ in found.bad] == [3]
 
 
 @pytest.mark.slow

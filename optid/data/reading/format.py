@@ -193,8 +193,6 @@ def _check_marks(how: Format) -> None:
         raise DataError(f"delimiter={delimiter!r}: must be one character such as ',' or ';' or a tab.")
     if decimal not in (".", ","):
         raise DataError(f"decimal={decimal!r}: must be '.' or ','.")
-    if delimiter == decimal:
-        raise DataError(f"delimiter={delimiter!r} with decimal={decimal!r}: the decimal mark is not the delimiter.")
     escaped = {"\\xa0": "\u00a0", "\\u00a0": "\u00a0", "\\u202f": "\u202f", "\\u2019": "\u2019"}
     if thousands in escaped:  # as a shell passes it
         thousands = escaped[thousands]
