@@ -221,7 +221,7 @@ def test_sinusoids_determine_two_numbers_each():
     k = np.arange(600)
     u = np.sin(0.2 * k) + 0.5 * np.sin(0.61 * k)
     told = informativity(optid.Data(u, driven(u, dead=0, noise=0.01)))
-    assert told.excitations[0].lines == 2 and told.numbers == 4
+    assert told.excitations[0].lines == 2 and told.excitations[0].numbers == 4
     one = optid.Data(np.sin(0.2 * k), driven(np.sin(0.2 * k), dead=0, noise=0.01))
     with pytest.raises(DataError, match="determines 2 numbers of a linear response. na 2 and nb 2 ask for 4"):
         optid.fit(one, "oe.exact", na=2, nb=2)

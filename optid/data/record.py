@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -390,8 +391,16 @@ class Data(Ports):
     resample, filter = preprocessing.resample, preprocessing.filter
 
     def raw(self) -> "Data":
-        """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed)."""
-        return self.mapped(self.transform.raw_u, self.transform.raw_y, transform=Transform.identity(self.m, self.l))
+        """Return the data in raw units, with `detrend` and `scale` undone (a removed drift stays removed).
+
+        It is the same object every time, so that what is known of a record is computed once.
+        """
+        if self.transform.is_identity:
+            return self
+        if self not in _RAW:
+            _RAW[self] = self.mapped(self.transform.raw_u, self.transform.raw_y,
+                                     transform=Transform.identity(self.m, self.l))
+        return _RAW[self]
 
     def with_findings(self, findings: Iterable[str]) -> "Data":
         """Return the same record with other findings."""
@@ -414,6 +423,9 @@ class Data(Ports):
 
     def _with(self, **changes: Any) -> "Data":
         return _filled(object.__new__(Data), **{f.name: getattr(self, f.name) for f in fields(self)} | changes)
+
+
+_RAW: WeakKeyDictionary[Data, Data] = WeakKeyDictionary()
 
 
 def _filled(data: Data, **values: Any) -> Data:

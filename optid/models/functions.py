@@ -79,6 +79,11 @@ def has_feedback(model: Any) -> bool:
     return bool(getattr(model, "feedback", ()))
 
 
+def runs_free(model: Any) -> bool:
+    """Whether a free run says something: stable, integrating, or with feedback, where poles do not decide."""
+    return bool(model.is_stable or model.integrates or has_feedback(model))
+
+
 def step_length(model: Model) -> int:
     """Return the number of samples after which the step response of the linear part has settled within 2 %.
 

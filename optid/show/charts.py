@@ -13,7 +13,7 @@ from optid.identify.dynamics import Levels, mean_slopes
 from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
 from optid.identify.validation.predictions import one_step_or_nan, simulated
-from optid.models.functions import StaticFunction, has_feedback, response_pairs, static_functions
+from optid.models.functions import StaticFunction, response_pairs, runs_free, static_functions
 from optid.show import summary
 from optid.show.estimates import uncertainty
 from optid.show.sections import Axis, Chart, Series, decibels
@@ -65,7 +65,7 @@ def visited(function: StaticFunction, record: Data | None) -> Array:
 
 def free_run(model: Any, record: Data) -> list[Array] | None:
     """Simulated outputs, or None where an input is missing or the model runs away."""
-    if not (model.is_stable or has_feedback(model)):
+    if not runs_free(model):
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)

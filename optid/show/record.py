@@ -16,14 +16,14 @@ def informativity_table(told: "Informativity") -> Table:
     rows = []
     for o, process in enumerate(told.processes):
         for c, (name, response) in enumerate(zip(told.inputs, process.responses)):
-            effect = told.effects[o * len(told.inputs) + c]
+            effect = told.effects[o * len(told.inputs) + c] if told.effects else None
             low, high = response.lag_interval
             lag = f"{response.nk}" if low == high else f"{response.nk} ({low} to {high})"
             inside = response.poles[(response.poles != 0) & (response.poles != 1)]
             taus = sorted((-1 / np.log(np.abs(inside))).tolist(), reverse=True)
+            seen = f"{'visible' if effect.visible else 'none'} (p = {effect.p_value:.1g})" if effect else "-"
             words = ["integrates"] * response.integrates + [number(tau, 3) for tau in taus]
-            rows.append((f"{name} to {process.output}", told.loops[c].word,
-                         f"{'visible' if effect.visible else 'none'} (p = {effect.p_value:.1g})", lag,
+            rows.append((f"{name} to {process.output}", told.loops[c].word, seen, lag,
                          "-" if response.integrates else number(response.gain, 4), ", ".join(words) or "-"))
     return Table("What the record tells", ("input", "loop", "effect", "first lag", "gain", "time constants"), rows,
                  "Lags and time constants in samples, of a model of low order; in brackets the 95 % interval.")

@@ -11,7 +11,7 @@ from optid.errors import DataError
 from optid.identify.equation_error import EquationError
 from optid.identify.validation.predictions import predictors
 from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
-from optid.models.functions import has_feedback, static_functions
+from optid.models.functions import has_feedback, runs_free, static_functions
 from optid.models.kalman import NoiseCovariances
 from optid.models.roots import in_words
 from optid.program.solution import Status
@@ -89,7 +89,7 @@ def simulation_fit(fit: "Fit") -> np.ndarray:
 
     With nonlinear feedback the poles of the linear part do not decide about stability; the simulation does.
     """
-    if not (fit.model.is_stable or has_feedback(fit.model)):
+    if not runs_free(fit.model):
         return np.full(fit.model.l, np.nan)
     return np.atleast_1d(fit.simulation_fit)
 

@@ -3,7 +3,8 @@
 Sims' test: in open loop the future of an input says nothing about an output beyond the past of both, for any input.
 The past is the first lags of the input and its response through the dead time and the poles of a low-order model, so
 that neither is missed. An input that answers without delay shows at the same sample: with a sign opposite to that of
-the gain it is the answer of a controller (Sims 1972; Gustavsson, Ljung and Söderström 1977).
+the gain it is the answer of a controller (Sims 1972; Gustavsson, Ljung and Söderström 1977). In a quiet loop the output
+has little future to tell, but between the moves of its set-point the input follows the outputs by one law.
 """
 
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ LEADS, LAGS, SHAPED = 6, 12, 4  # future and past samples of an input; samples o
 TIED = 1e-3  # share of the innovations of an input that outputs do not explain, below which nothing else moved it
 EXACT = 1e-6  # the same for an input that answers at once
 MOVING = 0.5  # share of the samples at which an input must change to be such an answer
+LAW = 0.3  # median error of an input from its past and the outputs, over that from its past alone, that is a law
+MEMORY, TURNS = 6, 12  # samples that a law reaches back; turns of its regression
+PREDICTED = 1e-6  # median error of an input, over its spread, from its own past alone that leaves no law to find
 
 Word = Literal["open", "closed", "regulated"]
 
@@ -36,12 +40,14 @@ class Loop:
         p_value: of the future of the input, the smallest over the outputs.
         outside: share of the innovations of the input that past and present outputs do not explain.
         output: the output that acts on it.
+        follows: whether that was seen in a law at most samples, not in the p value.
     """
 
     word: Word
     p_value: float = 1.0
     outside: float = 1.0
     output: str = ""
+    follows: bool = False
 
 
 def loop(signals: RecordSignals, c: int, processes: tuple[Process, ...], names: tuple[str, ...]) -> Loop:
@@ -57,6 +63,8 @@ def loop(signals: RecordSignals, c: int, processes: tuple[Process, ...], names: 
         if future < level or answered:
             return Loop("regulated" if free < TIED else "closed", min(future, now) if answered else future, free,
                         names[o])
+        if not (same and now < level) and _follows(signals, c, o):  # else it is the plant that answers at once
+            return Loop("closed", future, free, names[o], follows=True)
     return Loop("open", min(p for p, _, _ in found), free)
 
 
@@ -119,3 +127,28 @@ def outside(signals: RecordSignals, c: int, order: int = 12, beside: tuple[int, 
 
 def _moving(signals: RecordSignals, c: int) -> float:
     return float(np.mean(np.concatenate([np.diff(u) != 0 for u in signals.inputs(c)])))
+
+
+def _follows(signals: RecordSignals, c: int, o: int) -> bool:
+    """Whether input c follows output o and its own past by one law at most samples, whatever moves it at others."""
+    if _moving(signals, c) < MOVING:
+        return False
+    columns = stacked(signals, MEMORY, 0, lambda i, first, last: (
+        np.hstack([np.ones((last - first, 1)), lagged(signals.u[i][:, c], range(1, MEMORY + 1), first, last)]),
+        lagged(signals.y[i][:, o], range(MEMORY + 1), first, last), signals.u[i][first:last, c]))
+    if not columns or len(columns[2]) < 20 * MEMORY:
+        return False
+    own, output, u = columns
+    alone = _median_error(u, own)
+    return alone > PREDICTED and _median_error(u, np.hstack([own, output])) < LAW * alone
+
+
+def _median_error(target: Array, columns: Array) -> float:
+    """Return the median absolute error of a least-absolute regression, by reweighting; single jumps do not move it."""
+    weights = np.ones((len(target), 1))
+    error = target
+    for _ in range(TURNS):
+        x = np.linalg.lstsq(weights * columns, weights[:, 0] * target, rcond=1e-12)[0]
+        error = np.abs(target - columns @ x)
+        weights = 1 / np.sqrt(np.maximum(error, 1e-9))[:, None]
+    return float(np.median(error))

@@ -34,6 +34,7 @@ ROUNDING = 1e-13
 EXACT = 1e-16  # mean square of errors, over the variance of the output, at which a response is exact
 STEPS, FARTHEST, NUDGE = 12, 1.0, 1e-6  # of a descent; longest step in a logarithm; step of a difference
 ENOUGH = 1e-3  # fall of twice the log likelihood at which a descent ends
+SURE, BEHIND = 2, 20.0  # step from which on a descent is given up that promises a criterion so far behind the best
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,7 +246,7 @@ def _searched(regression: WhitenedRegression, drive: _Drive, least: int, longest
     def fitted(term: _Term) -> _Point:
         key = (len(term.taus), len(term.pairs), term.lag, term.zeros, term.integrates)
         if key not in tried:
-            tried[key] = _refined(regression, drive, term)
+            tried[key] = _refined(regression, drive, term, min((p.criterion for p in tried.values()), default=np.inf))
         return tried[key]
 
     terms = [] if start is None else [start]
@@ -320,19 +321,29 @@ def _slowest(poles: Poles) -> complex:
     return 1.0 if np.any(poles == 1) else complex(np.max(np.abs(poles), initial=0.0))
 
 
-def _refined(regression: WhitenedRegression, drive: _Drive, term: _Term) -> _Point:
-    """Descend over the poles of one response by Gauss-Newton steps, each along coefficients and poles together."""
+def _refined(regression: WhitenedRegression, drive: _Drive, term: _Term, below: float = np.inf) -> _Point:
+    """Descend over the poles of one response by Gauss-Newton steps, each along coefficients and poles together.
+
+    The descent ends early where its steps promise no criterion near `below`.
+    """
     most = np.log(20 * max(len(u) for u in drive.values))
-    at = term
-    energy, theta, free = _solved(regression, drive, at)
-    for _ in range(STEPS if at.z.size and regression.count > at.z.size + at.zeros + 1 else 0):
-        columns, slowest = _columns(at, drive.values), _slowest(at.poles)
-        moved = []
+    at, rows = term, max(regression.count, 2)
+
+    def criterion(energy: float) -> float:
+        count = at.z.size + at.zeros + 2 + free + regression.noise.size - 1 + drive.parameters
+        return float(rows * np.log(max(energy / rows, ROUNDING**2)) + count * np.log(rows))
+
+    energy, theta, free, columns = _solved(regression, drive, at)
+    for turn in range(STEPS if at.z.size and regression.count > at.z.size + at.zeros + 1 else 0):
+        slowest, moved = _slowest(at.poles), []
         for one in np.eye(at.z.size) * NUDGE:
             there = _columns(at.at(at.z + one), drive.values)
             moved.append([(x - here) @ theta / NUDGE for x, here in zip(there, columns)])
         whole = [np.column_stack([x, *(m[i] for m in moved)]) for i, x in enumerate(columns)]
-        step = regression.solve(whole, slowest)[1][theta.size :]
+        promised, step, _, _ = regression.solve(whole, slowest)
+        if turn >= SURE and criterion(promised) > below + BEHIND:
+            break
+        step = step[theta.size :]
         step *= min(1.0, FARTHEST / max(float(np.max(np.abs(step), initial=0.0)), 1e-300))
         for share in (1.0, 0.25, 0.05):
             z = np.clip(at.z + share * step, -4, most)
@@ -342,18 +353,16 @@ def _refined(regression: WhitenedRegression, drive: _Drive, term: _Term) -> _Poi
         else:
             break
         fall, at = energy - found[0], at.at(z)
-        energy, theta, free = found
+        energy, theta, free, columns = found
         if regression.count * fall <= ENOUGH * energy:
             break
-    rows = max(regression.count, 2)
-    spread = max(energy / rows, ROUNDING**2)
-    count = at.z.size + at.zeros + 2 + free + regression.noise.size - 1 + drive.parameters
-    return _Point(at, drive, energy, theta, float(rows * np.log(spread) + count * np.log(rows)))
+    return _Point(at, drive, energy, theta, criterion(energy))
 
 
-def _solved(regression: WhitenedRegression, drive: _Drive, term: _Term) -> tuple[float, Array, int]:
-    energy, theta, _, free = regression.solve(_columns(term, drive.values), _slowest(term.poles))
-    return energy, theta, free
+def _solved(regression: WhitenedRegression, drive: _Drive, term: _Term) -> tuple[float, Array, int, list[Array]]:
+    columns = _columns(term, drive.values)
+    energy, theta, _, free = regression.solve(columns, _slowest(term.poles))
+    return energy, theta, free, columns
 
 
 def _bent(regression: WhitenedRegression, drive: _Drive, term: _Term, nodes: Array) -> _Drive | None:

@@ -1,6 +1,6 @@
 """What a record can tell, put together: findings in sentences, and the reason where nothing can be identified."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -51,11 +51,6 @@ class Informativity(Rendered):
         return max(self.loops, key=lambda one: rank(one.word), default=Loop("open"))
 
     @property
-    def numbers(self) -> int | None:
-        """How many numbers of a linear response the least exciting input determines; None for many."""
-        return min((n for one in self.excitations if (n := one.numbers) is not None), default=None)
-
-    @property
     def lags(self) -> tuple[int, ...]:
         """Lag of the first coefficient of every input, the earliest over the outputs."""
         return tuple(min(p.responses[c].nk for p in self.processes) for c in range(len(self.inputs)))
@@ -82,6 +77,7 @@ def informativity(data: Data) -> Informativity:
     Args:
         data: the record; the first 30,000 samples of a longer one are read.
     """
+    data = data.raw()
     if data not in _KNOWN:
         with np.errstate(all="ignore"):
             _KNOWN[data] = _examined(data)
@@ -109,12 +105,14 @@ def _examined(data: Data) -> Informativity:
                              findings=(reason,))
     found, loops = _loops(data, signals)
     least = int(any(one.word != "open" for one in loops))
-    effects = tuple(effect(signals, c, o, found[o], (u, y), least) for o, y in enumerate(data.outputs)
-                    for c, u in enumerate(data.inputs))
-    whole = Informativity(data.inputs, data.outputs, loops, effects, tuple(moves), found)
-    reason = _regulated(whole) or _led(whole, signals) or _ineffective(whole)
-    return Informativity(data.inputs, data.outputs, loops, effects, tuple(moves), found, reason,
-                         tuple(_findings(whole, data, reason)))
+    whole = Informativity(data.inputs, data.outputs, loops, (), tuple(moves), found)
+    reason = _regulated(whole)
+    if not reason:
+        effects = tuple(effect(signals, c, o, found[o], (u, y), least) for o, y in enumerate(data.outputs)
+                        for c, u in enumerate(data.inputs))
+        whole = replace(whole, effects=effects)
+        reason = _led(whole, signals) or _ineffective(whole)
+    return replace(whole, reason=reason, findings=tuple(_findings(whole, data, reason)))
 
 
 def _loops(data: Data, signals: RecordSignals) -> tuple[tuple[Process, ...], tuple[Loop, ...]]:
@@ -166,8 +164,9 @@ def _findings(found: Informativity, data: Data, reason: str) -> list[str]:
     sentences = [reason] if reason else []
     for name, one in zip(found.inputs, found.loops):
         if one.word == "closed":
+            seen = "by one law at most samples" if one.follows else f"p = {one.p_value:.1g}"
             sentences.append(
-                f"closed loop: output {one.output!r} acts on input {name!r} (p = {one.p_value:.1g}); use lags from 1 "
+                f"closed loop: output {one.output!r} acts on input {name!r} ({seen}); use lags from 1 "
                 "on and a noise model (bj.exact, armax.exact, or arx with many lags), and move the set-point")
     sentences += [one.finding for one in found.excitations if one.finding and not reason]
     if reason:

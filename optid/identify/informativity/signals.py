@@ -98,7 +98,12 @@ def respond(poles: Sequence[complex] | Poles, drive: Array) -> Array:
     factors = np.asarray(poles, dtype=complex)
     gain = float(np.prod(np.abs(1 - factors[factors != 1])))
     x = (drive - drive[0]) * gain
-    return lfilter([1.0], np.real(np.poly(factors)), x) if factors.size else x
+    if not factors.size:
+        return x
+    a = np.ones(1, dtype=complex)
+    for p in factors:  # np.poly, without its search for conjugates
+        a = np.append(a, 0.0) - np.append(0.0, p * a)
+    return lfilter([1.0], a.real, x)
 
 
 def delayed(x: Array, lag: int) -> Array:
@@ -151,14 +156,18 @@ class WhitenedRegression:
         found: list[Array] = []
         free = 0
         for x, y, rows in zip(columns, self.white, self.rows):
-            both: Array = np.column_stack([whitened(self.noise, x)[rows], y])
-            k = np.arange(len(rows), dtype=float)[rows]
-            decay = k if slowest == 1 else np.abs(slowest) ** k
-            for one in (np.ones(len(both)), decay - decay.mean() if decay.size else decay):
-                size = float(one @ one)
-                if size > DISTINCT**2 * max(float(decay @ decay), 1.0):
-                    both -= np.outer(one, (one @ both) / size)
-                    free += 1
+            white = whitened(self.noise, x)
+            both = np.empty((y.size, x.shape[1] + 1))
+            both[:, :-1], both[:, -1] = white if rows.all() else white[rows], y
+            k = np.arange(rows.size, dtype=float)[rows]
+            decay = k if slowest == 1 else np.exp(k * np.log(max(abs(slowest), 1e-300)))
+            out = [np.ones(y.size), decay - decay.mean() if decay.size else decay]
+            sizes, whole = [float(one @ one) for one in out], max(float(decay @ decay), 1.0)
+            basis = [one / np.sqrt(size) for one, size in zip(out, sizes) if size > DISTINCT**2 * whole]
+            if basis:
+                q = np.array(basis)
+                both -= q.T @ (q @ both)
+            free += len(basis)
             found.append(both)
         return np.vstack(found), free
 
