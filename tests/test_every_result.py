@@ -206,7 +206,8 @@ def test_a_part_that_fails_leaves_the_others_and_says_why(monkeypatch, lenient, 
         text = " ".join(shown.split())
         assert f"{sections.FAILED}: ZeroDivisionError: nothing to divide by; this is a defect of optid" in text
         assert left in text
-    lost = [line for line in whole if line not in describe(fit).splitlines()]
+    kept = describe(fit).splitlines()
+    lost = [line for line in whole if line not in kept]
     assert len(lost) < len(whole) / 2
     assert "<table>" in fit_html(fit)
     monkeypatch.setattr(sections, "CAUGHT", ())
