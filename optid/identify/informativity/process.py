@@ -23,7 +23,8 @@ from optid.statistics.coloured import short_autoregression
 LATEST = 0.25  # longest delay as a share of the longest experiment
 KEPT = 4  # delays of the scan that are refined
 NOISE = 4  # order of the noise model, at most
-TURNS, SETTLED = 5, 0.01  # scans with a better noise model; largest change of its coefficients that is none
+TURNS, SETTLED = 5, 0.01  # descents with a better noise model; largest change of its coefficients that is none
+SCANNED = 2  # of these turns begin with a scan where there are several inputs
 LARGEST = 4  # poles, at most
 SWEEPS = 3  # over several inputs, each fitted beside the others
 LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
@@ -161,30 +162,36 @@ class _Point:
     criterion: float
 
 
-def processes(data: Data, least: int = 0) -> tuple[Process, ...]:
+def processes(data: Data, least: int = 0, known: Sequence[Process] = ()) -> tuple[Process, ...]:
     """Find low-order transfer functions with dead time, one `Process` per output; a record of any kind has some.
 
     Args:
         data: the record; of a long one the first 30,000 samples are read.
         least: smallest lag of an input; 1 where the input answers the output without delay, in a loop.
+        known: those of a smaller `least`, one per output; kept where their inputs act late enough.
     """
     signals = RecordSignals.of(data)
-    return tuple(_process(signals, o, name, least) for o, name in enumerate(data.outputs))
+    kept = [p if all(r.nk >= least for r in p.responses) else None for p in known] or [None] * len(data.outputs)
+    return tuple(p or _process(signals, o, name, least) for o, (name, p) in enumerate(zip(data.outputs, kept)))
 
 
 def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
     regression = WhitenedRegression(signals.outputs(o), tuple(there[:, o] for there in signals.present), np.ones(1))
-    inputs = range(len(signals.u_scale))
     longest = max(int(LATEST * signals.longest), min(least, signals.longest - 1))
-    points: list[_Point | None] = [None for _ in inputs]
-    u = [signals.inputs(c) for c in inputs]
+    u = [signals.inputs(c) for c in range(len(signals.u_scale))]
+    points: list[_Point | None] = [None] * len(u)
+    inputs = range(1) if len(u) == 1 else sorted(  # the one that explains most first
+        range(len(u)), key=lambda c: scan(regression, u[c], longest, 1)[0].energy)
+    whole = not any(lost.any() for lost in signals.lost)
     for turn in range(TURNS):
         before = [None if p is None else (p.term.lag, p.term.order, p.term.zeros) for p in points]
         for _ in range(SWEEPS if len(points) > 1 and turn == 0 else 1):
             for c in inputs:
                 others = [p for i, p in enumerate(points) if p is not None and i != c]
-                rest = replace(regression, y=_without(regression.y, others))
-                points[c] = _found(rest, u[c], signals.levels(c), least, longest, points[c])
+                rest, point = replace(regression, y=_without(regression.y, others)), points[c]
+                points[c] = (_searched(rest, point.drive, least, longest, point.term, scanned=False)
+                             if point is not None and turn >= SCANNED and whole and len(points) > 1 else
+                             _found(rest, u[c], signals.levels(c), least, longest, point))
         known = [p for p in points if p is not None]
         for c in inputs:
             rest = replace(regression, y=_without(regression.y, [p for i, p in enumerate(known) if i != c]))
@@ -195,7 +202,6 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
         size = max(noise.size, regression.noise.size)
         change = np.pad(noise, (0, size - noise.size)) - np.pad(regression.noise, (0, size - regression.noise.size))
         same = before == [(p.term.lag, p.term.order, p.term.zeros) for p in known]
-        whole = not any(lost.any() for lost in signals.lost)
         exact = all(p.energy <= EXACT * regression.count for p in known)
         if exact or np.max(np.abs(change)) < SETTLED and (same or (turn == 0 and whole)):
             break

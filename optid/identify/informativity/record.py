@@ -122,7 +122,7 @@ def _loops(data: Data, signals: RecordSignals) -> tuple[tuple[Process, ...], tup
     found = () if tied else processes(data)
     if not tied and all(r.nk for p in found for r in p.responses):
         return found, tuple(loop(signals, c, found, data.outputs) for c in inputs)
-    later = processes(data, 1)
+    later = processes(data, 1, found)
     loops = tuple(loop(signals, c, later, data.outputs) for c in inputs)
     if any(one.word != "open" for one in loops):  # what acts at once is a controller
         return later, loops
