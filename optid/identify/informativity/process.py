@@ -23,8 +23,7 @@ from optid.statistics.coloured import short_autoregression
 LATEST = 0.25  # longest delay as a share of the longest experiment
 KEPT = 4  # delays of the scan that are refined
 NOISE = 4  # order of the noise model, at most
-TURNS, SETTLED = 5, 0.01  # descents with a better noise model; largest change of its coefficients that is none
-SCANNED = 2  # of these turns begin with a scan where there are several inputs
+TURNS, SETTLED = 5, 0.01  # scans with a better noise model; largest change of its coefficients that is none
 LARGEST = 4  # poles, at most
 SWEEPS = 3  # over several inputs, each fitted beside the others
 LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
@@ -129,6 +128,10 @@ class _Term:
         return np.array([*([1.0] * self.integrates), *real, *pairs], dtype=complex)
 
     @property
+    def key(self) -> tuple[int, ...]:
+        return len(self.taus), len(self.pairs), self.lag, self.zeros, int(self.integrates)
+
+    @property
     def order(self) -> int:
         return len(self.taus) + 2 * len(self.pairs) + self.integrates
 
@@ -184,14 +187,12 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
         range(len(u)), key=lambda c: scan(regression, u[c], longest, 1)[0].energy)
     whole = not any(lost.any() for lost in signals.lost)
     for turn in range(TURNS):
-        before = [None if p is None else (p.term.lag, p.term.order, p.term.zeros) for p in points]
+        before = [None if p is None else p.term.key for p in points]
         for _ in range(SWEEPS if len(points) > 1 and turn == 0 else 1):
             for c in inputs:
                 others = [p for i, p in enumerate(points) if p is not None and i != c]
-                rest, point = replace(regression, y=_without(regression.y, others)), points[c]
-                points[c] = (_searched(rest, point.drive, least, longest, point.term, scanned=False)
-                             if point is not None and turn >= SCANNED and whole and len(points) > 1 else
-                             _found(rest, u[c], signals.levels(c), least, longest, point))
+                rest = replace(regression, y=_without(regression.y, others))
+                points[c] = _found(rest, u[c], signals.levels(c), least, longest, points[c])
         known = [p for p in points if p is not None]
         for c in inputs:
             rest = replace(regression, y=_without(regression.y, [p for i, p in enumerate(known) if i != c]))
@@ -201,7 +202,7 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
         noise = short_autoregression(errors, min(NOISE, regression.count // 30))
         size = max(noise.size, regression.noise.size)
         change = np.pad(noise, (0, size - noise.size)) - np.pad(regression.noise, (0, size - regression.noise.size))
-        same = before == [(p.term.lag, p.term.order, p.term.zeros) for p in known]
+        same = before == [p.term.key for p in known]
         exact = all(p.energy <= EXACT * regression.count for p in known)
         if exact or np.max(np.abs(change)) < SETTLED and (same or (turn == 0 and whole)):
             break
@@ -250,10 +251,10 @@ def _searched(regression: WhitenedRegression, drive: _Drive, least: int, longest
     tried: dict[tuple[int, ...], _Point] = {}
 
     def fitted(term: _Term) -> _Point:
-        key = (len(term.taus), len(term.pairs), term.lag, term.zeros, term.integrates)
-        if key not in tried:
-            tried[key] = _refined(regression, drive, term, min((p.criterion for p in tried.values()), default=np.inf))
-        return tried[key]
+        if term.key not in tried:
+            least = min((p.criterion for p in tried.values()), default=np.inf)
+            tried[term.key] = _refined(regression, drive, term, least)
+        return tried[term.key]
 
     terms = [] if start is None else [start]
     for order in (1, 2) if scanned or start is None else ():
