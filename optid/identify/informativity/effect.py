@@ -11,7 +11,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
-from optid.identify.informativity.process import DelayedResponse, Process
+from optid.identify.informativity.process import LATEST, DelayedResponse, Process
 from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.recursions import lfilter
 from optid.statistics.coloured import short_autoregression
@@ -20,7 +20,6 @@ LEVEL = 0.005
 TAUS = (0.2, 3.0, 12.0, 50.0)  # time constants in samples
 # delays in samples; not the one that a scan finds, which is the best of many on the same record
 DELAYS = (0, 4, 16, 64)
-LATEST = 0.25  # longest of them as a share of the longest experiment
 CLEAR, DOUBTFUL = 1e-9, 0.05  # p values between which the law is simulated
 DRAWS, WARMING = 399, 200  # simulations, and samples before each
 SAMPLES = 30  # per coefficient of the noise model: a longer one takes a slow response for noise

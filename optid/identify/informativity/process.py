@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.identify.informativity.bank import scan
+from optid.identify.informativity.descent import ROUNDING, Drive, Point, Term, columns_of, refined, slowest_of
 from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.roots import roots_of
 from optid.statistics.coloured import short_autoregression
@@ -30,11 +31,7 @@ LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nod
 LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice the log likelihood ratio
 UNIT = 0.5  # share of the longest experiment beyond which a time constant is compared with an integrator
 FILLED = 20  # missing samples of an input up to which they are estimated
-ROUNDING = 1e-13
 EXACT = 1e-16  # mean square of errors, over the variance of the output, at which a response is exact
-STEPS, FARTHEST, NUDGE = 12, 1.0, 1e-6  # of a descent; longest step in a logarithm; step of a difference
-ENOUGH = 1e-3  # fall of twice the log likelihood at which a descent ends
-SURE, BEHIND = 2, 20.0  # step from which on a descent is given up that promises a criterion so far behind the best
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,77 +91,6 @@ class Process:
     criterion: float
 
 
-@dataclass(frozen=True)
-class _Term:
-    """Structure of one response: real poles and complex pairs as logarithms of time constants, and angles."""
-
-    taus: tuple[float, ...]  # logarithms
-    pairs: tuple[tuple[float, float], ...]  # (logarithm of the time constant, angle)
-    lag: int
-    zeros: int  # coefficients of B after the first
-    integrates: bool = False
-
-    @classmethod
-    def of(cls, poles: Sequence[complex] | Poles, lag: int, zeros: int = 0) -> "_Term":
-        factors = np.asarray(poles, dtype=complex)
-        real = [_time(float(p.real)) for p in factors if p.imag == 0]
-        # equal time constants have the same derivative
-        spread = [tau + 0.03 * i for i, tau in enumerate(sorted(real))]
-        pairs = [(_time(abs(p)), float(abs(np.angle(p)))) for p in factors if p.imag > 0]
-        return cls(tuple(spread), tuple(pairs), lag, zeros)
-
-    @property
-    def z(self) -> Array:
-        return np.array([*self.taus, *(x for pair in self.pairs for x in pair)])
-
-    def at(self, z: Array) -> "_Term":
-        n = len(self.taus)
-        return replace(self, taus=tuple(z[:n].tolist()), pairs=tuple(map(tuple, z[n:].reshape(-1, 2).tolist())))
-
-    @property
-    def poles(self) -> Poles:
-        real = [np.exp(-np.exp(-tau)) for tau in self.taus]
-        pairs = [np.exp(-np.exp(-tau) + sign * 1j * angle) for tau, angle in self.pairs for sign in (1, -1)]
-        return np.array([*([1.0] * self.integrates), *real, *pairs], dtype=complex)
-
-    @property
-    def key(self) -> tuple[int, ...]:
-        return len(self.taus), len(self.pairs), self.lag, self.zeros, int(self.integrates)
-
-    @property
-    def order(self) -> int:
-        return len(self.taus) + 2 * len(self.pairs) + self.integrates
-
-
-def _time(modulus: float) -> float:
-    """Logarithm of the time constant of a pole."""
-    return float(np.log(-1 / np.log(np.clip(modulus, 1e-6, 1 - 1e-7))))
-
-
-@dataclass(frozen=True, eq=False)
-class _Drive:
-    """What drives a response: f(u) per experiment, and what its bends cost in parameters."""
-
-    values: tuple[Array, ...]
-    nodes: Array | None = None
-    heights: Array | None = None
-
-    @property
-    def parameters(self) -> int:
-        return 0 if self.nodes is None else self.nodes.size - 2
-
-
-@dataclass(frozen=True, eq=False)
-class _Point:
-    """A response fitted beside what is projected out: sum of squares and coefficients, and the criterion."""
-
-    term: _Term
-    drive: _Drive
-    energy: float
-    theta: Array
-    criterion: float
-
-
 def processes(data: Data, least: int = 0, known: Sequence[Process] = ()) -> tuple[Process, ...]:
     """Find low-order transfer functions with dead time, one `Process` per output; a record of any kind has some.
 
@@ -182,7 +108,7 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
     regression = WhitenedRegression(signals.outputs(o), tuple(there[:, o] for there in signals.present), np.ones(1))
     longest = max(int(LATEST * signals.longest), min(least, signals.longest - 1))
     u = [signals.inputs(c) for c in range(len(signals.u_scale))]
-    points: list[_Point | None] = [None] * len(u)
+    points: list[Point | None] = [None] * len(u)
     inputs = range(1) if len(u) == 1 else sorted(  # the one that explains most first
         range(len(u)), key=lambda c: scan(regression, u[c], longest, 1)[0].energy)
     whole = not any(lost.any() for lost in signals.lost)
@@ -217,9 +143,9 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
 
 
 def _found(regression: WhitenedRegression, u: tuple[Array, ...], levels: int, least: int, longest: int,
-           before: _Point | None) -> _Point:
+           before: Point | None) -> Point:
     """Return the best response to one input, whose f is bent where that pays."""
-    straight = _Drive(u)
+    straight = Drive(u)
     start = None if before is None else before.term
     best = _searched(regression, straight, least, longest, start)
     if levels <= LEVELS:
@@ -229,10 +155,10 @@ def _found(regression: WhitenedRegression, u: tuple[Array, ...], levels: int, le
     if nodes.size < 4:
         return best
     starts = [best.term] if before is None or before.drive.nodes is None else [before.term, best.term]
-    squares = _Drive(tuple((u - whole.mean()) ** 2 for u in straight.values))
+    squares = Drive(tuple((u - whole.mean()) ** 2 for u in straight.values))
     even = scan(regression, squares.values, longest, 1)
     if even and even[0].energy < 0.9 * best.energy and even[0].lag >= least:  # f is nearly even
-        starts[-1] = _Term.of(even[0].poles, even[0].lag)
+        starts[-1] = Term.of(even[0].poles, even[0].lag)
     for term in dict.fromkeys(starts):  # that of a straight f may be far from the one found for a bent f
         for _ in range(2):
             bent = _bent(regression, straight, term, nodes)
@@ -245,21 +171,21 @@ def _found(regression: WhitenedRegression, u: tuple[Array, ...], levels: int, le
     return best
 
 
-def _searched(regression: WhitenedRegression, drive: _Drive, least: int, longest: int, start: _Term | None,
-              scanned: bool = True) -> _Point:
+def _searched(regression: WhitenedRegression, drive: Drive, least: int, longest: int, start: Term | None,
+              scanned: bool = True) -> Point:
     """Refine the best of the scan, and then neighbouring structures as long as the criterion falls."""
-    tried: dict[tuple[int, ...], _Point] = {}
+    tried: dict[tuple[int, ...], Point] = {}
 
-    def fitted(term: _Term) -> _Point:
+    def fitted(term: Term) -> Point:
         if term.key not in tried:
             least = min((p.criterion for p in tried.values()), default=np.inf)
-            tried[term.key] = _refined(regression, drive, term, least)
+            tried[term.key] = refined(regression, drive, term, least)
         return tried[term.key]
 
     terms = [] if start is None else [start]
     for order in (1, 2) if scanned or start is None else ():
         lags = [one for one in scan(regression, drive.values, longest, order) if one.lag >= least]
-        terms += [_Term.of(one.poles, one.lag) for one in lags[: KEPT if start is None else 2]]
+        terms += [Term.of(one.poles, one.lag) for one in lags[: KEPT if start is None else 2]]
     best = min(map(fitted, terms), key=lambda p: p.criterion)
     exact = EXACT * regression.count
     oscillating = list(_oscillating(regression, drive, best.term)) if scanned else []
@@ -272,7 +198,7 @@ def _searched(regression: WhitenedRegression, drive: _Drive, least: int, longest
     return best
 
 
-def _neighbours(term: _Term, least: int, longest: int, drive: _Drive) -> Iterator[_Term]:
+def _neighbours(term: Term, least: int, longest: int, drive: Drive) -> Iterator[Term]:
     """Yield the structures one step from a structure."""
     for lag in (term.lag - 1, term.lag + 1):
         if least <= lag <= longest:
@@ -295,7 +221,7 @@ def _neighbours(term: _Term, least: int, longest: int, drive: _Drive) -> Iterato
         yield replace(term, taus=tuple(t for t in term.taus if t != slow), integrates=True)
 
 
-def _oscillating(regression: WhitenedRegression, drive: _Drive, term: _Term) -> Iterator[_Term]:
+def _oscillating(regression: WhitenedRegression, drive: Drive, term: Term) -> Iterator[Term]:
     """Yield structures with the complex pairs of a longer autoregression with the delayed input."""
     n = 2 * LARGEST
     rows, targets = [], []
@@ -312,123 +238,70 @@ def _oscillating(regression: WhitenedRegression, drive: _Drive, term: _Term) -> 
     found = roots_of(-theta[: n - 1])
     pairs = sorted((p for p in found if p.imag > 0.02 and 0.6 < abs(p) < 1), key=lambda p: -abs(p))[:2]
     for p in pairs:
-        alone = _Term.of([p, p.conjugate()], term.lag, 1)
+        alone = Term.of([p, p.conjugate()], term.lag, 1)
         yield alone
         yield replace(alone, taus=(max(term.taus, default=1.0),))
     if len(pairs) == 2:
-        yield replace(_Term.of([q for p in pairs for q in (p, p.conjugate())], term.lag, 2))
+        yield replace(Term.of([q for p in pairs for q in (p, p.conjugate())], term.lag, 2))
 
 
-def _columns(term: _Term, values: Sequence[Array]) -> list[Array]:
-    responses = [respond(term.poles, u) for u in values]
-    return [np.column_stack([delayed(v, term.lag + j) for j in range(term.zeros + 1)]) for v in responses]
-
-
-def _slowest(poles: Poles) -> complex:
-    return 1.0 if np.any(poles == 1) else complex(np.max(np.abs(poles), initial=0.0))
-
-
-def _refined(regression: WhitenedRegression, drive: _Drive, term: _Term, below: float = np.inf) -> _Point:
-    """Descend over the poles of one response by Gauss-Newton steps, each along coefficients and poles together.
-
-    The descent ends early where its steps promise no criterion near `below`.
-    """
-    most = np.log(20 * max(len(u) for u in drive.values))
-    at, rows = term, max(regression.count, 2)
-
-    def criterion(energy: float) -> float:
-        count = at.z.size + at.zeros + 2 + free + regression.noise.size - 1 + drive.parameters
-        return float(rows * np.log(max(energy / rows, ROUNDING**2)) + count * np.log(rows))
-
-    energy, theta, free, columns = _solved(regression, drive, at)
-    for turn in range(STEPS if at.z.size and regression.count > at.z.size + at.zeros + 1 else 0):
-        slowest, moved = _slowest(at.poles), []
-        for one in np.eye(at.z.size) * NUDGE:
-            there = _columns(at.at(at.z + one), drive.values)
-            moved.append([(x - here) @ theta / NUDGE for x, here in zip(there, columns)])
-        whole = [np.column_stack([x, *(m[i] for m in moved)]) for i, x in enumerate(columns)]
-        promised, step, _, _ = regression.solve(whole, slowest)
-        if turn >= SURE and criterion(promised) > below + BEHIND:
-            break
-        step = step[theta.size :]
-        step *= min(1.0, FARTHEST / max(float(np.max(np.abs(step), initial=0.0)), 1e-300))
-        for share in (1.0, 0.25, 0.05):
-            z = np.clip(at.z + share * step, -4, most)
-            found = _solved(regression, drive, at.at(z))
-            if found[0] < energy:
-                break
-        else:
-            break
-        fall, at = energy - found[0], at.at(z)
-        energy, theta, free, columns = found
-        if regression.count * fall <= ENOUGH * energy:
-            break
-    return _Point(at, drive, energy, theta, criterion(energy))
-
-
-def _solved(regression: WhitenedRegression, drive: _Drive, term: _Term) -> tuple[float, Array, int, list[Array]]:
-    columns = _columns(term, drive.values)
-    energy, theta, _, free = regression.solve(columns, _slowest(term.poles))
-    return energy, theta, free, columns
-
-
-def _bent(regression: WhitenedRegression, drive: _Drive, term: _Term, nodes: Array) -> _Drive | None:
+def _bent(regression: WhitenedRegression, drive: Drive, term: Term, nodes: Array) -> Drive | None:
     """Fit f, piecewise linear between nodes, through a response; with slope one on average."""
     hats = [np.column_stack([np.interp(u, nodes, one) for one in np.eye(nodes.size)[1:]]) for u in drive.values]
     columns = [np.column_stack([delayed(respond(term.poles, h), term.lag) for h in hat.T]) for hat in hats]
-    _, theta, _, _ = regression.solve(columns, _slowest(term.poles))
+    _, theta, _, _ = regression.solve(columns, slowest_of(term.poles))
     heights = np.concatenate([[0.0], theta])
     values = [np.interp(u, nodes, heights) for u in drive.values]
     spread = float(np.std(np.concatenate(values)))
     if not np.isfinite(spread) or spread == 0:
         return None
     heights = heights / spread
-    return _Drive(tuple(np.interp(u, nodes, heights) for u in drive.values), nodes, heights)
+    return Drive(tuple(np.interp(u, nodes, heights) for u in drive.values), nodes, heights)
 
 
-def _completed(regression: WhitenedRegression, point: _Point, u: tuple[Array, ...], lost: Sequence[NDArray[np.bool_]]
+def _completed(regression: WhitenedRegression, point: Point, u: tuple[Array, ...], lost: Sequence[NDArray[np.bool_]]
                ) -> tuple[Array, ...]:
     """Estimate a few missing samples of an input from what they do to the output; more of them stay as they are."""
     places = [(i, k) for i, one in enumerate(lost) for k in np.flatnonzero(one).tolist() if k]
     if not 0 < len(places) <= FILLED or point.drive.nodes is not None:
         return u
-    own = _columns(point.term, u)
+    own = columns_of(point.term, u)
     columns = [[x @ point.theta] for x in own]
     for place, k in places:
         for i, record in enumerate(u):
             pulse = np.zeros(len(record))
             pulse[k if i == place else 0] = i == place
-            columns[i].append(_columns(point.term, [pulse])[0] @ point.theta)
-    _, theta, _, _ = regression.solve([np.column_stack(x) for x in columns], _slowest(point.term.poles))
+            columns[i].append(columns_of(point.term, [pulse])[0] @ point.theta)
+    _, theta, _, _ = regression.solve([np.column_stack(x) for x in columns], slowest_of(point.term.poles))
     filled = [x.copy() for x in u]
     for (i, k), value in zip(places, theta[1:] / (theta[0] or 1.0)):
         filled[i][k] += value
     return tuple(filled)
 
 
-def _without(y: Sequence[Array], points: Sequence[_Point]) -> tuple[Array, ...]:
+def _without(y: Sequence[Array], points: Sequence[Point]) -> tuple[Array, ...]:
     """Return the output less the responses to some inputs."""
     rest = list(y)
     for p in points:
-        rest = [r - x @ p.theta for r, x in zip(rest, _columns(p.term, p.drive.values))]
+        rest = [r - x @ p.theta for r, x in zip(rest, columns_of(p.term, p.drive.values))]
     return tuple(rest)
 
 
-def _joint(regression: WhitenedRegression, points: Sequence[_Point]) -> tuple[list[Array], Array, complex]:
+def _joint(regression: WhitenedRegression, points: Sequence[Point]) -> tuple[list[Array], Array, float]:
     """Return the columns of all responses, their coefficients together, and the slowest pole."""
-    each = [_columns(p.term, p.drive.values) for p in points]
+    each = [columns_of(p.term, p.drive.values) for p in points]
     columns = [np.hstack(several) for several in zip(*each)]
-    slowest = max((_slowest(p.term.poles) for p in points), key=abs)
+    slowest = max((slowest_of(p.term.poles) for p in points), key=abs)
     return columns, regression.solve(columns, slowest)[1], slowest
 
 
-def _interval(regression: WhitenedRegression, point: _Point, least: int, longest: int) -> tuple[int, int]:
+def _interval(regression: WhitenedRegression, point: Point, least: int, longest: int) -> tuple[int, int]:
     """Return the delays that the likelihood does not exclude, poles and coefficients refitted at each."""
     ends = []
     for step in (-1, 1):
         lag, term = point.term.lag, point.term
         while least <= lag + step <= longest:
-            found = _refined(regression, point.drive, replace(term, lag=lag + step))
+            found = refined(regression, point.drive, replace(term, lag=lag + step))
             floor = ROUNDING**2 * regression.count
             if regression.count * np.log(max(found.energy, floor) / max(point.energy, floor)) > LIKELY:
                 break
@@ -437,7 +310,7 @@ def _interval(regression: WhitenedRegression, point: _Point, least: int, longest
     return ends[0], ends[1]
 
 
-def _response(signals: RecordSignals, c: int, o: int, point: _Point, interval: tuple[int, int]) -> DelayedResponse:
+def _response(signals: RecordSignals, c: int, o: int, point: Point, interval: tuple[int, int]) -> DelayedResponse:
     """Write a response in the units of the record."""
     term, drive = point.term, point.drive
     poles = term.poles

@@ -103,7 +103,7 @@ def respond(poles: Sequence[complex] | Poles, drive: Array) -> Array:
     a = np.ones(1, dtype=complex)
     for p in factors:  # np.poly, without its search for conjugates
         a = np.append(a, 0.0) - np.append(0.0, p * a)
-    return lfilter([1.0], a.real, x)
+    return lfilter([1.0], np.real(a), x)
 
 
 def delayed(x: Array, lag: int) -> Array:
@@ -151,7 +151,7 @@ class WhitenedRegression:
         """The whitened output."""
         return tuple(whitened(self.noise, y)[rows] for y, rows in zip(self.y, self.rows))
 
-    def projected(self, columns: Sequence[Array], slowest: complex) -> tuple[Array, int]:
+    def projected(self, columns: Sequence[Array], slowest: float) -> tuple[Array, int]:
         """Return [columns | output], (rows, k + 1), whitened and beside level and decay, and their free parameters."""
         found: list[Array] = []
         free = 0
@@ -171,14 +171,14 @@ class WhitenedRegression:
             found.append(both)
         return np.vstack(found), free
 
-    def solve(self, columns: Sequence[Array], slowest: complex) -> tuple[float, Array, Array, int]:
+    def solve(self, columns: Sequence[Array], slowest: float) -> tuple[float, Array, Array, int]:
         """Return sum of squares, coefficients, whitened errors, and the parameters that were projected out."""
         both, free = self.projected(columns, slowest)
         theta = np.linalg.lstsq(both[:, :-1], both[:, -1], rcond=1e-9)[0] if both.shape[1] > 1 else np.zeros(0)
         errors = both[:, -1] - both[:, :-1] @ theta
         return float(errors @ errors), theta, errors, free
 
-    def residuals(self, columns: Sequence[Array], theta: Array, slowest: complex) -> list[Array]:
+    def residuals(self, columns: Sequence[Array], theta: Array, slowest: float) -> list[Array]:
         """Return the errors before whitening, without level and decay, NaN where the output is missing."""
         plain = replace(self, noise=np.ones(1), present=tuple(np.ones_like(there) for there in self.present))
         both, _ = plain.projected(columns, slowest)
