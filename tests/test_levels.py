@@ -368,3 +368,11 @@ def test_an_input_that_is_constant_within_every_experiment_is_refused():
                 optid.fit(data, name, na=1, nb=1, nk=1, offset="each", **more)
     with pytest.raises(RankError):
         optid.fit(both, "ss.exact", nx=1, offset="each")
+
+
+def test_the_constants_of_the_experiments_are_printed():
+    data, _ = record(experiments=14)
+    fit = optid.fit(data, "arx", na=1, nb=1, nk=2, offset="each", prove=False)
+    words = " ".join(str(fit).split())
+    assert f"Constants of the experiments: {fit.model.levels[0, 0]:.4g}" in words
+    assert "and 2 more; offset is their mean" in words

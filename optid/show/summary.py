@@ -229,6 +229,10 @@ def model_facts(fit: "Fit") -> Facts:
     ]
     if isinstance(noise := getattr(model, "noise", None), str) and noise:
         facts.append(("Noise", noise))
+    if model.levels is not None:
+        shown = [" ".join(number(one, 4) for one in row) for row in model.levels[:MOST]]
+        more = f" and {len(model.levels) - MOST} more" if len(model.levels) > MOST else ""
+        facts.append(("Constants of the experiments", f"{', '.join(shown)}{more}; offset is their mean"))
     if gauge := _gauge(model):
         facts.append(("Gauge", gauge))
     functions = [function for function in static_functions(model) if not function.is_linear]
