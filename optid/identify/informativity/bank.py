@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
 from optid.arrays import Array
-from optid.identify.informativity.signals import WhitenedRegression, respond, whitened
+from optid.identify.informativity.signals import WhitenedRegression, delayed, respond, whitened
 
 SLOWEST, FASTEST, COUNT = 0.5, 0.8, 15  # time constants: share of the longest experiment, samples, their number
+TAUS, DELAYS, POWERS = (2.0, 6.0, 18.0, 54.0), (0, 3, 8, 16, 32), (1, 2, 3)  # of several inputs together, in samples
+RIDGE = 0.1  # weight of their coefficients, of columns of norm one
 FLAT = 1e-9  # share of its energy that a response must keep beside the level to count
 
 
@@ -88,3 +90,21 @@ def _products(white: Array, single: Array, first: NDArray[np.intp], second: NDAr
 def _weights(p: Array, q: Array) -> Array:
     """Return what combines the responses of two poles to that of both, all of unit static gain, (2, n)."""
     return np.stack([p * (1 - q) / (p - q), -q * (1 - p) / (p - q)])
+
+
+def apart(regression: WhitenedRegression, inputs: Sequence[Array], least: int, longest: int
+          ) -> list[tuple[Array, ...]]:
+    """Return a first response to each of several inputs, fitted together behind a few poles and delays.
+
+    The inputs are (T, m) per experiment; the responses, (T,) per experiment, are those of powers of the input.
+    """
+    lags = sorted({max(lag, least) for lag in DELAYS if lag <= max(longest, least)})
+    columns = [[np.column_stack([delayed(v, lag) for power in POWERS for tau in TAUS
+                                 for v in (respond((float(np.exp(-1 / tau)),), u[:, c] ** power),) for lag in lags])
+                for u in inputs] for c in range(inputs[0].shape[1])]
+    both, _ = regression.projected([np.hstack(several) for several in zip(*columns)], 1.0)
+    size = np.linalg.norm(both[:, :-1], axis=0) + 1e-300
+    x = both[:, :-1] / size
+    theta = np.linalg.solve(x.T @ x + RIDGE * np.eye(size.size), x.T @ both[:, -1]) / size
+    parts = np.split(theta, len(columns))
+    return [tuple(x @ part for x in own) for own, part in zip(columns, parts)]

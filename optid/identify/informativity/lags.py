@@ -28,15 +28,18 @@ def added(target: Array, base: Array, more: Array) -> Added:
     q = _span(base)
     rest = target - q @ (q.T @ target)
     more = more / np.maximum(np.linalg.norm(more, axis=0), 1e-300)
-    left, size, _ = np.linalg.svd(more - q @ (q.T @ more), full_matrices=False)
-    left = left[:, size > DISTINCT]
-    spare = len(target) - q.shape[1] - left.shape[1]
-    if not left.shape[1] or spare < 1:
+    new = more - q @ (q.T @ more)
+    size, turned = np.linalg.eigh(new.T @ new)  # squares of singular values, of which small ones do not count
+    distinct = size > DISTINCT**2
+    columns = int(distinct.sum())
+    spare = len(target) - q.shape[1] - columns
+    if not columns or spare < 1:
         return Added(1.0, 0.0, 0)
-    saved, energy = float(np.sum((left.T @ rest) ** 2)), float(rest @ rest)
+    along = turned[:, distinct].T @ (new.T @ rest)
+    saved, energy = float(np.sum(along**2 / size[distinct])), float(rest @ rest)
     kept = max(energy - saved, ROUNDING * float(target @ target), 1e-300)
-    ratio = saved / left.shape[1] / (kept / spare)
-    return Added(float(fdtrc(left.shape[1], spare, ratio)), saved / (saved + kept), left.shape[1])
+    ratio = saved / columns / (kept / spare)
+    return Added(float(fdtrc(columns, spare, ratio)), saved / (saved + kept), columns)
 
 
 def _span(columns: Array) -> Array:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.identify.informativity.bank import scan
+from optid.identify.informativity.bank import apart, scan
 from optid.identify.informativity.descent import ROUNDING, Drive, Point, Term, columns_of, refined, slowest_of
 from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.roots import roots_of
@@ -26,7 +26,6 @@ KEPT = 4  # delays of the scan that are refined
 NOISE = 4  # order of the noise model, at most
 TURNS, SETTLED = 5, 0.01  # scans with a better noise model; largest change of its coefficients that is none
 LARGEST = 4  # poles, at most
-SWEEPS = 3  # over several inputs, each fitted beside the others
 LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
 LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice the log likelihood ratio
 UNIT = 0.5  # share of the longest experiment beyond which a time constant is compared with an integrator
@@ -112,13 +111,14 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
     inputs = range(1) if len(u) == 1 else sorted(  # the one that explains most first
         range(len(u)), key=lambda c: scan(regression, u[c], longest, 1)[0].energy)
     whole = not any(lost.any() for lost in signals.lost)
+    first = apart(regression, signals.u, least, longest) if len(u) > 1 else ()
     for turn in range(TURNS):
         before = [None if p is None else p.term.key for p in points]
-        for _ in range(SWEEPS if len(points) > 1 and turn == 0 else 1):
-            for c in inputs:
-                others = [p for i, p in enumerate(points) if p is not None and i != c]
-                rest = replace(regression, y=_without(regression.y, others))
-                points[c] = _found(rest, u[c], signals.levels(c), least, longest, points[c])
+        for c in inputs:
+            y = _without(regression.y, [p for i, p in enumerate(points) if p is not None and i != c])
+            for i in (i for i, p in enumerate(points) if p is None and i != c):
+                y = tuple(rest - response for rest, response in zip(y, first[i]))
+            points[c] = _found(replace(regression, y=y), u[c], signals.levels(c), least, longest, points[c])
         known = [p for p in points if p is not None]
         for c in inputs:
             rest = replace(regression, y=_without(regression.y, [p for i, p in enumerate(known) if i != c]))
