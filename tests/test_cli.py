@@ -95,6 +95,7 @@ def test_an_option_without_a_value_is_refused(words):
         spread(words.split(), {"--in": False, "--out": False})
 
 
+@pytest.mark.slow
 def test_several_values_by_spaces_commas_and_repetition_are_the_same(csv, tmp_path):
     models = []
     for k, names in enumerate((["--inputs", "u1", "u2"], ["--inputs", "u1,u2"], ["--inputs", "u1", "--inputs", "u2"])):
@@ -158,6 +159,7 @@ def test_a_stream_gives_the_same_model(csv, tmp_path):
     assert np.allclose(optid.load(tmp_path / "a.json").a, optid.load(tmp_path / "b.json").a, rtol=1e-9)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", sorted(EXAMPLES))
 def test_every_example_runs_as_suggested(name):
     result = run("fit", "--example", name, "--seed", 1)

@@ -66,6 +66,7 @@ def test_a_horizon_is_validated_beside_one_step():
     assert found.predictors["3 steps"]["y2"].fit == pytest.approx(fit_percent(data.y, model.predict(data, 3))[1])
 
 
+@pytest.mark.slow
 def test_every_experiment_is_measured():
     model = mimo()
     parts = [record(model, 300, 1), record(model, 200, 2)]

@@ -34,6 +34,7 @@ def run(encoding, *words):
     return found.exit_code, text
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("encoding", ENCODINGS[:2])
 def test_a_record_with_any_names_is_fitted_validated_and_searched(folder, encoding):
     words = [folder / "r.csv", "--inputs", ODD["inputs"], "--outputs", ODD["outputs"], "--dt", "1"]

@@ -193,6 +193,7 @@ def lenient(monkeypatch):
     monkeypatch.setattr(sections, "CAUGHT", (Exception,))
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("module, name, left", [
     (estimates, "parameter_tables", "The model on this record"), (summary, "fit_table", "Parameters"),
     (summary, "verdict", "Parameters"), (summary, "judgement", "Parameters"), (summary, "model_facts", "Parameters"),

@@ -379,6 +379,7 @@ def test_shapes_of_output_functions_hold_and_have_prices():
     assert odd(grid) + odd(-grid) == pytest.approx(2 * odd(np.zeros(1)) * np.ones(400), abs=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
 def test_functions_of_latent_signals_are_bent_as_asked_or_the_question_is_refused():
     rng = np.random.default_rng(0)

@@ -127,6 +127,7 @@ def test_experiment_column_of_a_mat_file(save):
 # -- clocks
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name, value", [("Ts", 0.1), ("dt", 0.1), ("fs", 10.0), ("Fs", 10.0), ("SampleTime", 0.1),
                                          ("SampleRate", 10.0), ("Ts", np.float32(0.1)), ("fs", np.int32(10))])
 def test_scalar_clocks(save, name, value):
@@ -252,6 +253,7 @@ def test_iddata_of_several_experiments(save):
 # -- what is not a real number
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind, line", [
     ("timetable", r"r = x.Properties.RowTimes; s = table2struct\(timetable2table\(x"),
     ("table", r"s = table2struct\(x, 'To"), ("iddata", r"s = get\(x\)"), ("timeseries", r"struct\('t', x.Time"),
@@ -272,6 +274,7 @@ def test_text_is_ignored(save):
     refuses(DataError, "no column 'title'", read, path, inputs="title")
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("value, words", [
     (U * 1j, r"is complex. In MATLAB: u = \[real\(u\)"), (sparse.csc_matrix(column(U)), r"is sparse.*u = full\(u\)"),
     (np.zeros((0, 3)), "is empty"), (np.ones((3, 4, 5)), "has 3 dimensions .3 x 4 x 5."),
@@ -398,6 +401,7 @@ KINDS = {
     "others": {"u": U, "y": Y * 1j, "s": sparse.csc_matrix(UU), "o": Object("table"), "e": EMPTY, "b": U > 0}}
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("count", [4, pytest.param(100, marks=pytest.mark.slow)])
 def test_damaged_files_are_read_or_refused_by_name(save, kind, count):

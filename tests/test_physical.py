@@ -249,6 +249,7 @@ def test_bad_equations_are_refused_by_name(given, words):
         quiet(record(50), given() if callable(given) else given)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize(("right", "start", "time"), [
     (lambda v: {"x": v["a"] * v["x"] + v["b"] * v["u"], "y": v["x"]}, 50.0, "continuous"),
     (lambda v: {"x": v["a"] * v["x"] ** 3 + v["b"] * v["u"], "y": v["x"]}, 30.0, "discrete")])

@@ -249,6 +249,7 @@ def test_colours_are_told_apart_by_every_kind_of_colour_vision(scheme):
         assert min(np.linalg.norm(a - b) for i, a in enumerate(seen) for b in seen[:i]) > 15
 
 
+@pytest.mark.slow
 def test_figures_of_warned_validations_do_not_warn_again():
     with pytest.warns(DataWarning):
         optid.validate(mimo_fit().model, two_by_two(seed=5))

@@ -231,6 +231,7 @@ CELLS = ["1", "-2.5", "1e300", "3e-320", " 4", "5 ", "", "NA", " nan", "Null", "
          '"8,5"', "1,2", "-", "+6", ".5", "9.", "\u0663", "1\r", "\r", "\n", "\0", "true", "1d3", "Infinity", "-NaN"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("decimal", [".", ","])
 def test_polars_and_the_csv_module_read_the_same(tmp_path, monkeypatch, decimal):
     """Random cells in a table of numbers: the same samples, or the same words about the same cell."""
@@ -267,6 +268,7 @@ def test_bad_delimiter(tmp_path, delimiter):
     refuses(DataError, "one character|must be a text", read, write(tmp_path, CSV), delimiter=delimiter)
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_columns(tmp_path):
     names = ["u", "y", *(f"c{k}" for k in range(99_998))]
     path = write(tmp_path, ",".join(names) + "\n" + (",".join(["0.5"] * 100_000) + "\n") * 9)

@@ -176,6 +176,7 @@ def test_the_sign_rule_of_the_gauge_rests_where_a_constraint_fixes_a_sign():
     assert shaped(fit.model, GRID)[-1] > shaped(fit.model, GRID)[0]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("form", ["hammerstein_arx.exact", "hammerstein_arx.overparametrised", "hammerstein_oe.exact",
                                   "hammerstein_armax.exact", "hammerstein_ss.sid", "hammerstein_ss.exact"])
 @pytest.mark.parametrize("gain", [1.0, -1.0])

@@ -90,6 +90,7 @@ FITS = [("hammerstein_arx.exact", TRANSFER, []), ("hammerstein_arx.exact", TRANS
         pytest.param("hammerstein_ss.exact", {"nx": 2}, ["dead_zone:0,.3"], marks=pytest.mark.slow)]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 @pytest.mark.parametrize(("name", "orders", "words"), FITS, ids=lambda part: str(part) if part else "free")
 def test_f_rises_where_the_plant_rises(name, orders, words, gain):

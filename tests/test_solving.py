@@ -234,6 +234,7 @@ def test_a_pickled_programme_does_not_share_ids_with_what_is_made_after_it(monke
     assert solve(program, "clarabel").values["x"] == pytest.approx([1.0, 1.0], abs=1e-6)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("solver", ["gauss_newton", "alternating", "ipopt"])
 @pytest.mark.parametrize("constraints", [(), (lambda view: {"first": view["mu"][0] <= 0.5},)])
 def test_a_programme_stated_late_starts_elsewhere_where_it_starts_here(solver, constraints):

@@ -341,6 +341,7 @@ def test_poles_may_leave_the_circle_where_that_is_allowed():
     assert free.solution.objective < 0.5 * stable_one.solution.objective
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("weighting", ["scale", "variance"])
 def test_simulation_errors_carry_the_hankel_bound(weighting):
     _, data = system(samples=1500, noise=0.3, seed=5)

@@ -127,6 +127,7 @@ def records():
         yield [data.u[a:b] for a, b in cuts], [data.y[a:b] for a, b in cuts]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("change", ["order", "units of u", "units of y", "constants"])
 def test_p_values_do_not_depend_on(change):
     for u, y in records():
@@ -177,6 +178,7 @@ def test_records_without_noise():
     assert structure_test(Data(u, np.ones(1200) + 0 * u[:, 0])).p_value == 1
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("seed, level", [(0, 0.0), (1, 1e3), (2, 1e6)])
 def test_the_last_digits_of_records_without_noise(seed, level):
     rng = np.random.default_rng(seed)
@@ -231,6 +233,7 @@ def test_a_record_of_short_experiments():
                 refuses(RankError, "no experiment has 24 samples", structure_test, Data(*pieces), found=found)
 
 
+@pytest.mark.slow
 def test_several_inputs_and_outputs():
     model = mimo()
     u = inputs(model, 3000)

@@ -219,6 +219,7 @@ options = {{ max_iter = {}, {} }}
 """
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("written, key, words", [
     (("50", "max_itr = 3"), "max_itr", "max_itr makes clarabel fail where it succeeds without: TypeError"),
     (('"many"', "equilibrate_enable = true"), "max_iter",

@@ -124,6 +124,7 @@ def test_ranks_and_probabilities_by_counting():
         assert p == pytest.approx(min(1.0, 3 * scipy.stats.binomtest(worse, 15).pvalue))
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("shape", [(7, 2), (9, 3), (14, 4)])
 def test_equal_ones_are_seldom_told_apart_over_data_sets(shape):
     rng = np.random.default_rng(1)

@@ -61,6 +61,7 @@ def test_a_wrong_delay_is_useless_whatever_is_proved():
     assert "--nk 7" in [step for _, step in told(fit)] and "raises the simulation fit from" in fit.advice[0].sentence
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("plant, formulation, arguments, steps", [
     ({"delay": 1}, "oe.exact", {"nb": 2, "nk": 4}, ("--nk 0", "--nk 1")),
     ({}, "oe.exact", {"na": 1}, ("--na 2",)),
