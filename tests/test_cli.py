@@ -138,6 +138,7 @@ def test_split_validates_on_the_rest_and_the_report_has_it(csv, tmp_path):
     assert "Test record, not seen by the fit" in page
 
 
+@pytest.mark.slow
 def test_a_test_file_is_validated_on(csv):
     result = run("fit", csv, *ORDERS, "--test", csv.parent / "second.csv")
     assert result.exit_code == 0 and "200 samples held out" in result.output
@@ -169,6 +170,7 @@ def test_every_example_runs_as_suggested(name):
     assert np.array_equal(example(name, seed=1).data.y, example(name, seed=1).data.y)
 
 
+@pytest.mark.slow
 def test_a_suggestion_is_overruled_and_cut_to_what_the_formulation_takes():
     result = run("fit", "--example", "dead_zone", "--formulation", "arx", "--na", 1)
     assert result.exit_code == 0 and "Linear ARX model" in result.output and "a2" not in result.output

@@ -59,6 +59,7 @@ def test_the_curve_is_the_fit_of_predictions_over_common_samples():
         fit_by_horizon(model, data.window(0, 50), [100])
 
 
+@pytest.mark.slow
 def test_a_horizon_is_validated_beside_one_step():
     model, data = mimo(), record(mimo())
     found = validate(model, data, horizon=3)

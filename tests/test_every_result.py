@@ -88,6 +88,7 @@ def test_records_too_short_for_every_part_of_the_structure_test_are_judged(syste
         assert fit.verdict.word in str(fit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [-300, 300])
 @pytest.mark.parametrize("name, orders", [("arx", {"na": 1, "nb": 1}), ("oe.exact", {"na": 1, "nb": 1}),
                                           ("ss.exact", {"nx": 1}), ("hammerstein_ss.asivid", {"nx": 1})])

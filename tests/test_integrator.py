@@ -27,6 +27,7 @@ def tank(seed, drift=0.0, noise=0.02, samples=600):
 ORDERS = {"na": 1, "nb": 1, "nk": 1}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("drift", [0.0, 0.01])
 @pytest.mark.parametrize("seed", range(5))
 def test_the_slope_of_a_tank_is_found_apart_from_its_drift(seed, drift):

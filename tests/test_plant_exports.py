@@ -69,6 +69,7 @@ def test_a_mark_of_missing_samples_is_told(tmp_path):
     assert not optid.read(tmp_path / export.name, **export.words).findings
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("export", [one for one in EXPORTS if one.words or not one.refusal], ids=lambda e: e.name)
 def test_the_command_reads_the_same(export, tmp_path):
     words = ["look", export.file(tmp_path), "--inputs", export.channels[0], "--outputs", export.channels[1]]

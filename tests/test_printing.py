@@ -15,6 +15,7 @@ def rows(text: str, title: str) -> dict[str, list[str]]:
     return {line.split()[0]: line.split()[1:] for line in body}
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     "make",
     [

@@ -11,6 +11,7 @@ from optid.identify.selection import default_weights, fit_by_holdout, path
 STRUCTURE = {"na": 2, "nb": 2, "basis": BASIS}
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("formulation, penalty", [("hammerstein_arx.exact", "curvature"),
                                                   ("hammerstein_arx.exact", "ridge"),
                                                   ("hammerstein_arx.nuclear", "weight")])

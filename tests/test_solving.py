@@ -185,6 +185,7 @@ def test_time_limit_is_kept_for_a_solver_that_does_not():
     assert found.status is Status.LIMIT and time.monotonic() - clock < 30.0  # it would never end
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("name", ["clarabel", "ipopt", "uno", "highs"])
 def test_answer_in_a_process_of_its_own_is_the_same(name):
     here, there = solve(case("qp_box").build(), name), solve(case("qp_box").build(), name, time_limit=30.0)

@@ -199,6 +199,7 @@ def test_the_last_digits_of_records_without_noise(seed, level):
     assert not product.passed and product.p_values["y"][PRODUCTS] < 1e-20
 
 
+@pytest.mark.slow
 def test_missing_samples_and_experiments():
     for wiener in (False, True):
         data = hammerstein(3000, 5, wiener)

@@ -127,6 +127,7 @@ def test_a_true_model_passes():
         assert words in text
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Structure of the record")
 def test_each_output_and_experiment_counts():
     model = mimo()

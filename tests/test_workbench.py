@@ -126,6 +126,7 @@ def test_what_cannot_be_read_or_fitted_is_said():
         assert code == 200 and "high" in json.loads(text)["error"] and "low" in json.loads(text)["error"]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("constraints", [
     [("monotone", {"direction": "increasing"}, "rising"), ("through", {"u": 0.5, "y": 0.3}, "point 1"),
      ("range", {"low": -0.3, "high": 0.1, "first": -0.5, "last": 0.25}, "corridor 1")],
