@@ -91,10 +91,11 @@ def browser(tmp_path_factory):
 
 
 def shown(browser, path, width, dark=False):
-    """Open a page, bring every figure into view once, and return the milliseconds until it could be used."""
+    """Open a page and all that is folded, bring every figure into view once, and return the milliseconds to its use."""
     browser.window(width, 900, dark=dark, phone=width < 500)
     browser.open(path)
     ready = float(browser.run("document.documentElement.dataset.ready"))
+    browser.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     browser.run("(async () => { for (const host of document.querySelectorAll('[data-chart]')) { host.scrollIntoView("
                 "{behavior: 'instant'}); await new Promise((done) => requestAnimationFrame(() => "
                 "requestAnimationFrame(done))); } })()")
@@ -123,7 +124,7 @@ def test_a_page_fits_the_window_and_can_be_read(pages, browser, name, width, dar
 
 def test_a_useless_model_is_never_green(pages, browser):
     shown(browser, pages["useless"], 1300)
-    assert browser.run("document.querySelector('main section').className") == "verdict bad"
+    assert browser.run("document.querySelector('main section.verdict').className") == "verdict bad"
     assert "useless" in browser.run("document.querySelector('main section .word').textContent")
 
 
