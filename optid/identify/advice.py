@@ -27,6 +27,7 @@ JUMP = 4.0  # ratio of the sizes of a channel's steps before and after a sample 
 APART = 15.0  # points by which both halves of a record fit better alone, from which the plant counts as changed
 DRIVEN = 0.5  # log ratio by which past outputs reduce the error of the input, from which columns count as swapped
 TOO_FEW = 10  # samples per parameter at least
+UNSTABLE = "the model has a pole outside the unit circle"
 SLOW = 0.9  # real poles from here on are compared with 1
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
 NOISE_MODELS = ("arx", "hammerstein_arx", "armax", "hammerstein_armax", "bj", "hammerstein_bj")
@@ -245,7 +246,11 @@ def advise_on_poles(fit: Any) -> Iterator[Advice]:
             "constraints", ())):
         return
     slow = [pole.real for pole in model.poles if not pole.imag and pole.real > SLOW]
-    pole = min(slow, key=lambda one: abs(one - 1), default=0.0)
+    pole = min(slow, key=lambda one: abs(one - 1), default=None)
+    if pole is None:
+        if not model.is_stable:
+            yield Advice(UNSTABLE, "--constraint stable:0.99")
+        return
     try:
         nearest = fit.uncertainty.of(lambda model: model.poles[np.argmin(np.abs(model.poles - pole))].real)
         reach, words = 2 * float(nearest.error), f"{pole:.6g} ± {2 * float(nearest.error):.2g}"
@@ -257,7 +262,7 @@ def advise_on_poles(fit: Any) -> Iterator[Advice]:
         yield Advice(f"the record does not tell the pole {words} from 1: the plant may integrate, its output ramp "
                      "while the inputs are held", word)
     elif not model.is_stable:
-        yield Advice("the model has a pole outside the unit circle", "--constraint stable:0.99")
+        yield Advice(UNSTABLE, "--constraint stable:0.99")
 
 
 def _try(fit: Any, **changes: Any) -> Any:
