@@ -31,7 +31,7 @@ OVERFIT = 12.0  # points that the cross-validated fit may be below that on the r
 GAP = 15.0  # points that the one-step prediction may be better than the free run
 # errors of the response that inputs explain, over the spread of the simulated output: of a model that is not good, and
 NOTED, WRONG = 0.07, 0.10  # of one that is poor
-UNCERTAIN = 0.07  # standard error of the step response, over its size
+UNCERTAIN = 0.1  # standard error of the step response, over its size
 POINTS = 20  # of a step response, at which it is looked at
 APART = 0.12  # difference of the response from that of the low-order model, in a loop
 STRUCTURE = 0.1  # share of the residual variance that another structure may save in a model that is called good
@@ -109,7 +109,7 @@ def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = No
     if np.isfinite(ahead) and np.isfinite(own) and not closed:
         parts.append(Finding("one-step minus simulation fit", _points(ahead - own, " points"), ahead - own <= GAP))
     parts += _residuals(model, raw, predicted)
-    wrong = [*_response(model, raw, runs, told, closed), *_uncertain(model, raw, known)]
+    wrong = [*_response(model, raw, runs, told, closed), *_uncertain(model, raw, known, told)]
     wrong += _lags(model, told, all(part.passed for part in wrong))
     # a pole nearer to 1 than the record is long grows by less than e over it: the record does not tell it from 1
     ramps = model.integrates or (not model.is_stable and model.integrates_within(
@@ -174,8 +174,11 @@ def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Infor
     return parts
 
 
-def _uncertain(model: Any, data: Data, known: Any) -> list[Finding]:
-    """Say how well the record determines the response to a step over the range of every input."""
+def _uncertain(model: Any, data: Data, known: Any, told: Informativity) -> list[Finding]:
+    """Say how well the record determines the response to a step over the range of every input.
+
+    That to an input without visible effect is compared with the largest one of the output.
+    """
     if known is None or has_feedback(model) or getattr(model, "latent", ()) or len(model.nonlinearities) != data.m:
         return []
     length = max(min(step_length(model), max(e.n_samples for e in data.experiments) // 3), 2)
@@ -195,6 +198,8 @@ def _uncertain(model: Any, data: Data, known: Any) -> list[Finding]:
         return []
     shape = (points.size, data.l, data.m)
     size, error = np.abs(found.value).reshape(shape).max(axis=0), found.error.reshape(shape).max(axis=0)
+    idle = [told.without_effect(c) for c in range(data.m)]
+    size = np.where(idle, size.max(axis=1, keepdims=True), size)
     with np.errstate(all="ignore"):
         share = float(np.nanmax(np.where(size > 0, error / size, np.nan), initial=0.0))
     return [Finding("standard error of the step response", f"{100 * share:.2g} %", share <= UNCERTAIN)]

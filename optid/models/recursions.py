@@ -40,7 +40,7 @@ def lfilter(b: ArrayLike, a: ArrayLike, x: ArrayLike) -> Array:
     y is not finite where the recursion leaves the range of numbers.
     """
     x, a = np.asarray(x, dtype=float), np.asarray(a, dtype=float)
-    if x.size > SHORT:
+    if len(x) > SHORT:
         from scipy import signal
 
         return np.asarray(signal.lfilter(b, a, x, axis=0))

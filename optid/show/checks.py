@@ -111,7 +111,12 @@ def search_table(found: "Identification") -> Table:
                  f"{seconds(spent)} CPU)", ("structure", "cv fit %", "worst block", "parameters"), rows)
 
 
+def worst_block(trial: "Trial") -> str:
+    """Return the fit of a trial in its worst block; "-" where no block could be left out."""
+    return f"{trial.by_block.min():.1f}" if trial.by_block.size else "-"
+
+
 def _row(word: str, trial: "Trial", chosen: bool) -> tuple[str, ...]:
     structure = f"{trial.candidate.formulation} {trial.candidate.words}"
-    return (f"{'* ' * chosen}{word}: {structure}", f"{trial.score:.1f}", f"{trial.by_block.min():.1f}",
+    return (f"{'* ' * chosen}{word}: {structure}", f"{trial.score:.1f}", worst_block(trial),
             str(trial.parameters))

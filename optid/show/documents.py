@@ -242,11 +242,11 @@ def _search(found: "Identification") -> list[Any]:
     table = wording.Table(f"Every structure that was tried on all blocks ({len(trials)})",
                           ("structure", "fit %", "worst block", "parameters", "time"),
                           [(f"{t.candidate.kind}: {t.candidate.formulation} {t.candidate.words}", f"{t.score:.1f}",
-                            f"{t.by_block.min():.1f}", str(t.parameters), wording.seconds(t.seconds))
+                            checks.worst_block(t), str(t.parameters), wording.seconds(t.seconds))
                            for t in sorted(trials, key=lambda t: -t.score)])
+    drawn = [Charts([charts.block_chart(found)])] if found.chosen.by_block.size else []
     return [checks.search_table(found), Notes([*found.reasons, *notes]),
-            Code(f"--formulation {chosen.formulation} {chosen.words}"), Charts([charts.block_chart(found)]),
-            Fold(table.title, [table])]
+            Code(f"--formulation {chosen.formulation} {chosen.words}"), *drawn, Fold(table.title, [table])]
 
 
 def validation_document(checked: Validation) -> Document:
