@@ -9,7 +9,7 @@ alone, and in a loop direct feedthrough and methods for open loops. The error of
 import time
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from zlib import crc32
 
@@ -46,6 +46,7 @@ class Row:
         parts: name, value, whether it passes and whether it counts, for every part of the verdict.
         reason: why there is no model.
         seconds: CPU time of the verdict.
+        able: whether the structure can be right: linear or Hammerstein plants, of which the record can tell something.
     """
 
     kind: str
@@ -57,6 +58,7 @@ class Row:
     parts: tuple[tuple[str, str, bool, bool], ...]
     reason: str
     seconds: float
+    able: bool
 
     @property
     def is_false(self) -> bool:
@@ -71,7 +73,7 @@ class Row:
     @property
     def is_right(self) -> bool:
         """Whether structure and response are right."""
-        return self.structure.startswith("right") and self.error < RIGHT
+        return self.able and self.structure.startswith("right") and self.error < RIGHT
 
 
 def judge(kind: str, seed: int) -> list[Row]:
@@ -91,9 +93,12 @@ def judge(kind: str, seed: int) -> list[Row]:
                 reason = f"{type(refusal).__name__}: {refusal}"
             seconds = time.process_time() - clock
             fair = structure not in ("swapped", "another input") and model is not None
-            (e,) = one.data.experiments
-            error = response_error(model, one.plants, e.u, e.y) if fair else np.inf
-            rows.append(Row(kind, seed, structure, word, error, score, parts, reason, seconds))
+            (e,) = (data if fair else one.data).experiments  # the verdict holds within the range of its record
+            plants = tuple(p if p is None or p.drift is None else replace(
+                p, drift=p.drift[-one.data.n_samples :][: e.n_samples]) for p in one.plants)
+            error = response_error(model, plants, e.u, e.y) if fair else np.inf
+            able = one.loop != REGULATED and all(p is None or p.is_hammerstein for p in one.plants)
+            rows.append(Row(kind, seed, structure, word, error, score, parts, reason, seconds, able))
     return rows
 
 

@@ -177,12 +177,13 @@ def _beside_low_order(model: Any, data: Data, runs: Sequence[Array], told: Infor
 def _uncertain(model: Any, data: Data, known: Any, told: Informativity) -> list[Finding]:
     """Say how well the record determines the response to a step over the range of every input.
 
-    That to an input without visible effect is compared with the largest one of the output.
+    It is the root mean square over the response, relative to its largest value; for an input without visible effect
+    to that of the output.
     """
     if known is None or has_feedback(model) or getattr(model, "latent", ()) or len(model.nonlinearities) != data.m:
         return []
     length = max(min(step_length(model), max(e.n_samples for e in data.experiments) // 3), 2)
-    points = np.unique(np.geomspace(1, length, POINTS).astype(int)) - 1
+    points = np.unique(np.linspace(1, length, POINTS).astype(int)) - 1
     spans = []
     for c, f in enumerate(model.nonlinearities):
         u = np.concatenate([e.u[:, c] for e in data.experiments])
@@ -197,7 +198,8 @@ def _uncertain(model: Any, data: Data, known: Any, told: Informativity) -> list[
     except (OptidError, np.linalg.LinAlgError, ValueError):
         return []
     shape = (points.size, data.l, data.m)
-    size, error = np.abs(found.value).reshape(shape).max(axis=0), found.error.reshape(shape).max(axis=0)
+    size = np.abs(found.value).reshape(shape).max(axis=0)
+    error = np.sqrt(np.mean(found.error.reshape(shape) ** 2, axis=0))
     idle = [told.without_effect(c) for c in range(data.m)]
     size = np.where(idle, size.max(axis=1, keepdims=True), size)
     with np.errstate(all="ignore"):
