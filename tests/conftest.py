@@ -27,9 +27,10 @@ nuclear_subspace output_error prices rank_one readme shift shooting solving stat
 uncertainty""".split()
 
 
-SLOW = """clusters encoding fault_alternatives fault_empirical fault_scan hard_over isolability monitor monitor_arl
-monitor_cli physical random_commands reformulation solver_fallback state_shooting study_cli study_cluster
-study_description study_examples study_running study_third_party study_verdict_figures study_workers""".split()
+SLOW = """clusters diagnosis encoding fault_alternatives fault_empirical fault_scan hard_over isolability monitor
+monitor_arl monitor_cli physical processes random_commands real_faults reformulation solver_fallback state_shooting
+study_cli study_cluster study_description study_examples study_running study_third_party study_verdict_figures
+study_workers workbench""".split()
 
 
 def pytest_collection_modifyitems(items):

@@ -223,6 +223,7 @@ def test_an_option_that_the_formulation_does_not_take_is_explained(csv):
 # -- validate and listings ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_validate_takes_names_and_sampling_time_from_the_model(csv, tmp_path):
     assert run("fit", csv, "--dt", 0.5, *ORDERS, "--model", tmp_path / "m.json").exit_code == 0
     result = run("validate", tmp_path / "m.json", csv.parent / "second.csv")

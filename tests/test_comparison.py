@@ -136,6 +136,7 @@ def test_a_model_that_runs_away_is_compared_by_what_it_predicts():
     assert np.isfinite(found.fits["one step"]).all()
 
 
+@pytest.mark.slow
 def test_the_page_is_complete_and_makes_no_request(tmp_path):
     model = mimo()
     data = record(model)

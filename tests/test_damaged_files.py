@@ -93,6 +93,7 @@ def test_damaged_streams(tmp_path, monkeypatch, kind):
     assert found.count("refused") > 20
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["mat", "mat-packed", "mat-7.3"])
 @pytest.mark.parametrize("count", [3, pytest.param(200, marks=pytest.mark.slow)])
 def test_damaged_mat_files(tmp_path, kind, count):

@@ -274,6 +274,7 @@ def test_refusals():
         structure_test(hammerstein(26))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("OPTID_DATA" not in os.environ, reason="OPTID_DATA names no folder with the real records")
 def test_real_records():
     folder = Path(os.environ["OPTID_DATA"])

@@ -207,6 +207,7 @@ def test_refusals():
         validate(model, Data(data.u, data.y, dt=1.0))
 
 
+@pytest.mark.slow
 def test_nothing_is_warned_without_reason():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
