@@ -6,7 +6,7 @@
 import logging
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -34,20 +34,25 @@ def track(steps: Iterable[T], what: str, total: int) -> Iterator[T]:
     log.info("%s: %d of %d steps in %.3g s", what, done, total, time.monotonic() - clock)
 
 
-class Clock:
-    """Progress of work with a budget of seconds; call it with a sentence, inside a ``with`` statement."""
+class Meter:
+    """Progress of work of a known size; call it with a sentence, inside a ``with`` statement.
 
-    def __init__(self, what: str, budget: float) -> None:
-        self.what, self.budget = what, budget
-        self._started, self._bar = time.monotonic(), None
+    Attributes:
+        what: name of the work.
+        total: its size.
+        done: called for how much of it is done.
+    """
 
-    def __enter__(self) -> "Clock":
+    def __init__(self, what: str, total: float, done: Callable[[], float]) -> None:
+        self.what, self.total, self.done, self._bar = what, total, done, None
+
+    def __enter__(self) -> "Meter":
         if sys.stderr.isatty():
             from rich.console import Console
             from rich.progress import Progress
 
             self._bar = Progress(console=Console(stderr=True), transient=True)
-            self._task = self._bar.add_task(self.what, total=self.budget)
+            self._task = self._bar.add_task(self.what, total=self.total)
             self._bar.start()
         return self
 
@@ -55,7 +60,7 @@ class Clock:
         """Say what was done last."""
         log.info("%s: %s", self.what, sentence)
         if self._bar is not None:
-            self._bar.update(self._task, completed=time.monotonic() - self._started,
+            self._bar.update(self._task, completed=self.done(),
                              description=f"{self.what}: {sentence.partition(', ')[2][:50]}")
 
     def __exit__(self, *_: object) -> None:

@@ -52,7 +52,8 @@ VALUES = {  # by option; then by metavar; a number where neither is known
     "--option": ["verbose=1", "max_iter=3", "nope=2", "x", "tol_gap_rel=1e-3"],
     "NAME:SIZE...": ACCEPTED, "NAME:VALUE...": [*ACCEPTED, "none"],
     "--seed": ["0", "1", "-1", "99999999999999999999", "x"]}
-SLOW = {"--workers": ["1"], "--budget": ["1", "0.5", "0", "-1", "nan", "x"], "--draws": ["0", "1", "30", "-1", "x"],
+SLOW = {"--workers": ["1"], "--effort": ["1", "small", "0", "much", "nan"],
+        "--budget": ["1", "0.5", "0", "-1", "nan", "x"], "--draws": ["0", "1", "30", "-1", "x"],
         "--time-limit": ["5", "1", "0", "-1", "nan"], "--repetitions": ["1", "0", "x"],
         "--candidates": ["1", "2", "0", "-1"], "--memory-limit": ["2000", "0", "-5", "nan", "x"],
         "--arl0": ["100", "1000", "0", "-1", "nan", "x"], "--starts": ["1", "2"]}

@@ -11,20 +11,20 @@ import numpy as np
 from optid.errors import StructureError
 
 
-def slow_square(x):
+def slow_square(x, seconds=None):
     time.sleep(0.01)
     return x * x
 
 
-def die_of_one(x):
+def die_of_one(x, seconds=None):
     return os._exit(1) if x == 1 else x
 
 
-def hang(x):
+def hang(x, seconds=None):
     return time.sleep(600) if x else x
 
 
-def fail(x):
+def fail(x, seconds=None):
     raise ZeroDivisionError(f"of {x}")
 
 

@@ -44,7 +44,7 @@ def test_a_record_with_any_names_is_fitted_validated_and_searched(folder, encodi
     assert ("|ÿ|² -> Omega" if encoding != "ascii" else "|y|^2 -> Omega") in text
     assert run(encoding, "validate", folder / "m.json", folder / "r.csv")[0] == 0
     assert optid.load(folder / "m.json").inputs == (ODD["inputs"],)  # files have every character
-    code, _ = run(encoding, "identify", *words, "--budget", "0.5")
+    code, _ = run(encoding, "identify", *words, "--effort", "0.5")
     assert code == 0
     assert run(encoding, "fit", folder / "r.csv", "--inputs", "温")[0] == 2
 

@@ -71,7 +71,7 @@ def test_the_table_of_the_guide_is_the_record_of_the_heater(heater):
 def test_excerpts_about_the_heater_are_what_the_commands_of_the_readme_print(command, marks, heater, monkeypatch):
     monkeypatch.chdir(heater.parent)
     # richer classes are not chosen, and where the time for them ends depends on the machine
-    more = ["--classes", "linear", "--classes", "input functions", "--budget", 600] if command == "identify" else []
+    more = ["--classes", "linear", "--classes", "input functions", "--effort", "large"] if command == "identify" else []
     shown = output(*next(line for line in commands() if line[0] == command), *more)
     assert "The model on this record: good" in shown or command == "look"
     for words, count in marks.items():

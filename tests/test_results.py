@@ -22,7 +22,7 @@ RESULTS = {
     "comparison": lambda: optid.compare_models([linear_fit().model] * 2, linear_fit().data),
     "horizons": lambda: optid.fit_by_horizon(linear_fit().model, linear_fit().data),
     "order": lambda: optid.order(example("thruster").data),
-    "search": lambda: optid.identify(example("thruster").data, budget=2, workers=1, classes=["linear"]),
+    "search": lambda: optid.identify(example("thruster").data, effort=2, workers=1, classes=["linear"]),
     "verdict": lambda: example_fit("thruster").verdict, "solution": lambda: example_fit("thruster").solution,
     "model": lambda: example_fit("thruster").model, "record": lambda: example("thruster").data,
 }

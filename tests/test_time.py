@@ -64,7 +64,7 @@ def test_the_findings_of_the_record_come_before_every_verdict(clockless):
     fit = optid.fit(clockless, "arx", na=1, nb=2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = optid.identify(clockless, budget=2, workers=1, classes=["linear"])
+        found = optid.identify(clockless, effort=2, workers=1, classes=["linear"])
     checked, compared = optid.validate(fit.model, clockless), optid.compare_models({"a": fit.model}, clockless)
     for text, verdict in ((str(fit), "The model on this record"), (str(checked), "Validation on"),
                           (str(found), "Search"), (str(compared), "Fit on"), (str(optid.order(clockless)), "Order of"),

@@ -22,7 +22,7 @@ data
 # %%
 # Keep the last part for validation, and let optid find the structure.
 train, test = data.split(0.7)
-found = optid.identify(train, budget=10, workers=1)
+found = optid.identify(train, effort="small", workers=1)
 found
 
 # %%

@@ -11,8 +11,6 @@ from optid.cli.results import Work, check_names, reading_for, working
 from optid.errors import DataError
 from optid.lazy import import_cvxpy
 
-BUDGET = 60.0
-
 
 def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], stream: bool = False,
         scheduler: str | None = None, split: float | None = None, test: Words = None, formulation: str = DEFAULT,
@@ -72,16 +70,17 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         work.page(found, report, held_out)
 
 
-def identify(data: Paths = None, example: str | None = None, *, how: dict[str, Any], budget: float = BUDGET,
-             horizon: int | None = None, classes: Words = None, constraint: Words = None, solver: str = "auto",
-             workers: int | None = None, split: float | None = None, test: Words = None, seed: int = 0,
-             report: File = None, saved: File = None) -> None:
+def identify(data: Paths = None, example: str | None = None, *, how: dict[str, Any], effort: str = "normal",
+             budget: float | None = None, horizon: int | None = None, classes: Words = None, constraint: Words = None,
+             solver: str = "auto", workers: int | None = None, split: float | None = None, test: Words = None,
+             seed: int = 0, report: File = None, saved: File = None) -> None:
     """Select formulation, delay, orders and bases by cross-validation, and fit the model.
 
     Example: optid identify data.csv --inputs u --outputs y --dt 0.1 --report report.html
 
     The model:
-        budget (SECONDS): Time budget of the search.
+        effort (WORD): small, normal, large, or units of about a CPU second; the same trials on every machine.
+        budget (SECONDS): Stop after so much CPU time, wherever the search is. [dim]none[/]
         horizon (N): Compare N-step-ahead predictions. [dim]simulation[/]
         classes (NAME...): Model classes: linear, 'input functions', feedback, 'latent signals'. [dim]all[/]
         constraint (-c NAME:VALUE...): Constraint on every model; optid constraints lists them.
@@ -90,8 +89,8 @@ def identify(data: Paths = None, example: str | None = None, *, how: dict[str, A
     The record:
         split (SHARE): Search on this share of the record and validate on the rest.
     """
-    _search(data, example, how, seed, split, test, constraint, solver, saved, report, budget=budget, horizon=horizon,
-            workers=workers, **({"classes": classes} if classes else {}))
+    _search(data, example, how, seed, split, test, constraint, solver, saved, report, effort=effort, budget=budget,
+            horizon=horizon, workers=workers, **({"classes": classes} if classes else {}))
 
 
 def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,

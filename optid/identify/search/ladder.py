@@ -5,7 +5,7 @@ orders only as long as the fit improves. Later rungs start from the best structu
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -44,19 +44,23 @@ class Ladder:
 
     Attributes:
         data: the record.
+        folds: fits of a trial after the first.
         told: what it can tell.
         delays: combinations of delays of the inputs: none, and those found.
         regressions: orders (na, nb, nk) of the best autoregressions.
         levels: the evidence for levels of the experiments; None for one experiment.
         trials: all trials so far, by key.
+        spent: units of effort so far, by class.
     """
 
     data: Data
+    folds: int
     told: Informativity
     delays: list[tuple[int, ...]]
     regressions: list[tuple[int, int, tuple[int, ...]]]
     trials: dict[Any, Trial]
     levels: LevelEvidence | None = None
+    spent: dict[str, float] = field(default_factory=lambda: dict.fromkeys(KINDS, 0.0))
 
     @classmethod
     def of(cls, blocks: Blocks) -> "Ladder":
@@ -67,7 +71,8 @@ class Ladder:
         if told.processes:
             delays = list(dict.fromkeys([*delays, told.lags]))
         best = [one for delay in delays for one in scan(sums, [delay])[:1]]
-        return cls(data, told, delays, [(one.na, one.nb, one.nk) for one in best], {}, _levels_of(data, delays[-1]))
+        regressions = [(one.na, one.nb, one.nk) for one in best]
+        return cls(data, len(blocks.moving), told, delays, regressions, {}, _levels_of(data, delays[-1]))
 
     def levelled(self, candidate: Candidate) -> Candidate:
         """Return a candidate with a level for every experiment, where the record has them and the method knows them."""

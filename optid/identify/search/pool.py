@@ -1,61 +1,65 @@
-"""Trials side by side, in processes that work until the search is over or its time is."""
+"""Trials side by side, in processes that work until the search is over or its CPU time is."""
 
-import time
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import wait
 from typing import Any
 
-from optid.packing import Unsendable, pack
-from optid.processes import LONGEST, Worker, start_workers
+import numpy as np
 
-GRACE = 1.0  # seconds after a deadline, which work looks at itself
+from optid.packing import Unsendable, pack
+from optid.processes import Worker, start_workers
+
+PATIENCE, GRACE = 10.0, 60.0  # seconds on the clock for each CPU second that is left, and more, before work is ended
 
 
 class Pool:
-    """Runs a function of one argument in processes of their own, or here if one is enough or none can be used.
+    """Runs a function in processes of their own, or here if one is enough or none can be used.
 
     Attributes:
+        apart: whether it runs in other processes.
         reason: why no other process can be used, "" otherwise.
     """
 
-    def __init__(self, function: Callable[[Any], Any], count: int) -> None:
+    def __init__(self, function: Callable[[Any, float], Any], count: int) -> None:
         """Start `count` processes and send them the function."""
-        self._function, self._idle, self._busy, self.reason = function, list[Worker](), dict[Worker, int](), ""
+        self._function, self._idle, self._busy = function, list[Worker](), dict[Worker, int]()
+        self.apart, self.reason = False, ""
         if count < 2:
             return
         try:
-            self._idle = start_workers(count, pack(function))
+            self._idle, self.apart = start_workers(count, pack(function)), True
         except (Unsendable, ChildProcessError) as error:
             self.reason = str(error)
 
-    def run(self, tasks: Sequence[Any], deadline: float, told: Callable[[Any], None]) -> list[Any]:
-        """Return the results in the order of the tasks, None for those that time or a process did not last for.
+    def run(self, tasks: Sequence[Any], seconds: Callable[[], float], told: Callable[[Any], None]) -> list[Any]:
+        """Return the results in the order of the tasks, None for those that CPU time or a process did not last for.
 
-        The deadline is by `time.monotonic`; `told` is told every result as it comes. What the function raises is raised
-        here.
+        The function is called with a task and with the CPU seconds that are left when it begins; none is begun without
+        any. `told` is told every result as it comes. What the function raises is raised here.
         """
         results: list[Any] = [None] * len(tasks)
-        if not self._idle:
+        if not self.apart:
             for i, task in enumerate(tasks):
-                if time.monotonic() < deadline:
-                    results[i] = self._function(task)
+                if (left := seconds()) > 0:
+                    results[i] = self._function(task, left)
                     told(results[i])
             return results
         waiting = list(range(len(tasks)))[::-1]
         while (waiting and self._idle) or self._busy:
-            while waiting and self._idle and time.monotonic() < deadline:
+            while waiting and self._idle and (left := seconds()) > 0:
                 worker, i = self._idle.pop(), waiting.pop()
                 self._busy[worker] = i
                 try:
-                    worker.request(None, pack((tasks[i],)))
+                    worker.request(None, pack((tasks[i], left)))
                     worker.wait_until_begun()
                 except ChildProcessError:
                     self._drop(worker)
             if not self._busy:
                 break
-            left = max(deadline + GRACE - time.monotonic(), 0.0)
             by_connection = {worker.connection: worker for worker in self._busy}
-            ready: list[Any] = wait(list(by_connection), None if left > LONGEST else left)
+            # what works looks at its CPU time itself; what hangs uses none
+            left = max(seconds(), 0.0)
+            ready: list[Any] = wait(list(by_connection), None if np.isinf(left) else PATIENCE * left + GRACE)
             if not ready:
                 self.close()
                 break

@@ -16,6 +16,7 @@ from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks
 from optid.identify.fitting import Fit, fit
+from optid.identify.search.effort import effort_of, units
 from optid.identify.search.ladder import (
     CLEAR,
     EQUAL,
@@ -29,14 +30,15 @@ from optid.identify.search.ladder import (
     few_levels,
 )
 from optid.identify.search.pool import Pool
-from optid.identify.search.trial import Candidate, Trial, spared, tried
+from optid.identify.search.trial import OUT_OF_TIME, Candidate, Trial, spared, tried
 from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
-from optid.progress import Clock
+from optid.progress import Meter
 from optid.registry import Rendered, named_constraint
 
-FIRST = 0.25  # share of the budget that linear models have before the others begin
-RESERVED = 0.1  # share of the budget that is kept for the fit of the choice
+BUDGET = "the budget"
+FIRST = 0.25  # share of the effort that linear models have before the others begin
+LARGEST_SHARE = 0.25  # of the effort that one trial may take, after the first
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,6 +53,7 @@ class Identification(Rendered):
         reasons: why this one, a sentence each.
         horizon, blocks: as in `identify`.
         stopped: what ended the search early, or "".
+        units: effort that was spent.
         seconds: wall time.
     """
 
@@ -62,6 +65,7 @@ class Identification(Rendered):
     horizon: int | None
     blocks: int
     stopped: str
+    units: float
     seconds: float
 
     @property
@@ -75,8 +79,8 @@ class Identification(Rendered):
         return self.fit.verdict
 
 
-def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, blocks: int = 4,
-             classes: Sequence[str] = KINDS, constraints: Sequence[Any] = (), solver: Any = "auto",
+def identify(data: Data, *, effort: str | float = "normal", budget: float | None = None, horizon: int | None = None,
+             blocks: int = 4, classes: Sequence[str] = KINDS, constraints: Sequence[Any] = (), solver: Any = "auto",
              accuracy: float = 1e-8, workers: int | None = None,
              progress: Callable[[str], None] | None = None) -> Identification:
     """Find a structure for a record by blocked cross-validation, and fit it to the whole record.
@@ -85,11 +89,14 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     initial state is estimated from the block and as many samples around it. Classes of models are tried
     from the simple to the rich; a richer one is chosen only where the pooled fit improves and the median over the
     blocks of the log ratio of error energies exceeds 0.2. A model whose simulation diverges in a block
-    is never chosen. An interrupt (Ctrl-C) ends the search with the best so far.
+    is never chosen. The trials, and with them the model, depend on the record and the arguments alone, not on the
+    machine or the number of processes. An interrupt (Ctrl-C) ends the search with the best so far.
 
     Args:
         data: the record.
-        budget: seconds of the search.
+        effort: "small", "normal", "large", or a number of units, of which each is about a CPU second; every trial has a
+            declared price in them (`optid.identify.search.effort`).
+        budget: CPU seconds after which the search ends wherever it is; None for no such stop.
         horizon: compare predictions so many samples ahead; None compares free runs.
         blocks: number of contiguous blocks.
         classes: of "linear", "input functions", "feedback", "latent signals", those to be tried.
@@ -109,7 +116,8 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     clock = time.monotonic()
     if not isinstance(data, Data):
         raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
-    if not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf:
+    most = effort_of(effort)
+    if budget is not None and (not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf):
         raise StructureError(f"budget is a number of seconds above 0; got {shown(budget)}")
     Settings(accuracy)  # every trial would refuse it
     for word in classes:
@@ -125,17 +133,25 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
         raise StructureError(f"{next(limits[kind] for kind in classes)}: add 'linear' to the classes")
     if horizon is None and not ladder.open:
         horizon = 1  # a free run says nothing about the plant where the input answers the noise
-    end = clock + (1 - RESERVED) * budget
-
     pool = Pool(partial(_attempt, cut, {"solver": solver, "accuracy": accuracy}, rules, horizon),
                 available_cores(workers, "workers"))
     alone = pool.reason and (_unsendable(rules, solver) or pool.reason)
     if alone and workers is not None:
         raise StructureError(f"workers={workers!r}: {alone}, or use workers=1")
-    with Clock("search", budget) if progress is None else nullcontext(progress) as told:
+    begun = time.process_time()
+
+    def left() -> float:
+        if budget is None or ladder.choice() is None:  # a model is worth more than the budget
+            return np.inf
+        elsewhere = sum(trial.seconds for trial in ladder.trials.values()) if pool.apart else 0.0
+        return budget - (time.process_time() - begun) - elsewhere
+
+    meter = Meter("search", most, lambda: sum(ladder.spent.values()))
+    with meter if progress is None else nullcontext(progress) as told:
         try:
-            if not _climb(ladder, possible, pool, FIRST * budget, end, partial(_told, ladder, told, clock, budget)):
-                stopped = f"the budget of {budget:g} s"
+            stopped = _climb(ladder, possible, pool, most, left, partial(_told, ladder, told, most))
+            if stopped == BUDGET:
+                stopped = f"the budget of {budget:g} CPU s"
         except KeyboardInterrupt:
             stopped = "an interrupt"
         finally:
@@ -153,7 +169,7 @@ def identify(data: Data, *, budget: float = 60.0, horizon: int | None = None, bl
     if alone:
         why.append(f"the search worked in one process: {alone}")
     return Identification(found, chosen, best, tuple(ladder.trials.values()), tuple(why), horizon, blocks,
-                          stopped, time.monotonic() - clock)
+                          stopped, sum(ladder.spent.values()), time.monotonic() - clock)
 
 
 def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
@@ -176,47 +192,60 @@ def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
     yield from ((kind, reason) for kind in KINDS if kind != LINEAR)
 
 
-def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, first: float, end: float, told: Callable[[Trial], None]
-           ) -> bool:
-    """Try batch after batch until no class has more, or the time is over, which returns False.
+def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, most: float, left: Callable[[], float],
+           told: Callable[[Trial], None]) -> str:
+    """Try batch after batch until no class has more (""), the effort is spent, or no CPU second is left.
 
-    The low orders found in the record come first, without and with functions of the inputs; then linear models, for so
-    many seconds; then the class that has had the least time.
+    The low orders found in the record come first, without and with functions of the inputs; then linear models, for a
+    share of the effort; then the class that has had the least.
     """
     early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes]
     rungs = {kind: RUNGS[kind](ladder) for kind in kinds}
     waiting: dict[str, list[Candidate]] = {}
-    spent = dict.fromkeys(kinds, 0.0)
+    spent = ladder.spent
     while rungs:
-        if not early and ladder.choice() is not None and time.monotonic() > end:
-            return False
-        deadline = np.inf if early else end  # a loaded machine tries the low orders, too
+        if not early and ladder.choice() is not None and sum(spent.values()) >= most:
+            return f"its effort of {most:g} units"
+        if left() <= 0:
+            return BUDGET
         kind = early.pop(0) if early else (
-            LINEAR if LINEAR in rungs and spent[LINEAR] < first else min(rungs, key=spent.__getitem__))
+            LINEAR if LINEAR in rungs and spent[LINEAR] < FIRST * most else min(rungs, key=spent.__getitem__))
         batch = waiting.pop(kind) if kind in waiting else next(rungs[kind], None)
         if batch is None:
             del rungs[kind]
             continue
-        batch = [ladder.levelled(candidate) for candidate in batch]
-        clock, rival = time.monotonic(), ladder.rival(kind)
-        fresh = [c for c in {c.key: c for c in batch}.values() if c.key not in ladder.trials]
-        last = deadline if rival else np.inf  # the first are waited for
-        for candidate, trial in zip(fresh, pool.run([(c, rival, deadline) for c in fresh], last, told)):
-            if trial is None:
-                ladder.trials[candidate.key] = Trial(candidate, reason="out of time")
-        spent[kind] += time.monotonic() - clock
+        batch = list({c.key: c for c in map(ladder.levelled, batch)}.values())
+        _tried(ladder, kind, [c for c in batch if c.key not in ladder.trials], pool, most, left, told)
         try:
             waiting[kind] = rungs[kind].send([ladder.trials[c.key] for c in batch])
         except StopIteration:
             del rungs[kind]
-    return True
+    return ""
+
+
+def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], pool: Pool, most: float, left: Callable[[], float],
+           told: Callable[[Trial], None]) -> None:
+    """Try candidates of a class against its best so far, and put their trials down in the order of the batch."""
+    rival, tasks = ladder.rival(kind), []
+    for candidate in batch:
+        price = (1 + ladder.folds) * units(candidate, ladder.data)
+        if rival is not None and price > LARGEST_SHARE * most:
+            ladder.trials[candidate.key] = Trial(candidate, reason=f"it costs {price:.0f} units, more than "
+                                                                   f"{100 * LARGEST_SHARE:.0f} % of the effort")
+        else:
+            tasks.append(candidate)
+    found = pool.run([(candidate, rival) for candidate in tasks], left, told)
+    for candidate, trial in zip(tasks, found):
+        ladder.trials.pop(candidate.key, None)
+        ladder.trials[candidate.key] = trial or Trial(candidate, reason=OUT_OF_TIME)
+        ladder.spent[kind] += (trial.fits if trial else 0) * units(candidate, ladder.data)
 
 
 def _attempt(blocks: Blocks, settings: Mapping[str, Any], rules: Sequence[Any], horizon: int | None,
-             task: tuple[Candidate, Trial | None, float]) -> Trial:
-    """Try a candidate against a rival until a deadline."""
-    candidate, rival, deadline = task
-    return tried(candidate, blocks, rival, settings, rules, horizon, deadline)
+             task: tuple[Candidate, Trial | None], seconds: float) -> Trial:
+    """Try a candidate against a rival, for so many CPU seconds at most."""
+    candidate, rival = task
+    return tried(candidate, blocks, rival, settings, rules, horizon, seconds)
 
 
 def _unsendable(rules: Sequence[Any], solver: Any) -> str:
@@ -266,10 +295,10 @@ def _refitted(chosen: Trial, blocks: Blocks, horizon: int | None, settings: dict
     return fit(blocks.data, candidate.formulation, **settings, **arguments, **spared(candidate))
 
 
-def _told(ladder: Ladder, progress: Callable[[str], None], clock: float, budget: float, trial: Trial) -> None:
+def _told(ladder: Ladder, progress: Callable[[str], None], most: float, trial: Trial) -> None:
     ladder.trials[trial.candidate.key] = trial  # also what an interrupt leaves
     outcome = f"{trial.score:.1f} %" if np.isfinite(trial.score) else trial.reason
-    progress(f"{time.monotonic() - clock:.0f} of at most {budget:g} s, {trial.candidate.kind}: "
+    progress(f"{sum(ladder.spent.values()):.0f} of {most:g} units, {trial.candidate.kind}: "
              f"{trial.candidate.formulation} {trial.candidate.words}: {outcome}")
 
 

@@ -12,6 +12,7 @@ from optid.arrays import Array
 from optid.errors import DataError, OptidError, RankError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.fitting import fit
+from optid.identify.search.cpu_limit import OutOfTime, cpu_limit
 from optid.models.functions import free_parameters
 
 WORSE = 1.3
@@ -19,6 +20,7 @@ WORSE = 1.3
 STARTS = 3  # starts of output-error models in a trial
 OPTIONS = {"constraints": "constraint"}  # options of the command line by arguments with another name
 STEPS = 30  # iterations of state-space models in a trial
+OUT_OF_TIME = "out of time"
 
 Key = tuple[str, tuple[tuple[str, Any], ...]]
 
@@ -58,6 +60,7 @@ class Trial:
         energy: (b, l) energy of its errors on the blocks that were tried, in that order.
         measure: (b, l) what it is measured by, see `Blocks.errors`.
         parameters: number of parameters of the model.
+        fits: number of fits that were made.
         seconds: CPU time.
         status: of the solver on the whole record, or "refused".
         reason: why it was dropped, "" where it was tried on every block.
@@ -69,6 +72,7 @@ class Trial:
     measure: Array = field(default_factory=lambda: np.zeros((0, 1)), repr=False)
     order: tuple[int, ...] = ()
     parameters: int = 0
+    fits: int = 0
     seconds: float = 0.0
     status: str = "refused"
     reason: str = ""
@@ -109,32 +113,38 @@ class Trial:
 
 
 def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
-          constraints: Sequence[Any], horizon: int | None, deadline: float) -> Trial:
+          constraints: Sequence[Any], horizon: int | None, seconds: float = np.inf) -> Trial:
     """Fit a candidate, cross-validate it block by block, and stop early where it cannot beat its rival.
 
-    The settings are solver and accuracy, the horizon is as in `Blocks.errors`, the deadline by `time.monotonic`; where
-    there is no rival, it takes the time it needs.
+    The settings are solver and accuracy, the horizon is as in `Blocks.errors`. After so many CPU seconds the trial is
+    given up.
     """
-    clock, found = time.process_time(), Trial(candidate)
+    clock, found, fits = time.process_time(), Trial(candidate), 0
     arguments = {**candidate.under(constraints), **spared(candidate)}
 
     def fitted(data: Any) -> Any:
+        nonlocal fits
+        if time.process_time() - clock > seconds:  # where nothing interrupts a fit
+            raise OutOfTime
+        fits += 1
         return fit(data, candidate.formulation, prove=False, **settings, **arguments)
 
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):  # the fit that is chosen tells them
-            warnings.simplefilter("ignore")
-            for known in _steps(found, fitted, blocks, rival, horizon, deadline):
+        with cpu_limit(seconds), warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")  # the fit that is chosen tells them
+            for known in _steps(found, fitted, blocks, rival, horizon):
                 found = known
                 if known.reason:
                     break
+    except OutOfTime:
+        found = replace(found, reason=OUT_OF_TIME)
     except (OptidError, np.linalg.LinAlgError, ValueError) as error:
         found = replace(found, reason=f"{type(error).__name__}: {error}")
-    return replace(found, seconds=time.process_time() - clock)
+    return replace(found, fits=fits, seconds=time.process_time() - clock)
 
 
-def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Trial | None, horizon: int | None,
-           deadline: float) -> Iterator[Trial]:
+def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Trial | None, horizon: int | None
+           ) -> Iterator[Trial]:
     """Yield what is known after the fit to the whole record, and after every block."""
     whole = fitted(blocks.data)
     known = replace(known, status=whole.solution.status.value, parameters=free_parameters(whole.model),
@@ -144,8 +154,6 @@ def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Tr
     order = (*blocks.moving[::2], *blocks.moving[1::2])  # every other one first
     known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
     for done, b in enumerate(order, start=1):
-        if rival is not None and time.monotonic() > deadline:  # without a rival there is nothing to fall back to
-            yield replace(known, reason="out of time")
         try:
             energy, measure = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
         except (RankError, DataError):  # what is left of the record does not determine the structure
