@@ -160,6 +160,25 @@ class Blocks:
         return pooled_fit(*map(np.array, zip(*(self.errors(model, b, horizon) for b in range(len(self))))))
 
 
+def stretches(data: Data, most: int, count: int = 5) -> Data:
+    """Return a long record cut to so many samples in all, in stretches spread over its whole length, else the same."""
+    total = data.n_samples
+    if total <= most:
+        return data
+    lengths = [e.n_samples for e in data.experiments]
+    ends, kept = np.cumsum(lengths), list[Part]()
+    count = max(count, round(most / float(np.median(lengths))))  # of short experiments there are more
+    for middle in (np.arange(count) + 0.5) * total / count:
+        i = int(np.searchsorted(ends, middle, side="right"))
+        n = lengths[i]
+        length = min(most // count, n)
+        first = int(np.clip(middle - (ends[i] - n) - length / 2, 0, n - length))
+        part = Part(i, first, first + length)
+        if part not in kept:
+            kept.append(part)
+    return joined(data, kept)
+
+
 def joined(data: Data, parts: Iterable[Part]) -> Data:
     """Return parts of a record as experiments."""
     return Data.join(*(data.select(experiments=p.experiment).window(p.first, p.last) for p in parts))

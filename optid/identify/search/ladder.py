@@ -25,14 +25,13 @@ LINEAR, INPUTS, FEEDBACK, LATENT = KINDS = ("linear", "input functions", "feedba
 """Classes of models, each richer than those before."""
 ONE_LEVEL = ("hammerstein_ss.sid", "lfr.exact")  # formulations with one constant for all experiments
 PATIENCE = 2  # successive orders without improvement after which a rung ends
-LARGEST = 10  # largest number of states
+LARGEST, MOST_LATENT = 10, 8  # largest number of states, and that beside functions of latent signals
+RISE = 0.95  # ratio of the errors on the record above which one more latent signal has not helped
 FEW_LEVELS = 5  # levels of an input up to which a static function is not identifiable between them
 CLEAR = 0.2  # median over the blocks of the log ratio of error energies that a richer class must save
-BEHIND = 3.0  # points of cross-validated fit below the choice so far, beyond which a class is dropped
-PATIENT = 12.0  # the same where the class fits the estimation data much better
-PROMISING = 0.7  # how much better: the ratio of the errors on the estimation data
 EQUAL = 0.02
 """Relative difference of errors within which structures of a class count as equal: the smaller one is chosen."""
+SMALL, SMALLER = 0.1, 0.2  # points of fit within which they do, too, where that is no larger share of the error
 FEW_MOVES = 8
 """Moves of an input below which order and dead time are chosen by the likelihood: blocks without moves say little."""
 FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
@@ -63,8 +62,8 @@ class Ladder:
     spent: dict[str, float] = field(default_factory=lambda: dict.fromkeys(KINDS, 0.0))
 
     @classmethod
-    def of(cls, blocks: Blocks) -> "Ladder":
-        """Look for delays and orders of autoregressions in the sums of the record."""
+    def of(cls, blocks: Blocks, several: bool = False) -> "Ladder":
+        """Look for delays and orders of autoregressions in the sums of the record, and for levels of several runs."""
         data, told = blocks.data, informativity(blocks.data)
         sums = LagSums(blocks, linear(data))
         delays = [(told.least,) * data.m]
@@ -72,7 +71,8 @@ class Ladder:
             delays = list(dict.fromkeys([*delays, told.lags]))
         best = [one for delay in delays for one in scan(sums, [delay])[:1]]
         regressions = [(one.na, one.nb, one.nk) for one in best]
-        return cls(data, len(blocks.moving), told, delays, regressions, {}, _levels_of(data, delays[-1]))
+        return cls(data, len(blocks.moving), told, delays, regressions, {},
+                   _levels_of(data, delays[-1]) if several else None)
 
     def levelled(self, candidate: Candidate) -> Candidate:
         """Return a candidate with a level for every experiment, where the record has them and the method knows them."""
@@ -100,8 +100,8 @@ class Ladder:
         found = [t for t in self.trials.values() if t.candidate.kind == kind and np.isfinite(t.score)
                  and (not formulations or t.candidate.formulation in formulations)]
         most = max((t.score for t in found), default=0.0)
-        return min((t for t in found if t.score >= most - EQUAL * (100 - most)), key=lambda t: t.parameters,
-                   default=None)
+        near = max(EQUAL * (100 - most), min(SMALL, SMALLER * (100 - most)))
+        return min((t for t in found if t.score >= most - near), key=lambda t: (t.parameters, -t.score), default=None)
 
     def choice(self) -> Trial | None:
         """Return the choice so far: a richer class must be clearly better."""
@@ -116,18 +116,16 @@ class Ladder:
         found = [self.best(kind), None if kind == LINEAR else self.choice()]
         return max(filter(None, found), key=lambda t: t.score, default=None)
 
-    def hopeless(self, kind: str) -> bool:
-        """Whether a class is so far behind the choice that refinements will not help."""
-        best, chosen = self.best(kind), self.choice()
-        if best is None or chosen is None:
-            return best is None
-        richer = (100 - best.estimation) < PROMISING * (100 - chosen.estimation)
-        return best.score < chosen.score - (PATIENT if richer else BEHIND)
+    def leading(self, kind: str, *formulations: str) -> Trial | None:
+        """Return the best trial of a class; where none is complete, the one that fits the record best."""
+        found = [t for t in self.trials.values() if t.candidate.kind == kind and np.isfinite(t.estimation)
+                 and (not formulations or t.candidate.formulation in formulations)]
+        return self.best(kind, *formulations) or max(found, key=lambda t: t.estimation, default=None)
 
     def arguments(self, kind: str, *formulations: str) -> Mapping[str, Any]:
-        """Return the arguments of the best structure of a class, or of formulations of it; none where there is none."""
-        best = self.best(kind, *formulations)
-        return {} if best is None else best.candidate.arguments
+        """Return the arguments of the leading structure of a class, or of formulations of it; none without any."""
+        leading = self.leading(kind, *formulations)
+        return {} if leading is None else leading.candidate.arguments
 
     def order(self) -> int:
         """Return the number of states of the best linear model."""
@@ -221,8 +219,7 @@ def input_functions(ladder: Ladder) -> Rung:
     if not ladder.single:
         states = partial(structure, INPUTS, "hammerstein_ss.exact")
         yield [states(nx=k, basis=word) for k in dict.fromkeys([min(ladder.order(), 4), 2]) for word in words]
-        if not ladder.hopeless(INPUTS):
-            a = ladder.arguments(INPUTS)
+        if a := ladder.arguments(INPUTS):
             yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
         return
     if not ladder.open:
@@ -239,9 +236,8 @@ def input_functions(ladder: Ladder) -> Rung:
     a = ladder.arguments(LINEAR, "oe.exact") or {"na": 2, "nk": ladder.delays[-1]}
     delays = list(dict.fromkeys([tuple(a["nk"]), *ladder.delays]))
     yield [model(k, nk, word) for k in dict.fromkeys([min(int(a["na"]), 3), 2]) for nk in delays for word in words]
-    if ladder.hopeless(INPUTS):
+    if not (a := ladder.arguments(INPUTS)):
         return
-    a = ladder.arguments(INPUTS)
     yield from climbed([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
     a = ladder.arguments(INPUTS)
     yield [model(a["na"], a["nk"], bases(ladder.data, word))
@@ -255,13 +251,9 @@ def input_functions(ladder: Ladder) -> Rung:
 def feedback(ladder: Ladder) -> Rung:
     """Static feedback functions of the outputs, with or without functions of the inputs."""
     model = partial(structure, FEEDBACK, "hammerstein_ss.exact")
-    best, plain = ladder.best(INPUTS), ladder.best(LINEAR)
-    helped = best is not None and (plain is None or best.score > plain.score)
-    inner = ["linear", *([best.candidate.arguments["basis"]] if helped and best else [])]
-    yield [model(nx=n, basis=basis, feedback_basis="polynomial:3") for n in (2, 3) for basis in inner]
-    if ladder.hopeless(FEEDBACK):
+    yield [model(nx=n, basis=basis, feedback_basis="polynomial:3") for n in (2, 3) for basis in _inner(ladder)]
+    if not (a := ladder.arguments(FEEDBACK)):
         return
-    a = ladder.arguments(FEEDBACK)
     yield [model(nx=a["nx"], basis=a["basis"], feedback_basis=word)
            for word in ("polynomial:2", "polynomial:4", "triangular:6")]
     a = ladder.arguments(FEEDBACK)
@@ -269,20 +261,45 @@ def feedback(ladder: Ladder) -> Rung:
                        for n in range(a["nx"] + 1, 7))
 
 
-def latent_signals(ladder: Ladder) -> Rung:
-    """Static functions of latent signals, which are combinations of states and inputs."""
-    def model(n: int, channels: int, basis: str, direct: bool) -> Candidate:
-        return structure(LATENT, "lfr.exact", nx=n, channels=channels, latent_basis=basis, direct=direct)
+def _inner(ladder: Ladder) -> list[Any]:
+    """Return a straight line, and the basis of the inputs that was better, as bases inside of richer models."""
+    best, plain = ladder.best(INPUTS), ladder.best(LINEAR)
+    helped = best is not None and (plain is None or best.score > plain.score)
+    return ["linear", *([best.candidate.arguments["basis"]] if helped and best else [])]
 
-    orders = dict.fromkeys([2, min(ladder.order(), 4)])
+
+def latent_signals(ladder: Ladder) -> Rung:
+    """Static functions of the outputs of linear or Hammerstein systems, and of combinations of states and inputs.
+
+    Signals are added as long as the fit to the record rises, whatever cross-validation says of the first.
+    """
+    def model(n: int, channels: int, latent_basis: str, direct: bool, basis: Any = "linear") -> Candidate:
+        inner = {} if basis == "linear" else {"basis": basis}
+        return structure(LATENT, "lfr.exact", nx=n, channels=channels, latent_basis=latent_basis, direct=direct,
+                         **inner)
+
+    order, inner = min(max(ladder.order(), 2), MOST_LATENT), _inner(ladder)
+    orders = list(dict.fromkeys([2, min(order, 4), order]))
+    yield [structure(LATENT, "wiener_ss.exact", nx=k, output_basis="polynomial:3") for k in orders]
+    yield [structure(LATENT, "hammerstein_wiener_ss.exact", nx=k, basis=basis, output_basis="polynomial:3")
+           for k in orders for basis in (inner[1:] or [bases(ladder.data, "polynomial:3")])]
     yield [model(k, 1, "polynomial:3", direct) for k in orders for direct in (False, True)]
-    if ladder.hopeless(LATENT):
+    if not (a := ladder.arguments(LATENT, "lfr.exact")):
         return
-    nx = ladder.arguments(LATENT)["nx"]
-    yield [model(nx, 2, "polynomial:3", direct) for direct in (False, True)]
-    a = ladder.arguments(LATENT)
+    fit = ladder.leading(LATENT, "lfr.exact")
+    for channels in (2, 3):
+        found = yield [model(a["nx"], channels, a["latent_basis"], direct) for direct in (False, True)]
+        most = max(found, key=lambda t: t.estimation)
+        if fit is not None and 100 - most.estimation > RISE * (100 - fit.estimation):
+            break
+        fit = most
+    a = ladder.arguments(LATENT, "lfr.exact")
     yield [model(a["nx"] + 1, a["channels"], a["latent_basis"], a["direct"]),
-           *(model(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:5", "bspline:4"))]
+           *(model(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:5", "bspline:4")),
+           *(model(a["nx"], a["channels"], a["latent_basis"], a["direct"], basis) for basis in inner[1:])]
+    a = ladder.arguments(LATENT, "lfr.exact")
+    yield from climbed([model(n, a["channels"], a["latent_basis"], a["direct"], a.get("basis", "linear"))]
+                       for n in range(a["nx"] + 1, MOST_LATENT + 1))
 
 
 RUNGS: dict[str, Callable[[Ladder], Rung]] = {
@@ -295,8 +312,6 @@ def structure(kind: str, formulation: str, **arguments: Any) -> Candidate:
 
 
 def _levels_of(data: Data, nk: tuple[int, ...]) -> LevelEvidence | None:
-    if data.n_experiments == 1:
-        return None
     try:
         return level_evidence(data, nk=list(nk))
     except OptidError:  # too short for a regression: one level then

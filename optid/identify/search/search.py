@@ -14,7 +14,7 @@ from optid.backends.back_end import Settings
 from optid.data.record import Data, not_a_record
 from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
-from optid.identify.blocks import Blocks
+from optid.identify.blocks import Blocks, stretches
 from optid.identify.fitting import Fit, fit
 from optid.identify.search.effort import effort_of, units
 from optid.identify.search.ladder import (
@@ -37,6 +37,7 @@ from optid.progress import Meter
 from optid.registry import Rendered, named_constraint
 
 BUDGET = "the budget"
+COMPARED = 20_000  # samples of a long record on which structures are compared
 FIRST = 0.25  # share of the effort that linear models have before the others begin
 LARGEST_SHARE = 0.25  # of the effort that one trial may take, after the first
 
@@ -125,8 +126,9 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     if horizon is not None:
         check_integer(horizon, "horizon")
     rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
-    cut = Blocks.of(data, blocks)
-    ladder, stopped = Ladder.of(cut), ""
+    compared = stretches(data, COMPARED)
+    cut = Blocks.of(compared, blocks)
+    ladder, stopped = Ladder.of(cut, data.n_experiments > 1), ""
     limits = dict(_limits(ladder))
     possible = [kind for kind in KINDS if kind in classes and kind not in limits]
     if not possible:
@@ -160,9 +162,12 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     chosen = ladder.choice()
     if chosen is None:
         raise _nothing(list(ladder.trials.values()))
-    found = _refitted(chosen, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
+    found = _refitted(chosen, data, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
     found = replace(found, cross_validated=(tuple(chosen.by_block.tolist()), chosen.score))
     why = reasons(ladder, best)
+    if compared is not data:
+        why.append(f"structures were compared on {compared.n_samples} of {data.n_samples} samples, in "
+                   f"{compared.n_experiments} stretches; the one that was chosen is fitted to all")
     if ladder.levels is not None:
         why.append(str(ladder.levels))
     why += dict.fromkeys(limits[kind] for kind in classes if kind in limits)
@@ -285,14 +290,14 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
     return found
 
 
-def _refitted(chosen: Trial, blocks: Blocks, horizon: int | None, settings: dict[str, Any]) -> Fit:
+def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, settings: dict[str, Any]) -> Fit:
     """Fit a structure to the whole record with all its starts; as on trial where that follows the record better."""
     candidate = chosen.candidate
     arguments = candidate.under(settings.pop("constraints"))
-    found = fit(blocks.data, candidate.formulation, **settings, **arguments)
+    found = fit(data, candidate.formulation, **settings, **arguments)
     if 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation):
         return found
-    return fit(blocks.data, candidate.formulation, **settings, **arguments, **spared(candidate))
+    return fit(data, candidate.formulation, **settings, **arguments, **spared(candidate))
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None], most: float, trial: Trial) -> None:
