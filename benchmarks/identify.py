@@ -1,6 +1,6 @@
 """The search for a structure: what one call finds on real records and on simulated plants, and what it costs.
 
-    OPTID_DATA=folder python benchmarks/identify.py [--budget 60] [--only reflex tanks ...] [--oracle]
+    OPTID_DATA=folder python benchmarks/identify.py [--effort normal] [--only reflex tanks ...] [--oracle]
     python benchmarks/identify.py --plants [--seeds 25]
     python benchmarks/identify.py --sums
 
@@ -116,7 +116,7 @@ def refitted(train: optid.Data, test: optid.Data, trial: Any) -> float:
         return -np.inf
 
 
-def on_records(folder: Path, budget: float, only: list[str] | None, oracle: bool) -> None:
+def on_records(folder: Path, effort: str, only: list[str] | None, oracle: bool) -> None:
     regrets, behind = [], []
     print(f"{'record':<14}{'chosen':<58}{'cv %':>6}{'val %':>8}{'linear':>8}{'oracle':>8}  verdict   CPU s")
     for name, load in records(folder):
@@ -124,7 +124,7 @@ def on_records(folder: Path, budget: float, only: list[str] | None, oracle: bool
             continue
         train, test = load()
         before = spent()
-        found = identify(train, budget=budget, workers=1)
+        found = identify(train, effort=effort, workers=1)
         used = spent() - before
         reached = score(found.model, test)
         plain = refitted(train, test, found.best["linear"]) if "linear" in found.best else np.nan
@@ -136,7 +136,7 @@ def on_records(folder: Path, budget: float, only: list[str] | None, oracle: bool
         behind.append(plain - reached)
         structure = f"{found.chosen.candidate.formulation} {found.chosen.candidate.words}"
         print(f"{name:<14}{structure[:57]:<58}{found.chosen.score:6.1f}{reached:8.2f}{plain:8.2f}{best:8.2f}  "
-              f"{found.verdict.word:<8}{used:7.1f}{' (out of time)' * bool(found.stopped)}", flush=True)
+              f"{found.verdict.word:<8}{used:7.1f}{' (effort spent)' * bool(found.stopped)}", flush=True)
     print(f"largest loss against the linear model: {max(behind):.2f} points (goal 0.5)")
     if regrets:
         print(f"mean regret: {np.mean(regrets):.2f} points (goal 2.5)")
@@ -177,12 +177,12 @@ KINDS = ("linear", "linear, slow input", "saturation", "dead zone", "rectifier, 
          "feedback, slow input")
 
 
-def on_plants(budget: float, seeds: int) -> None:
+def on_plants(effort: str, seeds: int) -> None:
     for kind in KINDS:
         right, classes, used = 0, [], spent()
         for seed in range(seeds):
             data, expected = plant(kind, seed)
-            found = identify(data, budget=budget, workers=1)
+            found = identify(data, effort=effort, workers=1)
             classes.append(found.chosen.candidate.kind)
             right += classes[-1] == expected or (expected == "feedback" and classes[-1] == "latent signals")
         counts = ", ".join(f"{classes.count(c)} {c}" for c in dict.fromkeys(classes))
@@ -210,7 +210,7 @@ def sums() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", default=os.environ.get("OPTID_DATA"))
-    parser.add_argument("--budget", type=float, default=60.0)
+    parser.add_argument("--effort", default="normal")
     parser.add_argument("--only", nargs="+")
     parser.add_argument("--oracle", action="store_true")
     parser.add_argument("--plants", action="store_true")
@@ -221,11 +221,11 @@ def main() -> None:
     if options.sums:
         sums()
     elif options.plants:
-        on_plants(options.budget, options.seeds)
+        on_plants(options.effort, options.seeds)
     elif not options.data:
         parser.error("name the folder of the records with --data or OPTID_DATA")
     else:
-        on_records(Path(options.data), options.budget, options.only, options.oracle)
+        on_records(Path(options.data), options.effort, options.only, options.oracle)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks, stretches
 from optid.identify.fitting import Fit, fit
 from optid.identify.search.effort import effort_of, units
+from optid.identify.search.kept import KeptTrials
 from optid.identify.search.ladder import (
     CLEAR,
     EQUAL,
@@ -82,7 +84,7 @@ class Identification(Rendered):
 
 def identify(data: Data, *, effort: str | float = "normal", budget: float | None = None, horizon: int | None = None,
              blocks: int = 4, classes: Sequence[str] = KINDS, constraints: Sequence[Any] = (), solver: Any = "auto",
-             accuracy: float = 1e-8, workers: int | None = None,
+             accuracy: float = 1e-8, workers: int | None = None, trials: str | Path | None = None,
              progress: Callable[[str], None] | None = None) -> Identification:
     """Find a structure for a record by blocked cross-validation, and fit it to the whole record.
 
@@ -106,10 +108,11 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         accuracy: as in `optid.fit`.
         workers: number of processes; constraints must then be importable. None for one per available processor, or one
             alone if something cannot be sent to others (see ``reasons``).
+        trials: file in which finished trials are kept; a search that was stopped goes on from there.
         progress: called with a sentence after every trial; default the log "optid" and a progress bar on a terminal.
 
     Raises:
-        DataError: the record is not in memory.
+        DataError: the record is not in memory; the file of `trials` belongs to another search.
         RankError: the record is too short for the blocks.
         StructureError: invalid arguments, or constraints that cannot be sent to `workers`.
         SolverFailed: no structure could be fitted; with the most frequent reason.
@@ -129,12 +132,15 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     compared = stretches(data, COMPARED)
     cut = Blocks.of(compared, blocks)
     ladder, stopped = Ladder.of(cut, data.n_experiments > 1), ""
+    unfinished: Sequence[str] = ()
     limits = dict(_limits(ladder))
     possible = [kind for kind in KINDS if kind in classes and kind not in limits]
     if not possible:
         raise StructureError(f"{next(limits[kind] for kind in classes)}: add 'linear' to the classes")
     if horizon is None and not ladder.open:
         horizon = 1  # a free run says nothing about the plant where the input answers the noise
+    kept = KeptTrials(trials, data, {"blocks": blocks, "horizon": horizon, "constraints": [
+        getattr(rule, "name", rule) for rule in rules], "solver": solver, "accuracy": accuracy})
     pool = Pool(partial(_attempt, cut, {"solver": solver, "accuracy": accuracy}, rules, horizon),
                 available_cores(workers, "workers"))
     alone = pool.reason and (_unsendable(rules, solver) or pool.reason)
@@ -151,7 +157,8 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     meter = Meter("search", most, lambda: sum(ladder.spent.values()))
     with meter if progress is None else nullcontext(progress) as told:
         try:
-            stopped = _climb(ladder, possible, pool, most, left, partial(_told, ladder, told, most))
+            stopped, unfinished = _climb(ladder, possible, pool, kept, most, left,
+                                         partial(_told, ladder, told, most))
             if stopped == BUDGET:
                 stopped = f"the budget of {budget:g} CPU s"
         except KeyboardInterrupt:
@@ -164,7 +171,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         raise _nothing(list(ladder.trials.values()))
     found = _refitted(chosen, data, cut, horizon, {"solver": solver, "accuracy": accuracy, "constraints": rules})
     found = replace(found, cross_validated=(tuple(chosen.by_block.tolist()), chosen.score))
-    why = reasons(ladder, best)
+    why = reasons(ladder, best, unfinished)
     if compared is not data:
         why.append(f"structures were compared on {compared.n_samples} of {data.n_samples} samples, in "
                    f"{compared.n_experiments} stretches; the one that was chosen is fitted to all")
@@ -197,9 +204,11 @@ def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
     yield from ((kind, reason) for kind in KINDS if kind != LINEAR)
 
 
-def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, most: float, left: Callable[[], float],
-           told: Callable[[Trial], None]) -> str:
-    """Try batch after batch until no class has more (""), the effort is spent, or no CPU second is left.
+def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, kept: KeptTrials, most: float, left: Callable[[], float],
+           told: Callable[[Trial], None]) -> tuple[str, tuple[str, ...]]:
+    """Try batch after batch until no class has more, the effort is spent, or no CPU second is left.
+
+    Return what ended the search early, or "", and the classes that had more.
 
     The low orders found in the record come first, without and with functions of the inputs; then linear models, for a
     share of the effort; then the class that has had the least.
@@ -210,9 +219,9 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, most: float, left: 
     spent = ladder.spent
     while rungs:
         if not early and ladder.choice() is not None and sum(spent.values()) >= most:
-            return f"its effort of {most:g} units"
+            return f"its effort of {most:g} units", tuple(rungs)
         if left() <= 0:
-            return BUDGET
+            return BUDGET, tuple(rungs)
         kind = early.pop(0) if early else (
             LINEAR if LINEAR in rungs and spent[LINEAR] < FIRST * most else min(rungs, key=spent.__getitem__))
         batch = waiting.pop(kind) if kind in waiting else next(rungs[kind], None)
@@ -220,16 +229,16 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, most: float, left: 
             del rungs[kind]
             continue
         batch = list({c.key: c for c in map(ladder.levelled, batch)}.values())
-        _tried(ladder, kind, [c for c in batch if c.key not in ladder.trials], pool, most, left, told)
+        _tried(ladder, kind, [c for c in batch if c.key not in ladder.trials], pool, kept, most, left, told)
         try:
             waiting[kind] = rungs[kind].send([ladder.trials[c.key] for c in batch])
         except StopIteration:
             del rungs[kind]
-    return ""
+    return "", ()
 
 
-def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], pool: Pool, most: float, left: Callable[[], float],
-           told: Callable[[Trial], None]) -> None:
+def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], pool: Pool, kept: KeptTrials, most: float,
+           left: Callable[[], float], told: Callable[[Trial], None]) -> None:
     """Try candidates of a class against its best so far, and put their trials down in the order of the batch."""
     rival, tasks = ladder.rival(kind), []
     for candidate in batch:
@@ -239,8 +248,12 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], pool: Pool, mo
                                                                    f"{100 * LARGEST_SHARE:.0f} % of the effort")
         else:
             tasks.append(candidate)
-    found = pool.run([(candidate, rival) for candidate in tasks], left, told)
-    for candidate, trial in zip(tasks, found):
+    known = {c.key: trial for c in tasks if (trial := kept.known(c, rival)) is not None}
+    fresh = [c for c in tasks if c.key not in known]
+    found = dict(zip((c.key for c in fresh), pool.run([(candidate, rival) for candidate in fresh], left, told)))
+    kept.keep([trial for trial in found.values() if trial is not None], rival)
+    for candidate in tasks:
+        trial = known.get(candidate.key) or found[candidate.key]
         ladder.trials.pop(candidate.key, None)
         ladder.trials[candidate.key] = trial or Trial(candidate, reason=OUT_OF_TIME)
         ladder.spent[kind] += (trial.fits if trial else 0) * units(candidate, ladder.data)
@@ -263,8 +276,8 @@ def _unsendable(rules: Sequence[Any], solver: Any) -> str:
     return ""
 
 
-def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
-    """Say of every class why it was selected or not."""
+def reasons(ladder: Ladder, best: Mapping[str, Trial], open_kinds: Sequence[str] = ()) -> list[str]:
+    """Say of every class what it gained over the one chosen before, how sure that is, and what was not reached."""
     found: list[str] = []
     current: Trial | None = None
     for kind, trial in best.items():
@@ -272,14 +285,12 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
             found.append(f"{kind}: {trial.score:.1f} % by cross-validation")
             current = trial
             continue
-        saved = current.gain(trial)
-        sentence = f"{kind}: {trial.score:.1f} % against {current.score:.1f} %"
-        median = f"{100 * (1 - np.exp(-saved)):.0f} % less error energy in the median block"
-        if trial.score > current.score and saved > CLEAR:
-            found.append(f"{sentence}, with {median}: selected")
+        sentence = f"{kind}: {trial.score:.1f} % against {current.score:.1f} %, with {_saved(current, trial)}"
+        if trial.score > current.score and current.gain(trial) > CLEAR:
+            found.append(f"{sentence}: selected")
             current = trial
-        elif trial.score > current.score:
-            found.append(f"{sentence}, but {median}, less than {100 * (1 - np.exp(-CLEAR)):.0f} %: not selected")
+        elif trial.score > current.score and current.gain(trial) > 0:
+            found.append(f"{sentence}; at least {100 * (1 - np.exp(-CLEAR)):.0f} % less is asked for: not selected")
         else:
             found.append(f"{sentence}: not selected")
     for kind in KINDS:
@@ -287,7 +298,20 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial]) -> list[str]:
         if kind not in best and several:
             found.append(f"{kind}: none of {len(several)} structures was as good as what is chosen "
                          f"(first: {several[0].reason})")
+        if kind in open_kinds:
+            found.append(f"{kind}: {f'ended after {len(several)} structures' if several else 'not reached'}; "
+                         "a larger effort goes on")
     return found
+
+
+def _saved(plain: Trial, rich: Trial) -> str:
+    """Say how much less error energy a richer structure leaves in the median block, and how sure that is."""
+    gains = plain.gains(rich)
+    saved = float(np.median(gains)) if gains.size else -np.inf
+    share = 100 * (1 - np.exp(-saved)) if saved >= 0 else 100 * (np.exp(min(-saved, 100.0)) - 1)
+    words = f"{share:.0f} % {'less' if saved >= 0 else 'more'} error energy in the median block"
+    spread = float(np.std(gains, ddof=1)) if gains.size > 1 else 0.0
+    return words + (f" ({abs(float(np.mean(gains))) / spread:.1f} times the spread over the blocks)" if spread else "")
 
 
 def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, settings: dict[str, Any]) -> Fit:

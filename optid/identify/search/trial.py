@@ -105,11 +105,16 @@ class Trial:
         """Relative energy of the errors on the blocks (b,), summed over the outputs, in their order in the record."""
         return np.sum(self.energy / np.maximum(self.measure, 1e-300), axis=1)[np.argsort(self.order)]
 
-    def gain(self, rich: "Trial") -> float:
-        """Return the median over the blocks of both of the log ratio of error energies; minus infinity without any."""
+    def gains(self, rich: "Trial") -> Array:
+        """Return the log ratio of error energies on the blocks of both (b,): what a richer structure saves."""
         common = sorted(set(self.order) & set(rich.order))
         mine, other = (np.array([trial.losses[sorted(trial.order).index(b)] for b in common]) for trial in (self, rich))
-        return float(np.median(np.log(np.maximum(mine, 1e-300) / np.maximum(other, 1e-300)))) if common else -np.inf
+        return np.log(np.maximum(mine, 1e-300) / np.maximum(other, 1e-300))
+
+    def gain(self, rich: "Trial") -> float:
+        """Return the median of `gains`; minus infinity without any block."""
+        gains = self.gains(rich)
+        return float(np.median(gains)) if gains.size else -np.inf
 
 
 def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: Mapping[str, Any],
