@@ -5,9 +5,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
 from optid.cli.results import Work, check_names, reading_for, working
+from optid.cli.terminal import STOPPED
 from optid.errors import DataError
 from optid.lazy import import_cvxpy
 
@@ -72,8 +75,8 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
 
 def identify(data: Paths = None, example: str | None = None, *, how: dict[str, Any], effort: str = "normal",
              budget: float | None = None, horizon: int | None = None, classes: Words = None, constraint: Words = None,
-             solver: str = "auto", workers: int | None = None, split: float | None = None, test: Words = None,
-             seed: int = 0, report: File = None, saved: File = None) -> None:
+             solver: str = "auto", workers: int | None = None, trials: File = None, split: float | None = None,
+             test: Words = None, seed: int = 0, report: File = None, saved: File = None) -> None:
     """Select formulation, delay, orders and bases by cross-validation, and fit the model.
 
     Example: optid identify data.csv --inputs u --outputs y --dt 0.1 --report report.html
@@ -86,11 +89,12 @@ def identify(data: Paths = None, example: str | None = None, *, how: dict[str, A
         constraint (-c NAME:VALUE...): Constraint on every model; optid constraints lists them.
     The solver:
         workers (N): Number of processes. [dim]one per core[/]
+        trials (FILE): Keep finished trials in this file; a search that was stopped goes on from it.
     The record:
         split (SHARE): Search on this share of the record and validate on the rest.
     """
     _search(data, example, how, seed, split, test, constraint, solver, saved, report, effort=effort, budget=budget,
-            horizon=horizon, workers=workers, **({"classes": classes} if classes else {}))
+            horizon=horizon, workers=workers, trials=trials, **({"classes": classes} if classes else {}))
 
 
 def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, split: float | None, test: Words,
@@ -101,7 +105,8 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
 
         record: Any = words.record(data, how, example, seed)[0]
         import_cvxpy()
-        from optid.identify.search import identify as find
+        from optid.identify.search.search import INTERRUPT
+        from optid.identify.search.search import identify as find
 
         record, held_out = words.held_out(record, split, test, how)
         found = find(record, constraints=constraint or (), solver=solver, progress=work.step, **settings)
@@ -109,6 +114,8 @@ def _search(data: Any, example: str | None, how: dict[str, Any], seed: int, spli
         work.text = str(found)
         _check(work, found, record, held_out, "search")
         work.page(found, report, held_out)
+    if found.stopped == INTERRUPT:
+        raise typer.Exit(STOPPED)
 
 
 def _save(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths, how: dict[str, Any]) -> None:

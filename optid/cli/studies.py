@@ -13,12 +13,11 @@ from typer.core import TyperGroup
 from optid.cli.listings import systems
 from optid.cli.options import File, Words, register
 from optid.cli.results import check_folders, command_line
-from optid.cli.terminal import Command, SafeConsole, say
+from optid.cli.terminal import STOPPED, Command, SafeConsole, say
 
 study = typer.Typer(cls=TyperGroup, no_args_is_help=True, rich_markup_mode="rich",
                     help="Compare formulations and solvers on your data: run, report and export a study.")
 
-STOPPED = 130  # exit code after Ctrl-C, by convention of shells
 NOTHING_SOLVED = 4  # exit code of a run in which no cell has an answer, as where one fit fails in its solver
 
 Workers = Annotated[

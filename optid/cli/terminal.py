@@ -94,6 +94,10 @@ def spread(args: Sequence[str], several: dict[str, bool]) -> list[str]:
     return result
 
 
+STOPPED = 130
+"""Exit code after Ctrl-C, by convention of shells."""
+
+
 def exit_code(error: BaseException) -> int:
     """Return 2 for data, structure and names, 3 for no solution, 4 for the solver, 1 for a defect of optid."""
     if isinstance(error, InfeasibleError | UnboundedError):

@@ -80,5 +80,5 @@ def search_lines(found: "Identification") -> list[str]:
     chosen = found.chosen.candidate
     lines += ["", *wrapped(f"Chosen: --formulation {chosen.formulation} {chosen.words}", "    ")]
     if found.stopped:
-        lines += wrapped(f"Note: the search was ended by {found.stopped}; more effort may find a better structure")
+        lines += wrapped(f"Note: {found.ended}")
     return lines

@@ -38,7 +38,7 @@ from optid.packing import Unsendable, pack
 from optid.progress import Meter
 from optid.registry import Rendered, named_constraint
 
-BUDGET = "the budget"
+BUDGET, INTERRUPT = "the budget", "an interrupt"
 COMPARED = 20_000  # samples of a long record on which structures are compared
 FIRST = 0.25  # share of the effort that linear models have before the others begin
 LARGEST_SHARE = 0.25  # of the effort that one trial may take, after the first
@@ -75,6 +75,13 @@ class Identification(Rendered):
     def model(self) -> Any:
         """The model, in raw units."""
         return self.fit.model
+
+    @property
+    def ended(self) -> str:
+        """What ended the search early, and how it goes on; "" where every class came to its end."""
+        return self.stopped and (
+            f"the search was ended by {self.stopped} after {len(self.trials)} trials: more effort may find a better "
+            "structure (--effort large; from a file of --trials it goes on where it was)")
 
     @property
     def verdict(self) -> Verdict:
@@ -162,7 +169,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
             if stopped == BUDGET:
                 stopped = f"the budget of {budget:g} CPU s"
         except KeyboardInterrupt:
-            stopped = "an interrupt"
+            stopped = INTERRUPT
         finally:
             pool.close()
     best = {kind: trial for kind in KINDS if (trial := ladder.best(kind)) is not None}
