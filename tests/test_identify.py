@@ -433,26 +433,26 @@ def test_layouts_of_the_sums_hold_every_lag():
 @pytest.mark.usefixtures("short")
 def test_a_search_goes_on_from_the_file_of_its_trials(tmp_path, monkeypatch):
     data, file = plant(400, cubic=0.4), tmp_path / "trials.json"
-    first = identify(data, effort=1e-3, workers=1, trials=file)
+    first = identify(data, classes=KINDS[:2], effort=1e-3, workers=1, trials=file)
     made = []
     monkeypatch.setattr(searching, "tried", lambda one, *more: made.append(one.key) or tried(one, *more))
-    second = identify(data, workers=1, trials=file)
-    whole = identify(data, workers=1)
+    second = identify(data, classes=KINDS[:2], workers=1, trials=file)
+    whole = identify(data, classes=KINDS[:2], workers=1)
     assert not {t.candidate.key for t in first.trials if t.fits} & set(made[: len(second.trials) - len(first.trials)])
     assert [(t.candidate.key, t.score, t.reason) for t in second.trials] == [
         (t.candidate.key, t.score, t.reason) for t in whole.trials]
     assert str(second.fit.model) == str(whole.fit.model)
     with pytest.raises(DataError, match="of another record"):
-        identify(plant(400, seed=1), workers=1, trials=file)
+        identify(plant(400, seed=1), classes=KINDS[:2], workers=1, trials=file)
     file.write_text("{}")
     with pytest.raises(OptidError, match="trials.json"):
-        identify(data, workers=1, trials=file)
+        identify(data, classes=KINDS[:2], workers=1, trials=file)
 
 
 @pytest.mark.slow
 def test_the_trials_do_not_depend_on_the_number_of_processes(short):
     data = plant(400, cubic=0.4)
-    one, two = (identify(data, workers=count) for count in (1, 2))
+    one, two = (identify(data, classes=KINDS[:2], workers=count) for count in (1, 2))
     assert [(t.candidate.key, t.score, t.energy.tolist()) for t in one.trials] == [
         (t.candidate.key, t.score, t.energy.tolist()) for t in two.trials]
     assert one.units == two.units and one.fit.model.to_dict() == two.fit.model.to_dict()
