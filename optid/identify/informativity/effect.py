@@ -81,8 +81,8 @@ def _simulated(signals: RecordSignals, o: int, outputs: tuple[Array, ...], other
         drawn = tuple(s + lfilter([1.0], noise, spread * rng.standard_normal(len(s) + WARMING))[WARMING:]
                       for s in smooth)
         below += tested(drawn)[0] <= p_value
-        # more draws would change nothing, or little: it is not visible, or none of so many reached it
-        if below > LEVEL * (DRAWS + 1) or (not below and LEVEL * (draw + 1) >= 1):
+        # it is not visible: more draws would change nothing
+        if below > LEVEL * (DRAWS + 1):
             return (1 + below) / (draw + 1)
     return (1 + below) / (DRAWS + 1)
 
