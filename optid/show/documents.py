@@ -236,7 +236,7 @@ def search_document(found: "Identification", test: Data | None = None, *, comman
 
 def _search(found: "Identification") -> list[Any]:
     chosen = found.chosen.candidate
-    notes = [f"{found.ended.capitalize()}."] if found.stopped else []
+    notes = [f"{found.ended[0].upper()}{found.ended[1:]}."] if found.stopped else []
     trials = [t for t in found.trials if np.isfinite(t.score)]
     table = wording.Table(f"Every structure that was tried on all blocks ({len(trials)})",
                           ("structure", "fit %", "worst block", "parameters", "time"),

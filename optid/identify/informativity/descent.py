@@ -85,7 +85,7 @@ class Drive:
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class FittedTerm:
     """A response fitted beside what is projected out: sum of squares and coefficients, and the criterion."""
 
     term: Term
@@ -106,7 +106,7 @@ def slowest_of(poles: Poles) -> float:
     return 1.0 if np.any(poles == 1) else float(np.max(np.abs(poles), initial=0.0))
 
 
-def refined(regression: WhitenedRegression, drive: Drive, term: Term, below: float = np.inf) -> Point:
+def refined(regression: WhitenedRegression, drive: Drive, term: Term, below: float = np.inf) -> FittedTerm:
     """Descend over the poles of one response by Gauss-Newton steps, each along coefficients and poles together.
 
     The descent ends early where its steps promise no criterion near `below`.
@@ -141,7 +141,7 @@ def refined(regression: WhitenedRegression, drive: Drive, term: Term, below: flo
         energy, theta, free, columns = found
         if regression.count * fall <= ENOUGH * energy:
             break
-    return Point(at, drive, energy, theta, criterion(energy))
+    return FittedTerm(at, drive, energy, theta, criterion(energy))
 
 
 def solved(regression: WhitenedRegression, drive: Drive, term: Term) -> tuple[float, Array, int, list[Array]]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.identify.informativity.bank import apart, scan
-from optid.identify.informativity.descent import ROUNDING, Drive, Point, Term, columns_of, refined, slowest_of
+from optid.identify.informativity.descent import ROUNDING, Drive, FittedTerm, Term, columns_of, refined, slowest_of
 from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.roots import roots_of
 from optid.statistics.coloured import short_autoregression
@@ -107,7 +107,7 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
     regression = WhitenedRegression(signals.outputs(o), tuple(there[:, o] for there in signals.present), np.ones(1))
     longest = max(int(LATEST * signals.longest), min(least, signals.longest - 1))
     u = [signals.inputs(c) for c in range(len(signals.u_scale))]
-    points: list[Point | None] = [None] * len(u)
+    points: list[FittedTerm | None] = [None] * len(u)
     inputs = range(1) if len(u) == 1 else sorted(  # the one that explains most first
         range(len(u)), key=lambda c: scan(regression, u[c], longest, 1)[0].energy)
     whole = not any(lost.any() for lost in signals.lost)
@@ -143,7 +143,7 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
 
 
 def _found(regression: WhitenedRegression, u: tuple[Array, ...], levels: int, least: int, longest: int,
-           before: Point | None) -> Point:
+           before: FittedTerm | None) -> FittedTerm:
     """Return the best response to one input, whose f is bent where that pays."""
     straight = Drive(u)
     start = None if before is None else before.term
@@ -172,11 +172,11 @@ def _found(regression: WhitenedRegression, u: tuple[Array, ...], levels: int, le
 
 
 def _searched(regression: WhitenedRegression, drive: Drive, least: int, longest: int, start: Term | None,
-              scanned: bool = True) -> Point:
+              scanned: bool = True) -> FittedTerm:
     """Refine the best of the scan, and then neighbouring structures as long as the criterion falls."""
-    tried: dict[tuple[int, ...], Point] = {}
+    tried: dict[tuple[int, ...], FittedTerm] = {}
 
-    def fitted(term: Term) -> Point:
+    def fitted(term: Term) -> FittedTerm:
         if term.key not in tried:
             least = min((p.criterion for p in tried.values()), default=np.inf)
             tried[term.key] = refined(regression, drive, term, least)
@@ -259,8 +259,8 @@ def _bent(regression: WhitenedRegression, drive: Drive, term: Term, nodes: Array
     return Drive(tuple(np.interp(u, nodes, heights) for u in drive.values), nodes, heights)
 
 
-def _completed(regression: WhitenedRegression, point: Point, u: tuple[Array, ...], lost: Sequence[NDArray[np.bool_]]
-               ) -> tuple[Array, ...]:
+def _completed(regression: WhitenedRegression, point: FittedTerm, u: tuple[Array, ...],
+               lost: Sequence[NDArray[np.bool_]]) -> tuple[Array, ...]:
     """Estimate a few missing samples of an input from what they do to the output; more of them stay as they are."""
     places = [(i, k) for i, one in enumerate(lost) for k in np.flatnonzero(one).tolist() if k]
     if not 0 < len(places) <= FILLED or point.drive.nodes is not None:
@@ -279,7 +279,7 @@ def _completed(regression: WhitenedRegression, point: Point, u: tuple[Array, ...
     return tuple(filled)
 
 
-def _without(y: Sequence[Array], points: Sequence[Point]) -> tuple[Array, ...]:
+def _without(y: Sequence[Array], points: Sequence[FittedTerm]) -> tuple[Array, ...]:
     """Return the output less the responses to some inputs."""
     rest = list(y)
     for p in points:
@@ -287,7 +287,7 @@ def _without(y: Sequence[Array], points: Sequence[Point]) -> tuple[Array, ...]:
     return tuple(rest)
 
 
-def _joint(regression: WhitenedRegression, points: Sequence[Point]) -> tuple[list[Array], Array, float]:
+def _joint(regression: WhitenedRegression, points: Sequence[FittedTerm]) -> tuple[list[Array], Array, float]:
     """Return the columns of all responses, their coefficients together, and the slowest pole."""
     each = [columns_of(p.term, p.drive.values) for p in points]
     columns = [np.hstack(several) for several in zip(*each)]
@@ -295,7 +295,7 @@ def _joint(regression: WhitenedRegression, points: Sequence[Point]) -> tuple[lis
     return columns, regression.solve(columns, slowest)[1], slowest
 
 
-def _interval(regression: WhitenedRegression, point: Point, least: int, longest: int) -> tuple[int, int]:
+def _interval(regression: WhitenedRegression, point: FittedTerm, least: int, longest: int) -> tuple[int, int]:
     """Return the delays that the likelihood does not exclude, poles and coefficients refitted at each."""
     ends = []
     for step in (-1, 1):
@@ -310,7 +310,7 @@ def _interval(regression: WhitenedRegression, point: Point, least: int, longest:
     return ends[0], ends[1]
 
 
-def _response(signals: RecordSignals, c: int, o: int, point: Point, interval: tuple[int, int]) -> DelayedResponse:
+def _response(signals: RecordSignals, c: int, o: int, point: FittedTerm, interval: tuple[int, int]) -> DelayedResponse:
     """Write a response in the units of the record."""
     term, drive = point.term, point.drive
     poles = term.poles

@@ -6,13 +6,14 @@ long it takes: a slow machine makes the same trials as a fast one.
 """
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-from optid.arrays import is_number, shown
+from optid.arrays import LARGEST, is_number, shown
 from optid.data.record import Data
-from optid.errors import StructureError, nearest
+from optid.errors import StructureError
 from optid.identify.search.trial import Candidate
 
 EFFORTS = {"small": 15.0, "normal": 60.0, "large": 400.0}
@@ -25,14 +26,12 @@ RATES = {"arx": 5e-5, "armax": 1e-3, "bj": 3e-3, "oe": 3e-3, "sid": 2.5e-4, "ss"
 
 
 def effort_of(given: Any) -> float:
-    """Return the units of a word of `EFFORTS` or of a positive number (`StructureError`)."""
-    if isinstance(given, str) and given in EFFORTS:
-        return EFFORTS[given]
-    if isinstance(given, str) and not _is_text_of_a_number(given):
-        raise StructureError(f"effort={shown(given)}: use one of {', '.join(EFFORTS)}, or a number of units. "
-                             f"{nearest(given, EFFORTS)}")
-    value = float(given) if isinstance(given, str) else given
-    if not is_number(value) or not 0 < value < np.inf:
+    """Return the units of a word of `EFFORTS`, or of a positive number or its text (`StructureError`)."""
+    value: Any = EFFORTS.get(given, given) if isinstance(given, str) else given
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
+    if not is_number(value) or not 0 < value <= LARGEST:
         raise StructureError(f"effort={shown(given)}: use one of {', '.join(EFFORTS)}, or a number of units above 0")
     return float(value)
 
@@ -71,11 +70,3 @@ def _rate(formulation: str) -> str:
         return "arx"
     return {"armax": "armax", "hammerstein_armax": "armax", "bj": "bj", "hammerstein_bj": "bj", "oe": "oe",
             "ss": "ss"}.get(name, "hammerstein")
-
-
-def _is_text_of_a_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True

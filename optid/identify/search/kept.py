@@ -28,8 +28,11 @@ class KeptTrials:
     def __init__(self, path: str | Path | None, data: Data, settings: Mapping[str, Any]) -> None:
         """Read a file, if there is one; a `DataError` where it belongs to another search or is damaged."""
         self.path = None if path is None else Path(path)
-        self.search, self._known = _fingerprint(data, settings), dict[str, Trial]()
-        if self.path is None or not self.path.exists():
+        self.search, self._known = "", dict[str, Trial]()
+        if self.path is None:
+            return
+        self.search = _fingerprint(data, settings)
+        if not self.path.exists():
             return
         search, trials = read(self.path, FORMAT, VERSION, lambda content: (content["search"], [
             (row["key"], _trial(row)) for row in content["trials"]]))
@@ -39,9 +42,9 @@ class KeptTrials:
         self._known = dict(trials)
 
     def known(self, candidate: Candidate, rival: Trial | None) -> Trial | None:
-        """Return the trial of a candidate against a rival, if it was finished."""
+        """Return the trial of a candidate against a rival, if it was finished; it takes no more time."""
         found = self._known.get(_key(candidate, rival))
-        return None if found is None else replace(found, candidate=candidate)
+        return None if found is None else replace(found, candidate=candidate, seconds=0.0)
 
     def keep(self, trials: Sequence[Trial], rival: Trial | None) -> None:
         """Put down finished trials against a rival."""

@@ -39,6 +39,7 @@ from optid.progress import Meter
 from optid.registry import Rendered, named_constraint
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
+Runs = Callable[[Sequence[Candidate], Trial | None], list[Trial | None]]
 COMPARED = 20_000  # samples of a long record on which structures are compared
 FIRST = 0.25  # share of the effort that linear models have before the others begin
 LARGEST_SHARE = 0.25  # of the effort that one trial may take, after the first
@@ -164,8 +165,8 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     meter = Meter("search", most, lambda: sum(ladder.spent.values()))
     with meter if progress is None else nullcontext(progress) as told:
         try:
-            stopped, unfinished = _climb(ladder, possible, pool, kept, most, left,
-                                         partial(_told, ladder, told, most))
+            run = partial(_run, pool, kept, left, partial(_told, ladder, told, most))
+            stopped, unfinished = _climb(ladder, possible, run, most, left)
             if stopped == BUDGET:
                 stopped = f"the budget of {budget:g} CPU s"
         except KeyboardInterrupt:
@@ -211,8 +212,8 @@ def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
     yield from ((kind, reason) for kind in KINDS if kind != LINEAR)
 
 
-def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, kept: KeptTrials, most: float, left: Callable[[], float],
-           told: Callable[[Trial], None]) -> tuple[str, tuple[str, ...]]:
+def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: Callable[[], float]
+           ) -> tuple[str, tuple[str, ...]]:
     """Try batch after batch until no class has more, the effort is spent, or no CPU second is left.
 
     Return what ended the search early, or "", and the classes that had more.
@@ -236,7 +237,7 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, kept: KeptTrials, m
             del rungs[kind]
             continue
         batch = list({c.key: c for c in map(ladder.levelled, batch)}.values())
-        _tried(ladder, kind, [c for c in batch if c.key not in ladder.trials], pool, kept, most, left, told)
+        _tried(ladder, kind, [c for c in batch if c.key not in ladder.trials], run, most)
         try:
             waiting[kind] = rungs[kind].send([ladder.trials[c.key] for c in batch])
         except StopIteration:
@@ -244,8 +245,7 @@ def _climb(ladder: Ladder, kinds: Sequence[str], pool: Pool, kept: KeptTrials, m
     return "", ()
 
 
-def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], pool: Pool, kept: KeptTrials, most: float,
-           left: Callable[[], float], told: Callable[[Trial], None]) -> None:
+def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, most: float) -> None:
     """Try candidates of a class against its best so far, and put their trials down in the order of the batch."""
     rival, tasks = ladder.rival(kind), []
     for candidate in batch:
@@ -255,15 +255,20 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], pool: Pool, ke
                                                                    f"{100 * LARGEST_SHARE:.0f} % of the effort")
         else:
             tasks.append(candidate)
-    known = {c.key: trial for c in tasks if (trial := kept.known(c, rival)) is not None}
-    fresh = [c for c in tasks if c.key not in known]
-    found = dict(zip((c.key for c in fresh), pool.run([(candidate, rival) for candidate in fresh], left, told)))
-    kept.keep([trial for trial in found.values() if trial is not None], rival)
-    for candidate in tasks:
-        trial = known.get(candidate.key) or found[candidate.key]
+    for candidate, trial in zip(tasks, run(tasks, rival)):
         ladder.trials.pop(candidate.key, None)
         ladder.trials[candidate.key] = trial or Trial(candidate, reason=OUT_OF_TIME)
         ladder.spent[kind] += (trial.fits if trial else 0) * units(candidate, ladder.data)
+
+
+def _run(pool: Pool, kept: KeptTrials, left: Callable[[], float], told: Callable[[Trial], None],
+         batch: Sequence[Candidate], rival: Trial | None) -> list[Trial | None]:
+    """Return the trials of candidates against a rival, kept ones or new; None where no time was left."""
+    known = [kept.known(candidate, rival) for candidate in batch]
+    new = pool.run([(candidate, rival) for candidate, trial in zip(batch, known) if trial is None], left, told)
+    kept.keep([trial for trial in new if trial is not None], rival)
+    rest = iter(new)
+    return [next(rest) if trial is None else trial for trial in known]
 
 
 def _attempt(blocks: Blocks, settings: Mapping[str, Any], rules: Sequence[Any], horizon: int | None,
