@@ -27,10 +27,10 @@ RATES = {"arx": 5e-5, "armax": 1e-3, "bj": 3e-3, "oe": 3e-3, "sid": 2.5e-4, "ss"
 
 def effort_of(given: Any) -> float:
     """Return the units of a word of `EFFORTS`, or of a positive number or its text (`StructureError`)."""
-    value: Any = EFFORTS.get(given, given) if isinstance(given, str) else given
-    if isinstance(value, str):
+    value = given
+    if isinstance(given, str):
         with suppress(ValueError):
-            value = float(value)
+            value = EFFORTS[given] if given in EFFORTS else float(given)
     if not is_number(value) or not 0 < value <= LARGEST:
         raise StructureError(f"effort={shown(given)}: use one of {', '.join(EFFORTS)}, or a number of units above 0")
     return float(value)
