@@ -40,10 +40,16 @@ from optid.processes import run_apart
 FITS = 50
 
 
+@pytest.fixture
 def ended():
-    """Whether this process has no child but those that rest."""
-    resting = {worker._process.pid for worker in processes._resting[os.getpid()]}
-    return not [c for c in psutil.Process().children() if c.pid not in resting and not gone(c.pid)]
+    """Whether this process has no child but those that rest and those that others left to it before."""
+    before = {child.pid for child in psutil.Process().children()}
+
+    def ended():
+        allowed = before | {worker._process.pid for worker in processes._resting[os.getpid()]}
+        return not [c for c in psutil.Process().children() if c.pid not in allowed and not gone(c.pid)]
+
+    return ended
 
 
 def test_results_and_exceptions_come_back():
@@ -99,7 +105,7 @@ def test_what_is_not_used_may_stay_here():
     assert isinstance(run_apart(anything, anonymous(), lenient=True), Absent)
 
 
-def test_a_process_is_killed_after_its_time():
+def test_a_process_is_killed_after_its_time(ended):
     clock = time.monotonic()
     with pytest.raises(TimeoutError):
         run_apart(time.sleep, 60, seconds=0.2)
@@ -156,7 +162,7 @@ def test_a_lock_that_a_thread_holds_stops_no_process(monkeypatch):
         assert run_apart(locked, 3, seconds=60) == 3
 
 
-def test_no_descriptor_and_no_process_is_left():
+def test_no_descriptor_and_no_process_is_left(ended):
     def open_files():
         return psutil.Process().num_fds()
 
