@@ -50,10 +50,10 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         latent: signals that z combines, "states+inputs" or "states".
         direct: whether h also acts on the outputs directly.
         criterion: "simulation" (the free run) or "prediction" (K estimated).
-        initial: models without latent signals as additional starting points.
+        initial: models without latent signals, or with the same, as additional starting points.
         seed: of the directions of z that are tried.
         tries: searches for every latent signal, those after the first beside the others; with 1, which is quick,
-            a search that seems to have failed is not repeated either.
+            a search that seems to have failed is not repeated either; with 0 initial models alone are starts.
 
     Raises:
         StructureError: words, orders or starts that do not fit, a basis of affine functions alone.
@@ -75,7 +75,7 @@ def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool,
     inner = _on_latent(latent_basis)
     one = Latent(inner, beyond_affine(inner), direct=direct, moved=latent != "states")
     return partial(add_channels, channels=(one,) * channels, seed=seed, iterations=iterations,
-                   tries=check_integer(tries, "tries"))
+                   tries=check_integer(tries, "tries", 0))
 
 
 def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
@@ -90,7 +90,7 @@ def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
     Args:
         output_basis: basis of every h, on z in [-1, 1].
         feedthrough: whether the inputs act on z at once.
-        initial: linear models as additional starting points.
+        initial: linear models, or models of this structure, as additional starting points.
     """
     return _fit("wiener_ss.exact", data, nx, output_basis, feedthrough, iterations, block_rows=block_rows,
                 weighting=weighting, stability=stability, initial=initial, constraints=constraints)
@@ -108,7 +108,7 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
 
     Args:
         output_basis: basis of every h, on z in [-1, 1].
-        initial: Hammerstein models as additional starting points.
+        initial: Hammerstein models, or models of this structure, as additional starting points.
     """
     return _fit("hammerstein_wiener_ss.exact", data, nx, output_basis, False, iterations, basis=basis,
                 block_rows=block_rows, weighting=weighting, stability=stability, initial=initial,

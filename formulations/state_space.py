@@ -211,7 +211,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
                     ) -> Procedure:
     """Fit a model in the units of the samples, and return it in those of the record.
 
-    ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum), None for none.
+    ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum, initial models
+    with these functions), None for none.
     ``finish`` is a procedure of (plan, errors, constraints, optimum, figures) that returns the evidence; None
     solves the programmes in the tangent.
     The other arguments are those of `hammerstein_ss`, as are the errors raised.
@@ -241,7 +242,9 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
                    offset=bool(constants), instruments=instruments, feedthrough=feedthrough, stability="free",
                    iterations=2 * (feedback_basis is not None), constraints=poles)
     models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
-    found = {f"start {i}": model.with_transform(inverse(plan.units)) for i, model in enumerate(models, start=1)}
+    models = [model.with_transform(inverse(plan.units)) for model in models]
+    known = [model for model in models if model.latent]  # with functions that `extend` adds to the others
+    found = {f"start {i}": model for i, model in enumerate(models, start=1) if not model.latent}
 
     def run() -> Procedure:
         # what functions of latent signals are added to needs no more than a first part of a long record
@@ -254,7 +257,7 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
                                   in_units(record, plan.units) if constants == "each" else None)
         errors, best, figures = search_states(errors, starts, weighting, int(iterations))
         if extend is not None:
-            errors, best, more = extend(replace(errors, data=with_whole_inputs(plan.data, 2 * nx + 1)), best)
+            errors, best, more = extend(replace(errors, data=with_whole_inputs(plan.data, 2 * nx + 1)), best, known)
             figures = {**figures, **more}
         evidence = yield from (finish or _refined)(plan, errors, tuple(constraints), best, {"order": nx, **figures})
         return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))

@@ -16,9 +16,9 @@ from optid.identify.informativity import Informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
 from optid.identify.search import search as searching
-from optid.identify.search.ladder import CLEAR, INPUTS, KINDS, LINEAR, RUNGS, Ladder
+from optid.identify.search.ladder import RUNGS, Ladder
 from optid.identify.search.pool import Pool
-from optid.identify.search.trial import Candidate, Trial, free_parameters, tried
+from optid.identify.search.trial import CLEAR, INPUTS, KINDS, LATENT, LINEAR, Candidate, Trial, free_parameters, tried
 from optid.models.layout import Layout
 from optid.statistics import collect
 
@@ -183,6 +183,52 @@ def test_a_trial_is_given_up_early_and_says_why():
     assert late.reason == "out of time"
     refused = tried(Candidate(LINEAR, "arx", {"na": 300, "nb": 300}), blocks, None, {}, (), None)
     assert refused.reason.startswith("RankError") and refused.status == "refused"
+
+
+def test_a_richer_structure_that_follows_the_record_no_better_is_not_cross_validated():
+    data = plant(400, noise=0.05)
+    blocks = Blocks.of(data)
+    plain = tried(Candidate(LINEAR, "oe.exact", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None)
+    rich = Candidate(INPUTS, "hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": [1], "basis": "polynomial:3"})
+    found = tried(rich, blocks, plain, {}, (), None)
+    assert found.fits == 1 and "less error energy than the best linear model" in found.reason
+    assert found.estimation > plain.estimation
+    assert tried(rich, blocks, replace(plain, candidate=replace(rich, kind=INPUTS)), {}, (), None).fits == 5
+
+
+def test_functions_keep_the_range_of_the_record_where_a_block_is_left_out():
+    """The last block holds the largest inputs: without it the function would end before them."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, 800) * np.where(np.arange(800) < 600, 0.6, 1.0)
+    y = np.convolve(u + 0.5 * u**3, 0.8 ** np.arange(60))[:800]
+    blocks = Blocks.of(optid.Data(u, y + 0.01 * rng.normal(size=800)))
+    arguments = {"na": 1, "nb": 1, "basis": "polynomial:3"}
+    found = tried(Candidate(INPUTS, "hammerstein_oe.exact", arguments), blocks, None, {}, (), None)
+    assert found.by_block.min() > 98
+    narrow = optid.fit(blocks.without(3), "hammerstein_oe.exact", **arguments).model
+    energy, measure = blocks.errors(narrow, 3)
+    assert 100 * (1 - np.sqrt(energy / measure)).item() < 95
+
+
+@pytest.mark.filterwarnings("ignore:The functions of latent signals")
+@pytest.mark.parametrize("formulation, arguments", [
+    ("lfr.exact", {"channels": 1, "latent_basis": "polynomial:3"}), ("wiener_ss.exact", {}),
+    ("hammerstein_ss.exact", {"basis": "polynomial:2", "feedback_basis": "polynomial:3"}),
+])
+def test_fits_without_a_block_go_on_from_the_whole_record(formulation, arguments):
+    """Warm fits reach what cold ones do."""
+    rng = np.random.default_rng(1)
+    u, x = rng.normal(size=600), np.zeros(600)
+    for k in range(1, 600):
+        x[k] = 0.7 * x[k - 1] - 0.1 * np.tanh(x[k - 1]) ** 3 + u[k - 1]
+    y = x + 0.2 * x**2 if formulation == "wiener_ss.exact" else x
+    blocks = Blocks.of(optid.Data(3 + 2 * u, 40 + 7 * y + 0.05 * rng.normal(size=600)))
+    found = tried(Candidate(LATENT, formulation, {"nx": 1, **arguments}), blocks, None, {}, (), None)
+    assert found.complete, found.reason
+    cold = [optid.fit(blocks.without(b), formulation, nx=1, prove=False, **arguments).model for b in range(4)]
+    errors = np.array([blocks.errors(model, b)[0] for b, model in enumerate(cold)])
+    warm = found.energy[np.argsort(found.order)]
+    assert np.sum(warm) < 1.05 * np.sum(errors)
 
 
 @pytest.mark.parametrize("formulation, arguments, count", [

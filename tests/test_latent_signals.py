@@ -255,6 +255,22 @@ def test_a_latent_spring_is_found():
     assert fit.solution.objective < 0.01 * linear.solution.objective
 
 
+def test_a_fit_goes_on_from_a_model_with_latent_signals():
+    """In other units, too, and without a search; a model with other functions is refused."""
+    u = np.repeat(np.random.default_rng(3).uniform(-1.5, 1.5, 200), 4)
+    y = oscillator(u, 0.01)
+    first = optid.fit(Data(u, y), "lfr.exact", nx=2, latent="states")
+    moved = Data(10 + 5 * u[:700], 300 + 20 * y[:700])
+    before = first.model.with_transform(Transform((5.0,), (10.0,), (20.0,), (300.0,)))
+    again = optid.fit(moved, "lfr.exact", nx=2, latent="states", initial=before, tries=0)
+    cold = optid.fit(moved, "lfr.exact", nx=2, latent="states")
+    assert again.solution.objective == pytest.approx(cold.solution.objective, rel=1e-4)
+    with pytest.raises(StructureError, match="other basis functions|latent"):
+        optid.fit(moved, "lfr.exact", nx=2, latent="states", latent_basis="bspline:4", initial=before, tries=0)
+    with pytest.raises(OptidError, match="no start has a finite run"):
+        optid.fit(moved, "lfr.exact", nx=2, latent="states", tries=0)
+
+
 @pytest.mark.parametrize("formulation, front", [("wiener_ss.exact", False), ("hammerstein_wiener_ss.exact", True)])
 def test_functions_of_the_outputs_are_found(formulation, front):
     rng = np.random.default_rng(5)

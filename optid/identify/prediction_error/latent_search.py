@@ -21,10 +21,13 @@ from optid.errors import DataError, DataWarning, RankError
 from optid.identify.arguments import outputs_present
 from optid.identify.prediction_error.descent import COMPARED, Descent, descend
 from optid.identify.prediction_error.state_errors import StateErrors
+from optid.identify.prediction_error.state_search import entered
+from optid.models import HammersteinSS
 from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
 
 CANDIDATES = 32  # directions of z that are ranked, at least
 RANKED = 3_000  # samples on which directions are ranked and tried
+FEWEST = 100  # samples of an experiment that is cut
 STAGES = (8_000, 20_000)  # samples of the descents before the one on the whole record
 MARGIN = 1.15  # interval of a basis, as a multiple of the range of z at the start
 CELLS = 12  # largest number of cells of a spline in the search
@@ -41,23 +44,27 @@ SIZES = (1.0, 0.3, 0.05)  # shares of the Gauss-Newton step from which a descent
 SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.0)  # sizes of a function where a longer record would leave its range
 
 
-def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], *, seed: int = 0,
-                 iterations: int = 60, tries: int = 2) -> tuple[StateErrors, Descent, dict[str, Any]]:
+def add_channels(errors: StateErrors, best: Descent, known: Sequence[HammersteinSS], channels: tuple[Latent, ...], *,
+                 seed: int = 0, iterations: int = 60, tries: int = 2) -> tuple[StateErrors, Descent, dict[str, Any]]:
     """Add functions of latent signals to a model; return the criterion with them, its optimum, and figures.
 
     Args:
         errors: the criterion of the model without them.
         best: its optimum.
+        known: models with the functions, from which to descend as well.
         channels: the functions, each on the interval [-1, 1] of its argument.
         seed: of the random directions.
         iterations: of a descent at most.
         tries: searches for every function, after the first with the other functions present. Where one more function
-            would gain much, all of them are searched again from other directions, ``2 tries - 1`` times at most.
+            would gain much, all of them are searched again from other directions, ``2 tries - 1`` times at most. With 0
+            the known models alone are starts.
 
     Raises:
         RankError: no direction of z leads to a model whose run stays finite.
+        StructureError: a known model has other functions.
     """
-    rng, searches, refusal = np.random.default_rng(seed), [], None
+    rng, refusal = np.random.default_rng(seed), RankError("no start has a finite run that stays in its range")
+    searches = _continued(_widened(errors, channels), known, iterations)
     for _ in range(2 * tries - 1):
         try:
             searches.append(_search(errors, best, channels, rng, iterations, tries))
@@ -67,12 +74,21 @@ def add_channels(errors: StateErrors, best: Descent, channels: tuple[Latent, ...
         if _expected(searches[-1][0], searches[-1][1].x, channels[0], rng) <= LEFT:
             break
     if not searches:
-        assert refusal is not None
         raise refusal
     part, end, figures = min(searches, key=lambda one: one[1].value)
     if iterations:
         figures |= _idle(errors, best.x, part, end)
     return part, end, figures
+
+
+def _continued(errors: StateErrors, known: Sequence[HammersteinSS], iterations: int
+               ) -> list[tuple[StateErrors, Descent, dict[str, Any]]]:
+    """Descend from known models with all functions, where their runs stay finite."""
+    pace, found = PACE["long" if errors.data.n_samples > STAGES[0] else "short"], []
+    for i, model in enumerate(known, start=1):
+        if (x := entered(errors, model)) is not None:
+            found.append((errors, descend(errors, x, iterations=iterations, progress=pace, start=f"start {i}"), {}))
+    return [one for one in found if np.isfinite(one[1].value)]
 
 
 def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rng: np.random.Generator,
@@ -197,7 +213,8 @@ def _renewed(errors: StateErrors, x: Array, cells: int = 1) -> tuple[StateErrors
     return errors, errors.normalised(errors.unknowns.pack(point))
 
 
-def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[Latent, ...], iterations: int = 60
+def add_output_functions(errors: StateErrors, best: Descent, known: Sequence[HammersteinSS],
+                         functions: tuple[Latent, ...], iterations: int = 60
                          ) -> tuple[StateErrors, Descent, dict[str, Any]]:
     """Make every output a function of the former output z_o: y_o = h_o(z_o) + constant.
 
@@ -219,7 +236,9 @@ def add_output_functions(errors: StateErrors, best: Descent, functions: tuple[La
     unknowns = replace(errors.unknowns, linear_output=False, feedthrough=(False,) * len(errors.unknowns.feedthrough))
     errors = _widened(replace(errors, unknowns=unknowns), functions)
     start = _with(replace(point, offset=np.array(offsets)), np.array(rows), tuple(cs), Ez, Fz)
-    found = descend(errors, errors.unknowns.pack(start), iterations=iterations, start=best.start)
+    ends = [descend(errors, errors.unknowns.pack(start), iterations=iterations, start=best.start)]
+    ends += [end for _, end, _ in _continued(errors, known, iterations)]
+    found = min(ends, key=lambda end: end.value)
     return errors, replace(found, steps=best.steps + found.steps), _idle(linear, best.x, errors, found)
 
 
@@ -249,8 +268,12 @@ def whitened(errors: StateErrors, x: Array) -> Array:
 
 
 def first_samples(data: Data, size: int) -> Data:
-    """Return the first samples of a long record; several experiments stay as they are."""
-    return data if data.n_samples <= size or data.n_experiments > 1 else data.window(0, size)
+    """Return a long record cut to so many samples, the first of every experiment in proportion to its length."""
+    share = size / data.n_samples
+    if share >= 1:
+        return data
+    lengths = [min(max(round(share * e.n_samples), FEWEST), e.n_samples) for e in data.experiments]
+    return Data.join(*(data.select(experiments=i).window(0, n) for i, n in enumerate(lengths)))
 
 
 def _finite(errors: StateErrors, start: Array) -> Array:

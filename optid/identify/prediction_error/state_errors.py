@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from optid.arrays import Array
-from optid.bases import Linear
+from optid.bases import Basis, Linear
 from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.identify.prediction_error.descent import Criterion
@@ -30,6 +30,7 @@ STABLE = 1 - 1e-9
 HUGE = 1e250  # sum of squared sensitivities beyond which a run counts as one that leaves its range
 NUMBERS = 500_000  # entries of the sensitivities formed at a time
 WILD = 10.0  # times the range of the record that the run of an iterate must not leave
+ROUNDING = 1e-9  # share of an interval within which its ends are the same
 FLOOR = 1e-7  # smallest standard deviation of an error that weights may rest on, as a share of that of its output
 
 
@@ -202,9 +203,9 @@ class StateErrors(Criterion):
                                  f"{unknowns.n}, {x.m} and {x.l}")
         pairs = [(f.basis, basis) for f, basis in zip(model.nonlinearities, x.inputs)]
         pairs += [(g.basis, family.basis) for g, family in zip(model.feedback, x.feedback)]
-        same = [one.to_dict() == other.to_dict() or isinstance(one, Linear) and isinstance(other, Linear)
-                for one, other in pairs]
-        if not all(same) or len(model.feedback) > len(x.feedback):
+        pairs += [(h.basis, one.basis) for h, one in zip(model.latent, unknowns.latent)]
+        if not all(_same(one, other) for one, other in pairs) or len(model.feedback) > len(x.feedback) or (
+                len(model.latent) != len(unknowns.latent)):
             raise StructureError("a start has other basis functions than the fit: give it the same bases")
         mus = [np.ones(1) if not free else f.mu for f, free in zip(model.nonlinearities, unknowns.free)]
         scale = [1.0 if free else float(f.mu[0]) for f, free in zip(model.nonlinearities, unknowns.free)]
@@ -229,6 +230,15 @@ class StateErrors(Criterion):
         cs = tuple(np.linalg.lstsq(one.vectors, h.mu)[0] for one, h in zip(unknowns.latent, model.latent))
         return StatePoint(A, np.array(model.C), gain, offset, tuple(mus), b, d, tuple(nus), columns, x0, cs,
                           model.Ez + injection @ model.Fz, model.Fz, model.Cz, model.Dz, model.offset_z)
+
+
+def _same(one: Basis, other: Basis) -> bool:
+    """Whether two bases have the same functions, up to the rounding of their intervals by a change of units."""
+    if isinstance(one, Linear) and isinstance(other, Linear):
+        return True
+    ends, others = (np.array(basis.interval or (np.nan, np.nan)) for basis in (one, other))
+    near = bool(np.allclose(ends, others, rtol=0, atol=ROUNDING * max(np.ptp(ends), 1e-300), equal_nan=True))
+    return near and one.to_dict() | {"interval": None} == other.to_dict() | {"interval": None}
 
 
 def _weighted(block: Array, covariance: Array) -> Array:

@@ -18,10 +18,11 @@ from optid.identify.search.trial import Candidate
 
 EFFORTS = {"small": 15.0, "normal": 60.0, "large": 400.0}
 """Units of a search, by word."""
+CONTINUED = 0.25  # cost of a fit that goes on from another instead of searching for functions of latent signals
 LEAST = 0.01  # units of the shortest fit
 SAMPLES = 3000  # of a record that costs twice as much as a short one
 RATES = {"arx": 5e-5, "armax": 1e-3, "bj": 3e-3, "oe": 3e-3, "sid": 2.5e-4, "ss": 2.5e-3, "hammerstein": 1.5e-3,
-         "latent": 6e-3}
+         "wiener": 1e-3, "latent": 1e-2}
 """Units of a fit to a short record, over the number of parameters to the power of 1.5."""
 
 
@@ -36,10 +37,11 @@ def effort_of(given: Any) -> float:
     return float(value)
 
 
-def units(candidate: Candidate, data: Data) -> float:
-    """Return what one fit of a candidate to a record costs."""
-    size = parameters(candidate.arguments, data.m, data.l)
-    return LEAST + RATES[_rate(candidate.formulation)] * size**1.5 * (1 + data.n_samples / SAMPLES)
+def units(candidate: Candidate, data: Data, fits: int = 1) -> float:
+    """Return what so many fits of a candidate cost: one to a record, and others without a block of it."""
+    size, rate = parameters(candidate.arguments, data.m, data.l), _rate(candidate.formulation)
+    one = LEAST + RATES[rate] * size**1.5 * (1 + data.n_samples / SAMPLES)
+    return one * (fits if rate != "latent" or not fits else 1 + CONTINUED * (fits - 1))
 
 
 def parameters(arguments: Mapping[str, Any], m: int, l: int) -> int:  # noqa: E741 - the field's letter for outputs
@@ -64,8 +66,10 @@ def _rate(formulation: str) -> str:
     name = formulation.partition(".")[0]
     if formulation.endswith(".sid"):
         return "sid"
-    if name in ("lfr", "wiener_ss", "hammerstein_wiener_ss"):
+    if name == "lfr":
         return "latent"
+    if name.endswith("wiener_ss"):
+        return "wiener"
     if name in ("arx", "hammerstein_arx"):
         return "arx"
     return {"armax": "armax", "hammerstein_armax": "armax", "bj": "bj", "hammerstein_bj": "bj", "oe": "oe",

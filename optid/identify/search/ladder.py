@@ -17,21 +17,15 @@ from optid.identify.blocks import Blocks
 from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.levels import LevelEvidence, level_evidence
-from optid.identify.search.trial import Candidate, Trial
+from optid.identify.search.trial import CLEAR, FEEDBACK, INPUTS, KINDS, LATENT, LINEAR, Candidate, Trial, near
 
 Rung = Generator[list[Candidate], list[Trial], None]
 
-LINEAR, INPUTS, FEEDBACK, LATENT = KINDS = ("linear", "input functions", "feedback", "latent signals")
-"""Classes of models, each richer than those before."""
 ONE_LEVEL = ("hammerstein_ss.sid", "lfr.exact")  # formulations with one constant for all experiments
 PATIENCE = 2  # successive orders without improvement after which a rung ends
 LARGEST, MOST_LATENT = 10, 8  # largest number of states, and that beside functions of latent signals
-RISE = 0.95  # ratio of the errors on the record above which one more latent signal has not helped
+RISE = 0.95  # ratio of the errors on the record above which one more latent signal or state has not helped
 FEW_LEVELS = 5  # levels of an input up to which a static function is not identifiable between them
-CLEAR = 0.2  # median over the blocks of the log ratio of error energies that a richer class must save
-EQUAL = 0.02
-"""Relative difference of errors within which structures of a class count as equal: the smaller one is chosen."""
-SMALL, SMALLER = 0.1, 0.2  # points of fit within which they do, too, where that is no larger share of the error
 FEW_MOVES = 8
 """Moves of an input below which order and dead time are chosen by the likelihood: blocks without moves say little."""
 FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
@@ -100,8 +94,7 @@ class Ladder:
         found = [t for t in self.trials.values() if t.candidate.kind == kind and np.isfinite(t.score)
                  and (not formulations or t.candidate.formulation in formulations)]
         most = max((t.score for t in found), default=0.0)
-        near = max(EQUAL * (100 - most), min(SMALL, SMALLER * (100 - most)))
-        return min((t for t in found if t.score >= most - near), key=lambda t: (t.parameters, -t.score), default=None)
+        return min((t for t in found if t.score >= most - near(most)), key=lambda t: (t.parameters, -t.score), default=None)
 
     def choice(self) -> Trial | None:
         """Return the choice so far: a richer class must be clearly better."""
@@ -144,13 +137,14 @@ def bases(data: Data, word: str) -> Any:
 
 
 def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
-    """Try one batch after another until two in a row bring no improvement."""
-    best, failed = -np.inf, 0
+    """Try one batch after another until two in a row bring no improvement: of the score, or without one of the fit."""
+    best, failed = (False, -np.inf), 0
     for batch in candidates:
         found = yield batch
-        score = max((t.score for t in found), default=-np.inf)
-        failed = 0 if score > best + FINEST * (100 - max(best, 0.0)) or not np.isfinite(best) else failed + 1
-        best = max(best, score)
+        reached = max(((t.complete, t.score if t.complete else t.estimation) for t in found), default=(False, -np.inf))
+        least = (FINEST if reached[0] else 1 - RISE) * (100 - max(best[1], 0.0))
+        rises = reached[0] > best[0] or reached > best and not reached[1] <= best[1] + least
+        best, failed = max(best, reached), 0 if rises else failed + 1
         if failed >= PATIENCE:
             return
 
@@ -283,6 +277,10 @@ def latent_signals(ladder: Ladder) -> Rung:
     yield [structure(LATENT, "wiener_ss.exact", nx=k, output_basis="polynomial:3") for k in orders]
     yield [structure(LATENT, "hammerstein_wiener_ss.exact", nx=k, basis=basis, output_basis="polynomial:3")
            for k in orders for basis in (inner[1:] or [bases(ladder.data, "polynomial:3")])]
+    for formulation in ("wiener_ss.exact", "hammerstein_wiener_ss.exact"):
+        if a := ladder.arguments(LATENT, formulation):
+            yield [structure(LATENT, formulation, **{**a, "output_basis": word})
+                   for word in ("polynomial:5", "bspline:4", "bspline:8")]
     yield [model(k, 1, "polynomial:3", direct) for k in orders for direct in (False, True)]
     if not (a := ladder.arguments(LATENT, "lfr.exact")):
         return

@@ -19,7 +19,10 @@ from optid.identify.blocks import Blocks, stretches
 from optid.identify.fitting import Fit, fit
 from optid.identify.search.effort import effort_of, units
 from optid.identify.search.kept import KeptTrials
-from optid.identify.search.ladder import (
+from optid.identify.search.ladder import RUNGS, Ladder, few_levels
+from optid.identify.search.pool import Pool
+from optid.identify.search.trial import (
+    ASKED,
     CLEAR,
     EQUAL,
     FEEDBACK,
@@ -27,12 +30,12 @@ from optid.identify.search.ladder import (
     KINDS,
     LATENT,
     LINEAR,
-    RUNGS,
-    Ladder,
-    few_levels,
+    OUT_OF_TIME,
+    Candidate,
+    Trial,
+    spared,
+    tried,
 )
-from optid.identify.search.pool import Pool
-from optid.identify.search.trial import OUT_OF_TIME, Candidate, Trial, spared, tried
 from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
 from optid.progress import Meter
@@ -249,7 +252,7 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, mos
     """Try candidates of a class against its best so far, and put their trials down in the order of the batch."""
     rival, tasks = ladder.rival(kind), []
     for candidate in batch:
-        price = (1 + ladder.folds) * units(candidate, ladder.data)
+        price = units(candidate, ladder.data, 1 + ladder.folds)
         if rival is not None and price > LARGEST_SHARE * most:
             ladder.trials[candidate.key] = Trial(candidate, reason=f"it costs {price:.0f} units, more than "
                                                                    f"{100 * LARGEST_SHARE:.0f} % of the effort")
@@ -258,7 +261,7 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, mos
     for candidate, trial in zip(tasks, run(tasks, rival)):
         ladder.trials.pop(candidate.key, None)
         ladder.trials[candidate.key] = trial or Trial(candidate, reason=OUT_OF_TIME)
-        ladder.spent[kind] += (trial.fits if trial else 0) * units(candidate, ladder.data)
+        ladder.spent[kind] += units(candidate, ladder.data, trial.fits) if trial else 0.0
 
 
 def _run(pool: Pool, kept: KeptTrials, left: Callable[[], float], told: Callable[[Trial], None],
@@ -302,7 +305,7 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial], open_kinds: Sequence[str]
             found.append(f"{sentence}: selected")
             current = trial
         elif trial.score > current.score and current.gain(trial) > 0:
-            found.append(f"{sentence}; at least {100 * (1 - np.exp(-CLEAR)):.0f} % less is asked for: not selected")
+            found.append(f"{sentence}; at least {ASKED} less is asked for: not selected")
         else:
             found.append(f"{sentence}: not selected")
     for kind in KINDS:

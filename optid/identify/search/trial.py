@@ -9,16 +9,28 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
+from optid.bases import feedback_bases, fitted_bases
+from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError
 from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.fitting import fit
 from optid.identify.search.cpu_limit import OutOfTime, cpu_limit
 from optid.models.functions import free_parameters
 
+LINEAR, INPUTS, FEEDBACK, LATENT = KINDS = ("linear", "input functions", "feedback", "latent signals")
+"""Classes of models, each richer than those before."""
+CLEAR = 0.2  # median over the blocks of the log ratio of error energies that a richer class must save
+ASKED = f"{100 * (1 - np.exp(-CLEAR)):.0f} %"  # the same as a share of the energy
+EQUAL = 0.02
+"""Relative difference of errors within which structures of a class count as equal: the smaller one is chosen."""
+SMALL, SMALLER = 0.1, 0.2  # points of fit within which they do, too, where that is no larger share of the error
 WORSE = 1.3
 """Ratio of its error energy on the first half of the blocks to that of the best, above which a structure is dropped."""
 STARTS = 3  # starts of output-error models in a trial
 OPTIONS = {"constraints": "constraint"}  # options of the command line by arguments with another name
+LATENT_FITS = ("lfr.exact", "wiener_ss.exact", "hammerstein_wiener_ss.exact")
+STATE_FITS = ("ss.exact", "hammerstein_ss.exact", *LATENT_FITS)  # formulations that can begin with a model
+SUSPECT = 4.0  # ratio of the errors on a block to those of the whole fit above which a fit without it is repeated
 STEPS = 30  # iterations of state-space models in a trial
 OUT_OF_TIME = "out of time"
 
@@ -125,18 +137,18 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     given up.
     """
     clock, found, fits = time.process_time(), Trial(candidate), 0
-    arguments = {**candidate.under(constraints), **spared(candidate)}
 
-    def fitted(data: Any) -> Any:
+    def fitted(data: Any, **more: Any) -> Any:
         nonlocal fits
         if time.process_time() - clock > seconds:  # where nothing interrupts a fit
             raise OutOfTime
         fits += 1
-        return fit(data, candidate.formulation, prove=False, **settings, **arguments)
+        return fit(data, candidate.formulation, prove=False, **settings, **{**arguments, **more})
 
     try:
         with cpu_limit(seconds), warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the fit that is chosen tells them
+            arguments = {**candidate.under(constraints), **spared(candidate), **_bases(candidate, blocks.data)}
             for known in _steps(found, fitted, blocks, rival, horizon):
                 found = known
                 if known.reason:
@@ -148,19 +160,31 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     return replace(found, fits=fits, seconds=time.process_time() - clock)
 
 
-def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Trial | None, horizon: int | None
+def _bases(candidate: Candidate, data: Data) -> dict[str, Any]:
+    """Return the bases of a candidate on the ranges of the whole record, which a block left out may narrow."""
+    found: dict[str, Any] = {}
+    if "basis" in candidate.arguments:
+        found["basis"] = list(fitted_bases(data, candidate.arguments["basis"]))
+    if "feedback_basis" in candidate.arguments:
+        found["feedback_basis"] = feedback_bases(data, candidate.arguments["feedback_basis"])
+    return found
+
+
+def _steps(known: Trial, fitted: Callable[..., Any], blocks: Blocks, rival: Trial | None, horizon: int | None
            ) -> Iterator[Trial]:
     """Yield what is known after the fit to the whole record, and after every block."""
     whole = fitted(blocks.data)
+    errors = [blocks.errors(whole.model, b, horizon) for b in range(len(blocks))]
+    energies, measures = map(np.array, zip(*errors))
     known = replace(known, status=whole.solution.status.value, parameters=free_parameters(whole.model),
-                    estimation=blocks.fit(whole.model, horizon))
-    if rival is not None and known.estimation < rival.score:
-        yield replace(known, reason="its fit of the estimation data is below the cross-validated fit of the best")
+                    estimation=pooled_fit(energies, measures))
+    if rival is not None and (refusal := _no_better(known.candidate, energies, measures, rival)):
+        yield replace(known, reason=refusal)
     order = (*blocks.moving[::2], *blocks.moving[1::2])  # every other one first
     known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
     for done, b in enumerate(order, start=1):
         try:
-            energy, measure = blocks.errors(fitted(blocks.without(b)).model, b, horizon)
+            energy, measure = _left_out(known.candidate, fitted, blocks, b, horizon, whole.model, energies[b])
         except (RankError, DataError):  # what is left of the record does not determine the structure
             continue
         known = replace(known, energy=np.vstack([known.energy, energy]), measure=np.vstack([known.measure, measure]),
@@ -174,6 +198,41 @@ def _steps(known: Trial, fitted: Callable[[Any], Any], blocks: Blocks, rival: Tr
     yield known
 
 
+def _no_better(candidate: Candidate, energies: Array, measures: Array, rival: Trial) -> str:
+    """Return why a model of the whole record, by its errors on the blocks (b, l), cannot replace a rival; "" if it can.
+
+    The errors on a block are seldom smaller where the block is left out.
+    """
+    if pooled_fit(energies, measures) < rival.score - near(rival.score):
+        return "its fit of the estimation data is below the cross-validated fit of the best"
+    richer = KINDS.index(candidate.kind) > KINDS.index(rival.candidate.kind)
+    here = list(rival.order)
+    gain = rival.gain(Trial(candidate, energy=energies[here], measure=measures[here], order=rival.order))
+    if richer and here and gain <= CLEAR:
+        return (f"it follows the record with {100 * (1 - np.exp(-max(gain, 0.0))):.0f} % less error energy than the "
+                f"best {rival.candidate.kind} model is predicted to, in the median block; {ASKED} is asked for")
+    return ""
+
+
+def _left_out(candidate: Candidate, fitted: Callable[..., Any], blocks: Blocks, block: int, horizon: int | None,
+              whole: Any, reached: Array) -> tuple[Array, Array]:
+    """Return the errors on a block of the model of all others, which descends from that of the whole record.
+
+    Functions of latent signals have many optima: where the block is much worse than in the fit to the whole record,
+    they are searched for in the others alone, too, and the model that is better on these counts.
+    """
+    data, latent = blocks.without(block), candidate.formulation in LATENT_FITS
+    if candidate.formulation not in STATE_FITS:
+        return blocks.errors(fitted(data).model, block, horizon)
+    found = fitted(data, initial=whole, **({"tries": 0} if candidate.formulation == "lfr.exact" else {}))
+    errors = blocks.errors(found.model, block, horizon)
+    if latent and not np.sum(errors[0]) <= SUSPECT * np.sum(reached):
+        again = fitted(data)
+        if again.solution.objective < found.solution.objective:
+            return blocks.errors(again.model, block, horizon)
+    return errors
+
+
 def _on(trial: Trial, blocks: Sequence[int]) -> float:
     """Return the error energy of a trial on some blocks, over what it is measured by."""
     places = [trial.order.index(one) for one in blocks]
@@ -181,11 +240,16 @@ def _on(trial: Trial, blocks: Sequence[int]) -> float:
     return float(np.sum(energy.sum(axis=0) / np.maximum(measure.sum(axis=0), 1e-300)))
 
 
+def near(score: float) -> float:
+    """Return how far below a score in % another one counts as equal."""
+    return max(EQUAL * (100 - score), min(SMALL, SMALLER * (100 - score)))
+
+
 def spared(candidate: Candidate) -> dict[str, Any]:
     """Return the arguments that make a trial faster than the final fit."""
     if candidate.formulation.endswith("oe.exact"):
         return {"starts": STARTS}
-    if candidate.formulation in ("ss.exact", "hammerstein_ss.exact", "lfr.exact"):
+    if candidate.formulation in STATE_FITS:
         once = {"tries": 1} if candidate.formulation == "lfr.exact" else {}
         return {"iterations": STEPS, "block_rows": max(10, 2 * candidate.arguments["nx"] + 4), **once}
     return {}
