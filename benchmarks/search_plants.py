@@ -34,7 +34,7 @@ class Record:
     classes: tuple[str, ...]
 
     def error(self, model: object) -> float:
-        """Return the RMS error of a free run from a fitted state over the deviation of the output; of the worst output."""
+        """Return the RMS error of a free run over the deviation of the output, of the worst output."""
         run = np.asarray(model.simulate(self.test, x0="fit")).reshape(self.clean.shape)  # type: ignore[attr-defined]
         off = np.sqrt(np.mean((run - self.clean) ** 2, axis=0))
         return float(np.max(off / np.std(self.clean, axis=0)))

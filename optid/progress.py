@@ -58,7 +58,7 @@ class Meter:
 
     def __call__(self, sentence: str) -> None:
         """Say what was done last."""
-        log.info("%s: %s", self.what, sentence)
+        log.debug("%s: %s", self.what, sentence)
         if self._bar is not None:
             self._bar.update(self._task, completed=self.done(),
                              description=f"{self.what}: {sentence.partition(', ')[2][:50]}")

@@ -16,7 +16,7 @@ from optid.identify.informativity import Informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
 from optid.identify.search import search as searching
-from optid.identify.search.ladder import RUNGS, Ladder
+from optid.identify.search.ladder import RUNGS, Ladder, bases
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import CLEAR, INPUTS, KINDS, LATENT, LINEAR, Candidate, Trial, free_parameters, tried
 from optid.models.layout import Layout
@@ -344,14 +344,27 @@ def test_constraints_hold_for_what_is_chosen(short):
     assert found.model.nonlinearities[0].basis.size > 1
 
 
-def test_inputs_of_few_levels_allow_linear_models_only(short):
+def test_inputs_of_two_levels_allow_no_functions_of_them(short):
     rng = np.random.default_rng(3)
     u = np.sign(rng.normal(size=300))
     y = np.convolve(u, 0.8 ** np.arange(40))[:300] + 0.1 * rng.normal(size=300)
-    found = identify(optid.Data(u, y), workers=1)
-    assert {t.candidate.kind for t in found.trials} == {LINEAR} and "five levels" in found.reasons[-1]
+    found = identify(optid.Data(u, y), classes=KINDS[:3], workers=1)
+    assert INPUTS not in {t.candidate.kind for t in found.trials} and "two levels" in found.reasons[-1]
     with pytest.raises(StructureError, match="add 'linear'"):
         identify(optid.Data(u, y), classes=[INPUTS])
+
+
+@pytest.mark.filterwarnings("ignore:too few levels")
+def test_a_basis_has_no_more_functions_than_the_samples_determine():
+    rng = np.random.default_rng(0)
+    three, gap = rng.choice([-1.0, 0.2, 1.0], 500), np.concatenate([rng.uniform(0, 1, 250), rng.uniform(5, 6, 250)])
+    smooth, one = rng.normal(size=500), rng.choice([0.0, 1.0], 500)
+    data = optid.Data(np.column_stack([three, gap, smooth, one]), rng.normal(size=500))
+    assert bases(data, "polynomial:3") == ["polynomial:2", "polynomial:3", "polynomial:3", "linear"]
+    words = bases(data, "triangular:10")
+    assert words[0] in ("triangular:2", "linear") and words[3] == "linear" and words[1] != "triangular:10"
+    fit = optid.fit(data, "hammerstein_oe.exact", na=1, nb=1, basis=words, prove=False)  # no cell is empty
+    assert fit.solution.status.value == "locally optimal"
 
 
 @pytest.mark.usefixtures("short")

@@ -1,7 +1,8 @@
 """The structures that a search tries, class by class, from the simple to the rich.
 
 Every rung is a generator: it yields independent candidates together and receives their trials, so that it increases
-orders only as long as the fit improves. Later rungs start from the best structures of earlier ones.
+orders only as long as the fit improves, and of nonlinear structures only where one may be chosen. Later rungs start
+from the best structures of earlier ones.
 """
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -11,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from optid.arrays import Array
+from optid.bases import parse
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
@@ -25,7 +28,8 @@ ONE_LEVEL = ("hammerstein_ss.sid", "lfr.exact")  # formulations with one constan
 PATIENCE = 2  # successive orders without improvement after which a rung ends
 LARGEST, MOST_LATENT = 10, 8  # largest number of states, and that beside functions of latent signals
 RISE = 0.95  # ratio of the errors on the record above which one more latent signal or state has not helped
-FEW_LEVELS = 5  # levels of an input up to which a static function is not identifiable between them
+LINE = "linear"  # the basis of one function
+FEWEST = 0.3  # samples that must determine every function of a basis: the largest of a record determines the end
 FEW_MOVES = 8
 """Moves of an input below which order and dead time are chosen by the likelihood: blocks without moves say little."""
 FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
@@ -94,7 +98,8 @@ class Ladder:
         found = [t for t in self.trials.values() if t.candidate.kind == kind and np.isfinite(t.score)
                  and (not formulations or t.candidate.formulation in formulations)]
         most = max((t.score for t in found), default=0.0)
-        return min((t for t in found if t.score >= most - near(most)), key=lambda t: (t.parameters, -t.score), default=None)
+        equal = [t for t in found if t.score >= most - near(most)]
+        return min(equal, key=lambda t: (t.parameters, -t.score), default=None)
 
     def choice(self) -> Trial | None:
         """Return the choice so far: a richer class must be clearly better."""
@@ -115,6 +120,10 @@ class Ladder:
                  and (not formulations or t.candidate.formulation in formulations)]
         return self.best(kind, *formulations) or max(found, key=lambda t: t.estimation, default=None)
 
+    def promising(self, kind: str, *formulations: str) -> bool:
+        """Whether a structure of a class, or of formulations of it, came through cross-validation."""
+        return self.best(kind, *formulations) is not None
+
     def arguments(self, kind: str, *formulations: str) -> Mapping[str, Any]:
         """Return the arguments of the leading structure of a class, or of formulations of it; none without any."""
         leading = self.leading(kind, *formulations)
@@ -125,15 +134,31 @@ class Ladder:
         return int(self.arguments(LINEAR, "ss.exact", "hammerstein_ss.sid").get("nx", 2))
 
 
-def few_levels(data: Data) -> bool:
-    """Whether no input has more than a few levels: only linear models are tried then."""
-    return all(_levels(data, c) <= FEW_LEVELS for c in range(data.m))
+def binary(data: Data) -> bool:
+    """Whether no input has more than two levels, between which static functions cannot be told apart."""
+    return all(np.unique(_sorted(data, c)).size <= 2 for c in range(data.m))
 
 
 def bases(data: Data, word: str) -> Any:
-    """Return a basis for all inputs; straight lines for those of few levels."""
-    found = [word if _levels(data, c) > FEW_LEVELS else "linear" for c in range(data.m)]
-    return word if len(set(found)) == 1 else found
+    """Return a basis for all inputs, with as many functions as the samples of each determine."""
+    found = [_determined(word, _sorted(data, c)) for c in range(data.m)]
+    return found[0] if len(set(found)) == 1 else found
+
+
+def _determined(word: str, u: Array) -> str:
+    """Return a basis, or the largest of its family that sorted samples u (N,) determine; else a straight line.
+
+    Every combination of its functions must vary over the samples as much as one does that is one at `FEWEST` of them.
+    """
+    family, _, size = word.partition(":")
+    if np.unique(u).size <= 2:
+        return LINE
+    for count in range(int(size), 1, -1):
+        basis = parse(f"{family}:{count}").fitted(u[0], u[-1])
+        values = basis.values(u)
+        if np.linalg.svd(values - values.mean(axis=0), compute_uv=False)[-1] ** 2 >= FEWEST:
+            return f"{family}:{count}"
+    return LINE
 
 
 def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
@@ -232,7 +257,8 @@ def input_functions(ladder: Ladder) -> Rung:
     yield [model(k, nk, word) for k in dict.fromkeys([min(int(a["na"]), 3), 2]) for nk in delays for word in words]
     if not (a := ladder.arguments(INPUTS)):
         return
-    yield from climbed([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
+    if ladder.promising(INPUTS):
+        yield from climbed([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
     a = ladder.arguments(INPUTS)
     yield [model(a["na"], a["nk"], bases(ladder.data, word))
            for word in ("polynomial:2", "polynomial:5", "triangular:4", "triangular:10")]
@@ -251,8 +277,9 @@ def feedback(ladder: Ladder) -> Rung:
     yield [model(nx=a["nx"], basis=a["basis"], feedback_basis=word)
            for word in ("polynomial:2", "polynomial:4", "triangular:6")]
     a = ladder.arguments(FEEDBACK)
-    yield from climbed([model(nx=n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
-                       for n in range(a["nx"] + 1, 7))
+    if ladder.promising(FEEDBACK):
+        yield from climbed([model(nx=n, basis=a["basis"], feedback_basis=a["feedback_basis"])]
+                           for n in range(a["nx"] + 1, 7))
 
 
 def _inner(ladder: Ladder) -> list[Any]:
@@ -296,8 +323,9 @@ def latent_signals(ladder: Ladder) -> Rung:
            *(model(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:5", "bspline:4")),
            *(model(a["nx"], a["channels"], a["latent_basis"], a["direct"], basis) for basis in inner[1:])]
     a = ladder.arguments(LATENT, "lfr.exact")
-    yield from climbed([model(n, a["channels"], a["latent_basis"], a["direct"], a.get("basis", "linear"))]
-                       for n in range(a["nx"] + 1, MOST_LATENT + 1))
+    if ladder.promising(LATENT, "lfr.exact"):
+        yield from climbed([model(n, a["channels"], a["latent_basis"], a["direct"], a.get("basis", "linear"))]
+                           for n in range(a["nx"] + 1, MOST_LATENT + 1))
 
 
 RUNGS: dict[str, Callable[[Ladder], Rung]] = {
@@ -316,6 +344,7 @@ def _levels_of(data: Data, nk: tuple[int, ...]) -> LevelEvidence | None:
         return None
 
 
-def _levels(data: Data, c: int) -> int:
+def _sorted(data: Data, c: int) -> Array:
+    """Return the samples of an input in the order of their size, but those that are missing."""
     u = np.concatenate([e.u[:, c] for e in data.experiments])
-    return np.unique(u[np.isfinite(u)]).size
+    return np.sort(u[np.isfinite(u)])

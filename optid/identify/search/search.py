@@ -19,7 +19,7 @@ from optid.identify.blocks import Blocks, stretches
 from optid.identify.fitting import Fit, fit
 from optid.identify.search.effort import effort_of, units
 from optid.identify.search.kept import KeptTrials
-from optid.identify.search.ladder import RUNGS, Ladder, few_levels
+from optid.identify.search.ladder import RUNGS, Ladder, binary
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import (
     ASKED,
@@ -38,7 +38,7 @@ from optid.identify.search.trial import (
 )
 from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
-from optid.progress import Meter
+from optid.progress import Meter, log
 from optid.registry import Rendered, named_constraint
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
@@ -120,7 +120,8 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         workers: number of processes; constraints must then be importable. None for one per available processor, or one
             alone if something cannot be sent to others (see ``reasons``).
         trials: file in which finished trials are kept; a search that was stopped goes on from there.
-        progress: called with a sentence after every trial; default the log "optid" and a progress bar on a terminal.
+        progress: called with a sentence after every trial; default a progress bar on a terminal, and a line for every
+            class in the log "optid" (every trial at level DEBUG).
 
     Raises:
         DataError: the record is not in memory; the file of `trials` belongs to another search.
@@ -170,6 +171,8 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         try:
             run = partial(_run, pool, kept, left, partial(_told, ladder, told, most))
             stopped, unfinished = _climb(ladder, possible, run, most, left)
+            for kind in possible:
+                log.info("search: %s", _summary(ladder, kind))
             if stopped == BUDGET:
                 stopped = f"the budget of {budget:g} CPU s"
         except KeyboardInterrupt:
@@ -197,22 +200,20 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
 
 def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
     """Yield the classes that the record cannot tell from others, with the reason."""
+    kinds, reason = KINDS[1:], ""
     if ladder.told.reason:
         reason = "nothing can be identified from this record: only the simplest model was fitted"
     elif ladder.few_moves:
         moves = ladder.told.moves
         reason = (f"an input moves {'once' if moves == 1 else f'{moves} times'}: only linear models can be "
                   "distinguished, order and dead time were chosen by the Bayesian information criterion")
-    elif few_levels(ladder.data):
-        reason = ("no input has more than five levels: static functions cannot be distinguished from straight lines, "
-                  "and only linear models can be compared")
     elif not ladder.open:
+        kinds = (FEEDBACK, LATENT)
         reason = "closed loop: only models with a noise model were compared, one sample ahead"
-        yield from ((kind, reason) for kind in (FEEDBACK, LATENT))
-        return
-    else:
-        return
-    yield from ((kind, reason) for kind in KINDS if kind != LINEAR)
+    if reason:
+        yield from ((kind, reason) for kind in kinds)
+    if not (reason and INPUTS in kinds) and binary(ladder.data):
+        yield INPUTS, "no input has more than two levels: static functions of the inputs are straight lines"
 
 
 def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: Callable[[], float]
@@ -308,14 +309,16 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial], open_kinds: Sequence[str]
             found.append(f"{sentence}; at least {ASKED} less is asked for: not selected")
         else:
             found.append(f"{sentence}: not selected")
-    for kind in KINDS:
-        several = [t for t in ladder.trials.values() if t.candidate.kind == kind]
+    tried_of = {kind: [t for t in ladder.trials.values() if t.candidate.kind == kind] for kind in KINDS}
+    for kind, several in tried_of.items():
         if kind not in best and several:
-            found.append(f"{kind}: none of {len(several)} structures was as good as what is chosen "
-                         f"(first: {several[0].reason})")
-        if kind in open_kinds:
-            found.append(f"{kind}: {f'ended after {len(several)} structures' if several else 'not reached'}; "
-                         "a larger effort goes on")
+            nearest = max(several, key=lambda t: t.estimation)
+            found.append(f"{kind}: none of {len(several)} structures could be better than what is chosen; of the one "
+                         f"that fits best, {nearest.candidate.formulation} {nearest.candidate.words}: {nearest.reason}")
+    if open_kinds:
+        parts = [f"{kind} {f'ended after {len(tried_of[kind])} structures' if tried_of[kind] else 'not reached'}"
+                 for kind in KINDS if kind in open_kinds]
+        found.append(f"{', '.join(parts)}: a larger effort goes on")
     return found
 
 
@@ -344,6 +347,13 @@ def _told(ladder: Ladder, progress: Callable[[str], None], most: float, trial: T
     outcome = f"{trial.score:.1f} %" if np.isfinite(trial.score) else trial.reason
     progress(f"{sum(ladder.spent.values()):.0f} of {most:g} units, {trial.candidate.kind}: "
              f"{trial.candidate.formulation} {trial.candidate.words}: {outcome}")
+
+
+def _summary(ladder: Ladder, kind: str) -> str:
+    """Say how many structures of a class were tried, how good the best was and what all cost."""
+    count, best = sum(t.candidate.kind == kind for t in ladder.trials.values()), ladder.best(kind)
+    reached = f"best {best.score:.1f} %" if best is not None else "none could be better"
+    return f"{kind}: {count} structures, {reached}, {ladder.spent[kind]:.1f} units"
 
 
 def _nothing(trials: Sequence[Trial]) -> Exception:

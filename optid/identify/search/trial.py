@@ -47,8 +47,8 @@ class Candidate:
 
     @property
     def key(self) -> Key:
-        """Its identity."""
-        return self.formulation, tuple(sorted((name, str(value)) for name, value in self.arguments.items()))
+        """Its identity; one value for all channels is the same as a list of equal ones."""
+        return self.formulation, tuple(sorted((name, str(_shared(value))) for name, value in self.arguments.items()))
 
     @property
     def words(self) -> str:
@@ -61,6 +61,11 @@ class Candidate:
         """Return its arguments with further constraints."""
         whole = (*self.arguments.get("constraints", ()), *constraints)
         return {**self.arguments, **({"constraints": whole} if whole else {})}
+
+
+def _shared(value: Any) -> Any:
+    """Return the one value of a list of equal ones, anything else as it is."""
+    return value[0] if isinstance(value, list | tuple) and value and all(one == value[0] for one in value) else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,6 +255,9 @@ def spared(candidate: Candidate) -> dict[str, Any]:
     if candidate.formulation.endswith("oe.exact"):
         return {"starts": STARTS}
     if candidate.formulation in STATE_FITS:
-        once = {"tries": 1} if candidate.formulation == "lfr.exact" else {}
+        once: dict[str, Any] = {"tries": 1} if candidate.formulation == "lfr.exact" else {}
+        if candidate.formulation in ("ss.exact", "hammerstein_ss.exact", "lfr.exact") and (
+                candidate.arguments.get("criterion") != "prediction"):
+            once["weighting"] = "scale"  # as the errors on the blocks are measured
         return {"iterations": STEPS, "block_rows": max(10, 2 * candidate.arguments["nx"] + 4), **once}
     return {}
