@@ -25,6 +25,7 @@ from optid.solving.solve import Evidence, Procedure
 ROUNDS = 10  # updates of the weights at most
 SAME_WEIGHT = 1e-4
 FINALISTS = 2
+SHARES = (1.0, 0.3, 0.1, 0.0)  # of the step to the initial states, which a nonlinear run may not bear
 RADII = (0.999, 0.98, 0.95, 0.9, 0.7, 0.4)  # spectral radii tried to make a start stable
 
 
@@ -102,8 +103,8 @@ def entered(errors: StateErrors, model: HammersteinSS) -> Array | None:
             continue
         if np.isfinite(at.value):
             p = errors.unknowns.shared
-            x[p:] += at.follow(np.zeros(p))
-            return x
+            step = np.concatenate([np.zeros(p), at.follow(np.zeros(p))])
+            return next(x + share * step for share in SHARES if not share or errors.value(x + share * step) < at.value)
     return None
 
 

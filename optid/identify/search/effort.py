@@ -21,8 +21,8 @@ EFFORTS = {"small": 15.0, "normal": 60.0, "large": 400.0}
 CONTINUED = 0.25  # cost of a fit that goes on from another instead of searching for functions of latent signals
 LEAST = 0.01  # units of the shortest fit
 SAMPLES = 3000  # of a record that costs twice as much as a short one
-RATES = {"arx": 5e-5, "armax": 1e-3, "bj": 3e-3, "oe": 3e-3, "sid": 2.5e-4, "ss": 2.5e-3, "hammerstein": 1.5e-3,
-         "wiener": 1e-3, "latent": 1e-2}
+RATES = {"arx": 5e-5, "armax": 1e-3, "bj": 3e-3, "oe": 5e-3, "sid": 2.5e-4, "ss": 2.5e-3, "hammerstein": 3e-3,
+         "wiener": 2e-3, "latent": 1e-2}
 """Units of a fit to a short record, over the number of parameters to the power of 1.5."""
 
 

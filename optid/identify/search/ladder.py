@@ -237,7 +237,7 @@ def input_functions(ladder: Ladder) -> Rung:
     words = [bases(ladder.data, word) for word in ("polynomial:3", "triangular:6")]
     if not ladder.single:
         states = partial(structure, INPUTS, "hammerstein_ss.exact")
-        yield [states(nx=k, basis=word) for k in dict.fromkeys([min(ladder.order(), 4), 2]) for word in words]
+        yield [states(nx=k, basis=word) for k in dict.fromkeys([ladder.order(), 2]) for word in words]
         if a := ladder.arguments(INPUTS):
             yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
         return
@@ -300,18 +300,13 @@ def latent_signals(ladder: Ladder) -> Rung:
                          **inner)
 
     order, inner = min(max(ladder.order(), 2), MOST_LATENT), _inner(ladder)
-    orders = list(dict.fromkeys([2, min(order, 4), order]))
-    yield [structure(LATENT, "wiener_ss.exact", nx=k, output_basis="polynomial:3") for k in orders]
-    yield [structure(LATENT, "hammerstein_wiener_ss.exact", nx=k, basis=basis, output_basis="polynomial:3")
-           for k in orders for basis in (inner[1:] or [bases(ladder.data, "polynomial:3")])]
-    for formulation in ("wiener_ss.exact", "hammerstein_wiener_ss.exact"):
-        if a := ladder.arguments(LATENT, formulation):
-            yield [structure(LATENT, formulation, **{**a, "output_basis": word})
-                   for word in ("polynomial:5", "bspline:4", "bspline:8")]
+    orders = list(dict.fromkeys([2, 4, order]))  # functions hide the order from linear models
+    yield from _output_functions(ladder, orders, inner[1:] or [bases(ladder.data, "polynomial:3")])
     yield [model(k, 1, "polynomial:3", direct) for k in orders for direct in (False, True)]
     if not (a := ladder.arguments(LATENT, "lfr.exact")):
         return
-    fit = ladder.leading(LATENT, "lfr.exact")
+    yield [model(a["nx"], 1, word, direct) for word in ("polynomial:5", "bspline:8") for direct in (False, True)]
+    a, fit = ladder.arguments(LATENT, "lfr.exact"), ladder.leading(LATENT, "lfr.exact")
     for channels in (2, 3):
         found = yield [model(a["nx"], channels, a["latent_basis"], direct) for direct in (False, True)]
         most = max(found, key=lambda t: t.estimation)
@@ -320,12 +315,27 @@ def latent_signals(ladder: Ladder) -> Rung:
         fit = most
     a = ladder.arguments(LATENT, "lfr.exact")
     yield [model(a["nx"] + 1, a["channels"], a["latent_basis"], a["direct"]),
-           *(model(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:5", "bspline:4")),
+           *(model(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:3", "polynomial:5", "bspline:4")),
            *(model(a["nx"], a["channels"], a["latent_basis"], a["direct"], basis) for basis in inner[1:])]
+    if not ladder.promising(LATENT, "lfr.exact"):
+        return
     a = ladder.arguments(LATENT, "lfr.exact")
-    if ladder.promising(LATENT, "lfr.exact"):
-        yield from climbed([model(n, a["channels"], a["latent_basis"], a["direct"], a.get("basis", "linear"))]
-                           for n in range(a["nx"] + 1, MOST_LATENT + 1))
+    yield from climbed([model(n, a["channels"], a["latent_basis"], a["direct"], a.get("basis", "linear"))]
+                       for n in range(a["nx"] + 1, MOST_LATENT + 1))
+    yield [structure(LATENT, "lfr.exact", **ladder.arguments(LATENT, "lfr.exact"), tries=2)]
+
+
+def _output_functions(ladder: Ladder, orders: Sequence[int], inner: Sequence[Any]) -> Rung:
+    """Functions of the outputs of linear or Hammerstein systems: first of the orders, then of the functions."""
+    for formulation, several in (("wiener_ss.exact", [{}]), ("hammerstein_wiener_ss.exact", [
+            {"basis": basis} for basis in inner])):
+        model = partial(structure, LATENT, formulation)
+        yield [model(nx=k, output_basis="polynomial:3", **given) for k in orders for given in several]
+        if a := ladder.arguments(LATENT, formulation):
+            yield [model(**{**a, "output_basis": word}) for word in ("polynomial:5", "bspline:4", "bspline:8")]
+        if ladder.promising(LATENT, formulation):
+            a = ladder.arguments(LATENT, formulation)
+            yield from climbed([model(**{**a, "nx": n})] for n in range(a["nx"] + 1, MOST_LATENT + 1))
 
 
 RUNGS: dict[str, Callable[[Ladder], Rung]] = {

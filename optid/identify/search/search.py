@@ -43,7 +43,7 @@ from optid.registry import Rendered, named_constraint
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
 Runs = Callable[[Sequence[Candidate], Trial | None], list[Trial | None]]
-COMPARED = 20_000  # samples of a long record on which structures are compared
+COMPARED = 8_000  # samples of a long record on which structures are compared
 FIRST = 0.25  # share of the effort that linear models have before the others begin
 LARGEST_SHARE = 0.25  # of the effort that one trial may take, after the first
 
@@ -339,7 +339,7 @@ def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, se
     found = fit(data, candidate.formulation, **settings, **arguments)
     if 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation):
         return found
-    return fit(data, candidate.formulation, **settings, **arguments, **spared(candidate))
+    return fit(data, candidate.formulation, **settings, **{**spared(candidate), **arguments})
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None], most: float, trial: Trial) -> None:

@@ -107,7 +107,7 @@ class Trial:
         """
         if not self.complete:
             return -np.inf
-        if not len(self.energy):  # no block could be left out
+        if not len(self.energy):  # the record has no blocks
             return self.estimation
         return min(pooled_fit(self.energy, self.measure), self.estimation)
 
@@ -153,7 +153,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     try:
         with cpu_limit(seconds), warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the fit that is chosen tells them
-            arguments = {**candidate.under(constraints), **spared(candidate), **_bases(candidate, blocks.data)}
+            arguments = {**spared(candidate), **candidate.under(constraints), **_bases(candidate, blocks.data)}
             for known in _steps(found, fitted, blocks, rival, horizon):
                 found = known
                 if known.reason:
@@ -185,12 +185,13 @@ def _steps(known: Trial, fitted: Callable[..., Any], blocks: Blocks, rival: Tria
                     estimation=pooled_fit(energies, measures))
     if rival is not None and (refusal := _no_better(known.candidate, energies, measures, rival)):
         yield replace(known, reason=refusal)
-    order = (*blocks.moving[::2], *blocks.moving[1::2])  # every other one first
+    order, refusal = (*blocks.moving[::2], *blocks.moving[1::2]), None  # every other one first
     known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
     for done, b in enumerate(order, start=1):
         try:
             energy, measure = _left_out(known.candidate, fitted, blocks, b, horizon, whole.model, energies[b])
-        except (RankError, DataError):  # what is left of the record does not determine the structure
+        except (RankError, DataError) as error:  # what is left of the record does not determine the structure
+            refusal = error
             continue
         known = replace(known, energy=np.vstack([known.energy, energy]), measure=np.vstack([known.measure, measure]),
                         order=(*known.order, b))
@@ -200,6 +201,8 @@ def _steps(known: Trial, fitted: Callable[..., Any], blocks: Blocks, rival: Tria
             both = [one for one in known.order if one in rival.order]
             if both and _on(known, both) > WORSE * _on(rival, both):
                 yield replace(known, reason="worse than the best on the first half of the blocks")
+    if refusal is not None and not known.order:
+        yield replace(known, reason=f"it cannot be cross-validated: {refusal}")
     yield known
 
 
@@ -229,7 +232,12 @@ def _left_out(candidate: Candidate, fitted: Callable[..., Any], blocks: Blocks, 
     data, latent = blocks.without(block), candidate.formulation in LATENT_FITS
     if candidate.formulation not in STATE_FITS:
         return blocks.errors(fitted(data).model, block, horizon)
-    found = fitted(data, initial=whole, **({"tries": 0} if candidate.formulation == "lfr.exact" else {}))
+    try:
+        found = fitted(data, initial=whole, **({"tries": 0} if candidate.formulation == "lfr.exact" else {}))
+    except RankError:  # no run from it stays finite
+        if not latent:
+            raise
+        return blocks.errors(fitted(data).model, block, horizon)
     errors = blocks.errors(found.model, block, horizon)
     if latent and not np.sum(errors[0]) <= SUSPECT * np.sum(reached):
         again = fitted(data)
