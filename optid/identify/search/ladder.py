@@ -314,9 +314,10 @@ def latent_signals(ladder: Ladder) -> Rung:
             break
         fit = most
     a = ladder.arguments(LATENT, "lfr.exact")
-    yield [model(a["nx"] + 1, a["channels"], a["latent_basis"], a["direct"]),
-           *(model(a["nx"], a["channels"], word, a["direct"]) for word in ("polynomial:3", "polynomial:5", "bspline:4")),
-           *(model(a["nx"], a["channels"], a["latent_basis"], a["direct"], basis) for basis in inner[1:])]
+    nx, channels, word, direct = a["nx"], a["channels"], a["latent_basis"], a["direct"]
+    yield [model(nx + 1, channels, word, direct),
+           *(model(nx, channels, other, direct) for other in ("polynomial:3", "polynomial:5", "bspline:4")),
+           *(model(nx, channels, word, direct, basis) for basis in inner[1:])]
     if not ladder.promising(LATENT, "lfr.exact"):
         return
     a = ladder.arguments(LATENT, "lfr.exact")

@@ -45,7 +45,8 @@ BUDGET, INTERRUPT = "the budget", "an interrupt"
 Runs = Callable[[Sequence[Candidate], Trial | None], list[Trial | None]]
 COMPARED = 8_000  # samples of a long record on which structures are compared
 FIRST = 0.25  # share of the effort that linear models have before the others begin
-LARGEST_SHARE = 0.25  # of the effort that one trial may take, after the first
+TURN = 0.05  # share of the effort that a class has at a time
+LARGEST_SHARE = 0.4  # of the effort that one trial may take, after the first
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -218,35 +219,47 @@ def _limits(ladder: Ladder) -> Iterator[tuple[str, str]]:
 
 def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: Callable[[], float]
            ) -> tuple[str, tuple[str, ...]]:
-    """Try batch after batch until no class has more, the effort is spent, or no CPU second is left.
+    """Try structures until no class has more, the effort is spent, or no CPU second is left.
 
     Return what ended the search early, or "", and the classes that had more.
 
     The low orders found in the record come first, without and with functions of the inputs; then linear models, for a
-    share of the effort; then the class that has had the least.
+    share of the effort; then the class that has had the least. Of a batch, as much is tried at a time as costs a small
+    share of the effort, so that no class waits for expensive structures of another.
     """
-    early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes]
+    early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes and ladder.single]
     rungs = {kind: RUNGS[kind](ladder) for kind in kinds}
-    waiting: dict[str, list[Candidate]] = {}
+    batches: dict[str, list[Candidate]] = {}
+    waiting: dict[str, list[Candidate]] = {}  # of the batch of a class, those that are not tried yet
     spent = ladder.spent
     while rungs:
         if not early and ladder.choice() is not None and sum(spent.values()) >= most:
             return f"its effort of {most:g} units", tuple(rungs)
         if left() <= 0:
             return BUDGET, tuple(rungs)
-        kind = early.pop(0) if early else (
+        kind = early[0] if early else (
             LINEAR if LINEAR in rungs and spent[LINEAR] < FIRST * most else min(rungs, key=spent.__getitem__))
-        batch = waiting.pop(kind) if kind in waiting else next(rungs[kind], None)
-        if batch is None:
-            del rungs[kind]
-            continue
-        batch = list({c.key: c for c in map(ladder.levelled, batch)}.values())
-        _tried(ladder, kind, [c for c in batch if c.key not in ladder.trials], run, most)
         try:
-            waiting[kind] = rungs[kind].send([ladder.trials[c.key] for c in batch])
+            if kind not in batches:
+                batches[kind] = _different(ladder, next(rungs[kind]))
+                waiting[kind] = [c for c in batches[kind] if c.key not in ladder.trials]
+            prices = np.cumsum([units(c, ladder.data, 1 + ladder.folds) for c in waiting[kind]])
+            count = max(int(np.sum(prices <= TURN * most)), 1)
+            _tried(ladder, kind, waiting[kind][:count], run, most)
+            waiting[kind] = waiting[kind][count:]
+            if not waiting[kind]:
+                early = [one for one in early if one != kind]
+                batches[kind] = _different(ladder, rungs[kind].send([ladder.trials[c.key] for c in batches[kind]]))
+                waiting[kind] = [c for c in batches[kind] if c.key not in ladder.trials]
         except StopIteration:
+            early = [one for one in early if one != kind]
             del rungs[kind]
     return "", ()
+
+
+def _different(ladder: Ladder, batch: Sequence[Candidate]) -> list[Candidate]:
+    """Return the candidates of a batch, each once."""
+    return list({c.key: c for c in map(ladder.levelled, batch)}.values())
 
 
 def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, most: float) -> None:

@@ -30,6 +30,8 @@ STARTS = 3  # starts of output-error models in a trial
 OPTIONS = {"constraints": "constraint"}  # options of the command line by arguments with another name
 LATENT_FITS = ("lfr.exact", "wiener_ss.exact", "hammerstein_wiener_ss.exact")
 STATE_FITS = ("ss.exact", "hammerstein_ss.exact", *LATENT_FITS)  # formulations that can begin with a model
+CONTINUED: dict[str, dict[str, Any]] = {  # what a fit that goes on from a model need not do
+    "lfr.exact": {"tries": 0}, "ss.exact": {"block_rows": ()}, "hammerstein_ss.exact": {"block_rows": ()}}
 SUSPECT = 4.0  # ratio of the errors on a block to those of the whole fit above which a fit without it is repeated
 STEPS = 30  # iterations of state-space models in a trial
 OUT_OF_TIME = "out of time"
@@ -233,7 +235,7 @@ def _left_out(candidate: Candidate, fitted: Callable[..., Any], blocks: Blocks, 
     if candidate.formulation not in STATE_FITS:
         return blocks.errors(fitted(data).model, block, horizon)
     try:
-        found = fitted(data, initial=whole, **({"tries": 0} if candidate.formulation == "lfr.exact" else {}))
+        found = fitted(data, initial=whole, **CONTINUED.get(candidate.formulation, {}))
     except RankError:  # no run from it stays finite
         if not latent:
             raise
