@@ -20,6 +20,8 @@ from optid.errors import DataError, OptidError, RankError
 SHORTEST = 10  # samples of a part of an experiment: the output of shorter ones is mostly that of the initial state
 NEAR = 0.15  # an experiment that ends this near to the border of two blocks, as a share of their length, moves it
 LEAD, LEAST = 0.33, 30  # share of a block that the initial state of unstable models is fitted to; samples at least
+PIECES = 20  # stretches of a record at most: every one costs time of its own
+LEAST_LEFT = 0.1  # share of the samples of a part that a fitted state leaves, for this correction
 RUNAWAY = 10.0  # a simulation diverges where its error exceeds so many times the range of the outputs
 WIDER = 2
 """Length of the simulation around a block, as a multiple of that of the block, where the experiment is so long.
@@ -128,7 +130,10 @@ class Blocks:
                 error = np.where(here, run - y, 0.0)
                 with np.errstate(over="ignore", invalid="ignore"):
                     wild = ~np.all(np.abs(error) <= RUNAWAY * span, axis=0)
-                    energy += np.where(wild, np.inf, np.sum(error**2, axis=0))
+                    # a state fitted to the first samples takes as many errors away as it has numbers
+                    taken = model.n_states if horizon is None and begin == part.first else 0
+                    left = max(1 - taken / max(here.sum(), 1), LEAST_LEFT)
+                    energy += np.where(wild, np.inf, np.sum(error**2, axis=0)) / left
                 count += here.sum(axis=0)
         if not count.all():
             raise DataError(f"block {block + 1} has no sample of an output that can be compared: use fewer blocks")
@@ -161,13 +166,16 @@ class Blocks:
 
 
 def stretches(data: Data, most: int, count: int = 5) -> Data:
-    """Return a long record cut to so many samples in all, in stretches spread over its whole length, else the same."""
+    """Return a long record cut to so many samples in all, in stretches spread over its whole length, else the same.
+
+    Of more than `PIECES` experiments so many are taken.
+    """
     total = data.n_samples
-    if total <= most:
+    if total <= most and data.n_experiments <= PIECES:
         return data
     lengths = [e.n_samples for e in data.experiments]
     ends, kept = np.cumsum(lengths), list[Part]()
-    count = max(count, round(most / float(np.median(lengths))))  # of short experiments there are more
+    count = min(max(count, round(most / float(np.median(lengths)))), PIECES)  # of short experiments there are more
     for middle in (np.arange(count) + 0.5) * total / count:
         i = int(np.searchsorted(ends, middle, side="right"))
         n = lengths[i]

@@ -268,6 +268,11 @@ class Model(Ports):
         predicted = self.predict(data, 1, x0)
         return one_or_all([e.y - p for e, p in zip(data.raw().experiments, as_list(predicted))])
 
+    @property
+    def n_states(self) -> int:
+        """How many numbers the state has."""
+        return int(np.prod(self._state_shape))
+
     def initial_state(self, data: Data, simulator: str = "free") -> Any:
         """Estimate the state at the first sample by least squares; a tuple for several experiments.
 

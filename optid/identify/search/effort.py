@@ -20,7 +20,7 @@ EFFORTS = {"small": 15.0, "normal": 60.0, "large": 400.0}
 """Units of a search, by word."""
 CONTINUED = 0.25  # cost of a fit that goes on from another instead of searching for functions of latent signals
 LEAST = 0.01  # units of the shortest fit
-SAMPLES = 3000  # of a record that costs twice as much as a short one
+SAMPLES, EXPERIMENTS = 3000, 8  # of a record that costs twice as much as a short one
 RATES = {"arx": (5e-5, 1.5), "armax": (1e-3, 1.5), "bj": (3e-3, 1.5), "oe": (4.5e-3, 1.5), "sid": (1.3e-3, 1.0),
          "ss": (4e-3, 1.2), "wiener": (3.5e-3, 1.2), "latent": (7e-3, 1.5)}
 """Units of a fit with one parameter to a short record, and the power of their number by which it becomes dearer."""
@@ -41,7 +41,8 @@ def units(candidate: Candidate, data: Data, fits: int = 1) -> float:
     """Return what so many fits of a candidate cost: one to a record, and others without a block of it."""
     size, rate = parameters(candidate.arguments, data.m, data.l), _rate(candidate.formulation)
     factor, power = RATES[rate]
-    one = LEAST + factor * size**power * (1 + data.n_samples / SAMPLES) * int(candidate.arguments.get("tries", 1))
+    length = 1 + data.n_samples / SAMPLES + (data.n_experiments - 1) / EXPERIMENTS
+    one = LEAST + factor * size**power * length * int(candidate.arguments.get("tries", 1))
     return one * (fits if rate != "latent" or not fits else 1 + CONTINUED * (fits - 1))
 
 
