@@ -27,8 +27,12 @@ Rung = Generator[list[Candidate], list[Trial], None]
 ONE_LEVEL = ("hammerstein_ss.sid", "lfr.exact")  # formulations with one constant for all experiments
 PATIENCE = 2  # successive orders without improvement after which a rung ends
 LARGEST, MOST_LATENT = 10, 8  # largest number of states, and that beside functions of latent signals
+MOST_CHANNELS = 3  # latent signals
+SAME_ORDER = 0.003  # relative difference of errors within which linear models say the same of the order
 RISE = 0.95  # ratio of the errors on the record above which one more latent signal or state has not helped
 LINE = "linear"  # the basis of one function
+SMOOTH, FLEXIBLE, ENOUGH = "polynomial:3", "bspline:8", 1000
+"""First basis of latent functions on short records, that on records of so many samples."""
 FEWEST = 0.3  # samples that must determine every function of a basis: the largest of a record determines the end
 FEW_MOVES = 8
 """Moves of an input below which order and dead time are chosen by the likelihood: blocks without moves say little."""
@@ -124,14 +128,23 @@ class Ladder:
         """Whether a structure of a class, or of formulations of it, came through cross-validation."""
         return self.best(kind, *formulations) is not None
 
+    def followed(self, kind: str, *formulations: str) -> float:
+        """Return the fit of the record in % of the leading structure of a class; minus infinity without any."""
+        leading = self.leading(kind, *formulations)
+        return -np.inf if leading is None else leading.estimation
+
     def arguments(self, kind: str, *formulations: str) -> Mapping[str, Any]:
         """Return the arguments of the leading structure of a class, or of formulations of it; none without any."""
         leading = self.leading(kind, *formulations)
         return {} if leading is None else leading.candidate.arguments
 
     def order(self) -> int:
-        """Return the number of states of the best linear model."""
-        return int(self.arguments(LINEAR, "ss.exact", "hammerstein_ss.sid").get("nx", 2))
+        """Return the number of states of the best linear model: the smallest whose errors are hardly larger."""
+        several = [t for t in self.trials.values() if t.candidate.kind == LINEAR and np.isfinite(t.score)
+                   and t.candidate.formulation in ("ss.exact", "hammerstein_ss.sid")]
+        least = min((100 - t.score for t in several), default=0.0)
+        return min((int(t.candidate.arguments["nx"]) for t in several if 100 - t.score <= (1 + SAME_ORDER) * least),
+                   default=2)
 
 
 def binary(data: Data) -> bool:
@@ -185,17 +198,17 @@ def linear_models(ladder: Ladder) -> Rung:
     if not ladder.open:  # others assume that the input does not depend on the noise
         yield from _in_a_loop(ladder)
         return
-    if ladder.single:
-        for delay in ladder.delays:
-            yield from climbed([model("oe.exact", na=n, nb=n, nk=list(delay))] for n in range(1, 8))
     yield from climbed([model("hammerstein_ss.sid", nx=n, basis="linear")] for n in range(1, LARGEST + 1))
     if not ladder.single:
         n = int(ladder.arguments(LINEAR, "hammerstein_ss.sid").get("nx", 2))
         yield [model("ss.exact", nx=k) for k in dict.fromkeys([n, 2])]
         yield from climbed([model("ss.exact", nx=k)] for k in range(n + 1, min(n + 3, LARGEST) + 1))
-    elif a := ladder.arguments(LINEAR, "oe.exact"):  # fewer zeros, and a delay one sample off
-        yield [model("oe.exact", na=a["na"], nb=nb, nk=list(a["nk"]))
-               for nb in dict.fromkeys([1, max(a["na"] - 1, 1), a["na"] + 2])]
+        return
+    yield from climbed([model("oe.exact", na=n, nb=n, nk=list(ladder.delays[-1]))] for n in range(1, 8))
+    if a := ladder.arguments(LINEAR, "oe.exact"):  # fewer zeros, and other delays
+        n = a["na"]
+        yield [*(model("oe.exact", na=n, nb=nb, nk=list(a["nk"])) for nb in dict.fromkeys([1, max(n - 1, 1), n + 2])),
+               *(model("oe.exact", na=n, nb=n + 1, nk=list(nk)) for nk in ladder.delays[:-1])]
 
 
 def low_order(ladder: Ladder) -> Iterator[Candidate]:
@@ -301,41 +314,48 @@ def latent_signals(ladder: Ladder) -> Rung:
 
     order, inner = min(max(ladder.order(), 2), MOST_LATENT), _inner(ladder)
     orders = list(dict.fromkeys([2, 4, order]))  # functions hide the order from linear models
-    yield from _output_functions(ladder, orders, inner[1:] or [bases(ladder.data, "polynomial:3")])
-    yield [model(k, 1, "polynomial:3", direct) for k in orders for direct in (False, True)]
+    output = [partial(structure, LATENT, "wiener_ss.exact"),
+              *(partial(structure, LATENT, "hammerstein_wiener_ss.exact", basis=basis)
+                for basis in inner[1:] or [bases(ladder.data, "polynomial:3")])]
+    first = SMOOTH if ladder.data.n_samples < ENOUGH else FLEXIBLE
+    yield [one(nx=k, output_basis=first) for one in output for k in orders]
+    yield [model(k, 1, first, direct) for k in orders for direct in (False, True)]
+    yield from _output_functions(ladder)
     if not (a := ladder.arguments(LATENT, "lfr.exact")):
         return
-    yield [model(a["nx"], 1, word, direct) for word in ("polynomial:5", "bspline:8") for direct in (False, True)]
-    a, fit = ladder.arguments(LATENT, "lfr.exact"), ladder.leading(LATENT, "lfr.exact")
-    for channels in (2, 3):
-        found = yield [model(a["nx"], channels, a["latent_basis"], direct) for direct in (False, True)]
-        most = max(found, key=lambda t: t.estimation)
-        if fit is not None and 100 - most.estimation > RISE * (100 - fit.estimation):
-            break
-        fit = most
+    yield [model(a["nx"], 1, word, direct) for word in ("polynomial:5", FLEXIBLE) for direct in (False, True)]
+    yield from _larger(ladder, model)
     a = ladder.arguments(LATENT, "lfr.exact")
     nx, channels, word, direct = a["nx"], a["channels"], a["latent_basis"], a["direct"]
-    yield [model(nx + 1, channels, word, direct),
-           *(model(nx, channels, other, direct) for other in ("polynomial:3", "polynomial:5", "bspline:4")),
+    yield [*(model(nx, channels, other, direct) for other in (SMOOTH, "polynomial:5", "bspline:4")),
+           model(nx, channels, word, not direct),
            *(model(nx, channels, word, direct, basis) for basis in inner[1:])]
-    if not ladder.promising(LATENT, "lfr.exact"):
-        return
-    a = ladder.arguments(LATENT, "lfr.exact")
-    yield from climbed([model(n, a["channels"], a["latent_basis"], a["direct"], a.get("basis", "linear"))]
-                       for n in range(a["nx"] + 1, MOST_LATENT + 1))
-    yield [structure(LATENT, "lfr.exact", **ladder.arguments(LATENT, "lfr.exact"), tries=2)]
+    if ladder.promising(LATENT, "lfr.exact"):
+        yield [structure(LATENT, "lfr.exact", **ladder.arguments(LATENT, "lfr.exact"), tries=2)]
 
 
-def _output_functions(ladder: Ladder, orders: Sequence[int], inner: Sequence[Any]) -> Rung:
-    """Functions of the outputs of linear or Hammerstein systems: first of the orders, then of the functions."""
-    for formulation, several in (("wiener_ss.exact", [{}]), ("hammerstein_wiener_ss.exact", [
-            {"basis": basis} for basis in inner])):
-        model = partial(structure, LATENT, formulation)
-        yield [model(nx=k, output_basis="polynomial:3", **given) for k in orders for given in several]
-        if a := ladder.arguments(LATENT, formulation):
-            yield [model(**{**a, "output_basis": word}) for word in ("polynomial:5", "bspline:4", "bspline:8")]
-        if ladder.promising(LATENT, formulation):
-            a = ladder.arguments(LATENT, formulation)
+def _larger(ladder: Ladder, model: Callable[..., Candidate]) -> Rung:
+    """One more state, or one more latent signal, whatever the record is followed better with, while it is by much."""
+    a, error = ladder.arguments(LATENT, "lfr.exact"), 100 - max(ladder.followed(LATENT, "lfr.exact"), 0.0)
+    while a:
+        nx, channels, word, direct = a["nx"], a["channels"], a["latent_basis"], a["direct"]
+        found = yield [*([model(nx + 1, channels, word, direct)] if nx < MOST_LATENT else []),
+                       *([model(nx, channels + 1, word, direct)] if channels < MOST_CHANNELS else [])]
+        best = max(found, key=lambda t: (t.score, t.estimation), default=None)
+        if best is None or 100 - best.estimation > RISE * error:
+            return
+        a, error = best.candidate.arguments, 100 - best.estimation
+
+
+def _output_functions(ladder: Ladder) -> Rung:
+    """Other functions, and then orders, of the better of Wiener and Hammerstein-Wiener models."""
+    words = ("wiener_ss.exact", "hammerstein_wiener_ss.exact")
+    if leading := ladder.leading(LATENT, *words):
+        model = partial(structure, LATENT, leading.candidate.formulation)
+        a = leading.candidate.arguments
+        yield [model(**{**a, "output_basis": word}) for word in (SMOOTH, "polynomial:5", "bspline:4", FLEXIBLE)]
+        if ladder.promising(LATENT, *words):
+            a = ladder.arguments(LATENT, leading.candidate.formulation)
             yield from climbed([model(**{**a, "nx": n})] for n in range(a["nx"] + 1, MOST_LATENT + 1))
 
 

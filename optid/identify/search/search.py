@@ -44,7 +44,8 @@ from optid.registry import Rendered, named_constraint
 BUDGET, INTERRUPT = "the budget", "an interrupt"
 Runs = Callable[[Sequence[Candidate], Trial | None], list[Trial | None]]
 COMPARED = 8_000  # samples of a long record on which structures are compared
-FIRST = 0.25  # share of the effort that linear models have before the others begin
+FIRST = 0.15  # share of the effort that linear models have before the others begin
+MANY = 3.0  # effort for latent signals, of which there are most structures, over that of another class
 TURN = 0.05  # share of the effort that a class has at a time
 LARGEST_SHARE = 0.4  # of the effort that one trial may take, after the first
 
@@ -224,8 +225,8 @@ def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: C
     Return what ended the search early, or "", and the classes that had more.
 
     The low orders found in the record come first, without and with functions of the inputs; then linear models, for a
-    share of the effort; then the class that has had the least. Of a batch, as much is tried at a time as costs a small
-    share of the effort, so that no class waits for expensive structures of another.
+    share of the effort; then the class that has had the least for its kind. Of a batch, as much is tried at a time as
+    costs a small share of the effort, so that no class waits for expensive structures of another.
     """
     early = [kind for kind in (LINEAR, INPUTS) if kind in kinds and ladder.told.processes and ladder.single]
     rungs = {kind: RUNGS[kind](ladder) for kind in kinds}
@@ -238,7 +239,8 @@ def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: C
         if left() <= 0:
             return BUDGET, tuple(rungs)
         kind = early[0] if early else (
-            LINEAR if LINEAR in rungs and spent[LINEAR] < FIRST * most else min(rungs, key=spent.__getitem__))
+            LINEAR if LINEAR in rungs and spent[LINEAR] < FIRST * most
+            else min(rungs, key=lambda one: spent[one] / (MANY if one == LATENT else 1)))
         try:
             if kind not in batches:
                 batches[kind] = _different(ladder, next(rungs[kind]))
