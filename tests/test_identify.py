@@ -257,7 +257,7 @@ def test_free_parameters_are_counted_without_those_that_repeat_others(formulatio
 def trial(kind, energies, parameters=3):
     energy = np.array(energies, dtype=float)[:, None]
     candidate = Candidate(kind, f"of {kind}", {"n": parameters})
-    return Trial(candidate, 99.0, energy, np.ones_like(energy), tuple(range(len(energy))), parameters, 5, 0.1,
+    return Trial(candidate, 99.0, energy, np.ones_like(energy), tuple(range(len(energy))), parameters, 5, 5, 0.1,
                  "optimal")
 
 

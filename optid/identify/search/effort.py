@@ -37,13 +37,16 @@ def effort_of(given: Any) -> float:
     return float(value)
 
 
-def units(candidate: Candidate, data: Data, fits: int = 1) -> float:
-    """Return what so many fits of a candidate cost: one to a record, and others without a block of it."""
+def units(candidate: Candidate, data: Data, fits: int = 1, searches: int = 1) -> float:
+    """Return what so many fits of a candidate to a record, or to the rest of it without a block, cost.
+
+    Of functions of latent signals, so many fits search for them; the others go on from a model with them.
+    """
     size, rate = parameters(candidate.arguments, data.m, data.l), _rate(candidate.formulation)
     factor, power = RATES[rate]
     length = 1 + data.n_samples / SAMPLES + (data.n_experiments - 1) / EXPERIMENTS
     one = LEAST + factor * size**power * length * int(candidate.arguments.get("tries", 1))
-    return one * (fits if rate != "latent" or not fits else 1 + CONTINUED * (fits - 1))
+    return one * (searches + CONTINUED * (fits - searches) if rate == "latent" and fits else fits)
 
 
 def parameters(arguments: Mapping[str, Any], m: int, l: int) -> int:  # noqa: E741 - the field's letter for outputs

@@ -277,7 +277,7 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, mos
     for candidate, trial in zip(tasks, run(tasks, rival)):
         ladder.trials.pop(candidate.key, None)
         ladder.trials[candidate.key] = trial or Trial(candidate, reason=OUT_OF_TIME)
-        ladder.spent[kind] += units(candidate, ladder.data, trial.fits) if trial else 0.0
+        ladder.spent[kind] += units(candidate, ladder.data, trial.fits, trial.searches) if trial else 0.0
 
 
 def _run(pool: Pool, kept: KeptTrials, left: Callable[[], float], told: Callable[[Trial], None],

@@ -80,6 +80,7 @@ class Trial:
         measure: (b, l) what it is measured by, see `Blocks.errors`.
         parameters: number of parameters of the model.
         fits: number of fits that were made.
+        searches: of them those that began without a model.
         seconds: CPU time.
         status: of the solver on the whole record, or "refused".
         reason: why it was dropped, "" where it was tried on every block.
@@ -92,6 +93,7 @@ class Trial:
     order: tuple[int, ...] = ()
     parameters: int = 0
     fits: int = 0
+    searches: int = 0
     seconds: float = 0.0
     status: str = "refused"
     reason: str = ""
@@ -143,13 +145,13 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
     The settings are solver and accuracy, the horizon is as in `Blocks.errors`. After so many CPU seconds the trial is
     given up.
     """
-    clock, found, fits = time.process_time(), Trial(candidate), 0
+    clock, found, fits, searches = time.process_time(), Trial(candidate), 0, 0
 
     def fitted(data: Any, **more: Any) -> Any:
-        nonlocal fits
+        nonlocal fits, searches
         if time.process_time() - clock > seconds:  # where nothing interrupts a fit
             raise OutOfTime
-        fits += 1
+        fits, searches = fits + 1, searches + ("initial" not in more)
         return fit(data, candidate.formulation, prove=False, **settings, **{**arguments, **more})
 
     try:
@@ -164,7 +166,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
         found = replace(found, reason=OUT_OF_TIME)
     except (OptidError, np.linalg.LinAlgError, ValueError) as error:
         found = replace(found, reason=f"{type(error).__name__}: {error}")
-    return replace(found, fits=fits, seconds=time.process_time() - clock)
+    return replace(found, fits=fits, searches=searches, seconds=time.process_time() - clock)
 
 
 def _bases(candidate: Candidate, data: Data) -> dict[str, Any]:
