@@ -111,7 +111,7 @@ class Trial:
         """
         if not self.complete:
             return -np.inf
-        if not len(self.energy):  # the record has no blocks
+        if not len(self.energy):  # no structure can be tried on a block of this record
             return self.estimation
         return min(pooled_fit(self.energy, self.measure), self.estimation)
 
@@ -205,7 +205,7 @@ def _steps(known: Trial, fitted: Callable[..., Any], blocks: Blocks, rival: Tria
             both = [one for one in known.order if one in rival.order]
             if both and _on(known, both) > WORSE * _on(rival, both):
                 yield replace(known, reason="worse than the best on the first half of the blocks")
-    if refusal is not None and not known.order:
+    if refusal is not None and not known.order and rival is not None and rival.order:
         yield replace(known, reason=f"it cannot be cross-validated: {refusal}")
     yield known
 
