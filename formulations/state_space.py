@@ -257,7 +257,8 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
                                   in_units(record, plan.units) if constants == "each" else None)
         errors, best, figures = search_states(errors, starts, weighting, int(iterations))
         if extend is not None:
-            errors, best, more = extend(replace(errors, data=with_whole_inputs(plan.data, 2 * nx + 1)), best, known)
+            errors, best = _on_whole(errors, best, with_whole_inputs(plan.data, 2 * nx + 1))
+            errors, best, more = extend(errors, best, known)
             figures = {**figures, **more}
         evidence = yield from (finish or _refined)(plan, errors, tuple(constraints), best, {"order": nx, **figures})
         return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
@@ -269,6 +270,20 @@ def _refined(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best
              ) -> Procedure:
     programmes = StateSpaceFit(plan.name, errors, constraints, plan.units)
     return (yield from refine(programmes, best, figures, programmes.signed(best.x)))
+
+
+def _on_whole(errors: StateErrors, best: Descent, data: Data) -> tuple[StateErrors, Descent]:
+    """Return the errors on the whole of a record whose first samples were fitted, and their optimum as a point of them.
+
+    Missing inputs may cut the rest into more stretches, whose states are fitted.
+    """
+    if data.n_experiments == errors.unknowns.experiments:
+        return replace(errors, data=data), best
+    whole = replace(errors, data=data, unknowns=replace(errors.unknowns, experiments=data.n_experiments))
+    x = entered(whole, errors.at(errors.unknowns.unpack(best.x)))
+    if x is None:
+        raise RankError("the model of the first samples has no finite run on the rest of the record")
+    return whole, replace(best, x=x)
 
 
 def _block_rows(plan: Plan) -> list[int | None]:

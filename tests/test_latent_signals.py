@@ -234,6 +234,21 @@ def test_a_long_record_is_fitted_in_stages():
     assert fit.model.latent[0].basis.p == 14
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*steps gain less than", "ignore:.*without every input", "ignore:.*missing")
+def test_inputs_missing_late_in_a_long_record_are_left_out():
+    """The first samples of the record, which are fitted first, have fewer stretches than the whole."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=9_000)
+    y = lfilter([0.0, 0.4], [1.0, -0.6], np.tanh(2 * lfilter([0.0, 0.3], [1.0, -0.7], u))) + 0.01 * rng.normal(size=9_000)
+    arguments = {"nx": 2, "latent_basis": "bspline:4", "tries": 1}
+    whole = optid.fit(Data(u, y), "lfr.exact", **arguments)
+    u[[3_000, 8_500]] = np.nan
+    cut = optid.fit(Data(u, y), "lfr.exact", **arguments)
+    assert cut.model.simulate(rng.normal(size=200)[:, None]).shape == (200, 1)
+    assert cut.solution.objective == pytest.approx(whole.solution.objective, rel=0.02)
+
+
 def oscillator(u, noise=0.0, seed=0):
     """A hardening spring: the latent signal is a state that no output shows alone."""
     x, v, y = 0.0, 0.0, np.zeros(len(u))
