@@ -240,7 +240,8 @@ def test_inputs_missing_late_in_a_long_record_are_left_out():
     """The first samples of the record, which are fitted first, have fewer stretches than the whole."""
     rng = np.random.default_rng(0)
     u = rng.normal(size=9_000)
-    y = lfilter([0.0, 0.4], [1.0, -0.6], np.tanh(2 * lfilter([0.0, 0.3], [1.0, -0.7], u))) + 0.01 * rng.normal(size=9_000)
+    y = lfilter([0.0, 0.4], [1.0, -0.6], np.tanh(2 * lfilter([0.0, 0.3], [1.0, -0.7], u)))
+    y += 0.01 * rng.normal(size=9_000)
     arguments = {"nx": 2, "latent_basis": "bspline:4", "tries": 1}
     whole = optid.fit(Data(u, y), "lfr.exact", **arguments)
     u[[3_000, 8_500]] = np.nan
