@@ -252,7 +252,7 @@ def test_findings_of_a_record_lead_the_printed_fit_and_the_search():
     data = optid.Data(u0, y0, 5.0, inputs=["heater"], outputs=["temperature"])
     sentence = "dead time from 'heater' to 'temperature': 35 s (7 samples)"
     assert sentence in " ".join(str(optid.fit(data, "arx", na=1, nb=1, nk=8)).split())
-    found = optid.identify(data, workers=1, classes=["linear"], progress=lambda sentence: None)
+    found = optid.identify(data, workers=1, classes=["linear"], effort=1, progress=lambda sentence: None)
     assert " ".join(str(found).split()).index(sentence) < 200
 
 

@@ -271,6 +271,7 @@ def test_a_latent_spring_is_found():
     assert fit.solution.objective < 0.01 * linear.solution.objective
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_from_a_model_with_latent_signals():
     """In other units, too, and without a search; a model with other functions is refused."""
     u = np.repeat(np.random.default_rng(3).uniform(-1.5, 1.5, 200), 4)

@@ -25,6 +25,6 @@ def test_a_terminal_sees_the_time_that_is_left(monkeypatch, capsys):
 
 def test_a_fit_and_a_search_are_logged_and_print_nothing(caplog, capsys):
     with caplog.at_level(logging.DEBUG, "optid"):
-        optid.identify(example("dead_zone").data, effort=2, workers=1, classes=["linear"])
-    assert " of 2 units, linear: " in caplog.text and "fit arx: " in caplog.text
+        optid.identify(example("dead_zone").data, effort=0.5, workers=1, classes=["linear"])
+    assert " of 0.5 units, linear: " in caplog.text and "fit arx: " in caplog.text
     assert capsys.readouterr() == ("", "")
