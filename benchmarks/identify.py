@@ -34,7 +34,7 @@ from search_plants import LIKENESSES, ORDINARY, record
 
 import optid
 from optid.errors import OptidError
-from optid.identify.blocks import Blocks
+from optid.identify.blocks import Blocks, pooled_fit
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
 from optid.identify.validation.predictions import prediction_fit
@@ -158,8 +158,8 @@ def on_plant(task: tuple[str, int, str]) -> tuple[str, bool, float, float, float
     one, before = record(kind, seed), spent()
     found = identify(one.train, effort=effort, workers=1)
     used, chosen = spent() - before, found.chosen.candidate
-    best = float(np.mean(100 * (1 - np.linalg.norm(one.clean - one.test.y, axis=0)
-                                / np.maximum(np.linalg.norm(one.test.y - one.test.y.mean(axis=0), axis=0), 1e-300))))
+    y = one.test.y
+    best = pooled_fit((one.clean - y) ** 2, (y - y.mean(axis=0)) ** 2)
     return (chosen.kind, chosen.kind in one.classes, one.error(found.model), score(found.model, one.test), best, used,
             found.verdict.word, f"{chosen.formulation} {chosen.words}{' (effort spent)' * bool(found.stopped)}")
 

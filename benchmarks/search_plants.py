@@ -118,10 +118,9 @@ def _hammerstein(rng: np.random.Generator) -> Record:
 
 def _wiener(rng: np.random.Generator) -> Record:
     plant = _lag(rng, 2, 2, 6, 0.0)
-    v = plant.respond(_smooth(rng, 2500, 0.7))
-    v = v / np.std(v)
     u = _smooth(rng, 2500, 0.7)
-    v = plant.respond(u) / np.std(plant.respond(u))
+    v = plant.respond(u)
+    v = v / np.std(v)
     x = np.tanh(v) if rng.random() < 0.5 else v + 0.3 * v**2
     return _cut(u, x, _noise(rng, x, 0.01, 0.03), 2000, (LATENT,))
 

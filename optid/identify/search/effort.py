@@ -1,7 +1,7 @@
 """What a trial costs, in units: about a second of one core, but declared, so that a search is the same everywhere.
 
-The formula is from the time that fits of every formulation took on simulated records of 300 to 10,000 samples; nine of
-ten lie within a factor of three of it. It decides in which order classes are tried and when a search ends, never how
+The formula is from the time that fits of every formulation took on simulated records of 300 to 10,000 samples; most lie
+within a factor of three of it. It decides in which order classes are tried and when a search ends, never how
 long it takes: a slow machine makes the same trials as a fast one.
 """
 
@@ -18,7 +18,7 @@ from optid.identify.search.trial import Candidate
 
 EFFORTS = {"small": 15.0, "normal": 60.0, "large": 400.0}
 """Units of a search, by word."""
-CONTINUED = 0.25  # cost of a fit that goes on from another instead of searching for functions of latent signals
+WARM = 0.25  # cost of a fit that goes on from another instead of searching for functions of latent signals
 LEAST = 0.01  # units of the shortest fit
 SAMPLES, EXPERIMENTS = 3000, 8  # of a record that costs twice as much as a short one
 RATES = {"arx": (5e-5, 1.5), "armax": (1e-3, 1.5), "bj": (3e-3, 1.5), "oe": (4.5e-3, 1.5), "sid": (1.3e-3, 1.0),
@@ -46,7 +46,7 @@ def units(candidate: Candidate, data: Data, fits: int = 1, searches: int = 1) ->
     factor, power = RATES[rate]
     length = 1 + data.n_samples / SAMPLES + (data.n_experiments - 1) / EXPERIMENTS
     one = LEAST + factor * size**power * length * int(candidate.arguments.get("tries", 1))
-    return one * (searches + CONTINUED * (fits - searches) if rate == "latent" and fits else fits)
+    return one * (searches + WARM * (fits - searches) if rate == "latent" and fits else fits)
 
 
 def parameters(arguments: Mapping[str, Any], m: int, l: int) -> int:  # noqa: E741 - the field's letter for outputs

@@ -128,11 +128,6 @@ class Ladder:
         """Whether a structure of a class, or of formulations of it, came through cross-validation."""
         return self.best(kind, *formulations) is not None
 
-    def followed(self, kind: str, *formulations: str) -> float:
-        """Return the fit of the record in % of the leading structure of a class; minus infinity without any."""
-        leading = self.leading(kind, *formulations)
-        return -np.inf if leading is None else leading.estimation
-
     def arguments(self, kind: str, *formulations: str) -> Mapping[str, Any]:
         """Return the arguments of the leading structure of a class, or of formulations of it; none without any."""
         leading = self.leading(kind, *formulations)
@@ -336,15 +331,16 @@ def latent_signals(ladder: Ladder) -> Rung:
 
 def _larger(ladder: Ladder, model: Callable[..., Candidate]) -> Rung:
     """One more state, or one more latent signal, whatever the record is followed better with, while it is by much."""
-    a, error = ladder.arguments(LATENT, "lfr.exact"), 100 - max(ladder.followed(LATENT, "lfr.exact"), 0.0)
-    while a:
+    leading = ladder.leading(LATENT, "lfr.exact")
+    while leading is not None:
+        a = leading.candidate.arguments
         nx, channels, word, direct = a["nx"], a["channels"], a["latent_basis"], a["direct"]
         found = yield [*([model(nx + 1, channels, word, direct)] if nx < MOST_LATENT else []),
                        *([model(nx, channels + 1, word, direct)] if channels < MOST_CHANNELS else [])]
         best = max(found, key=lambda t: (t.score, t.estimation), default=None)
-        if best is None or 100 - best.estimation > RISE * error:
+        if best is None or 100 - best.estimation > RISE * (100 - max(leading.estimation, 0.0)):
             return
-        a, error = best.candidate.arguments, 100 - best.estimation
+        leading = best
 
 
 def _output_functions(ladder: Ladder) -> Rung:
