@@ -54,6 +54,13 @@ def share(count: int, of: int) -> str:
     return f"{100 * count / of:5.1f} % [{100 * low:.1f}, {100 * high:.1f}]"
 
 
+def coverage(values: Any, errors: Any, covered: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share of runs (first axis) whose intervals contain the truth, in %, and printed over true scatter."""
+    true = np.std(values, axis=0, ddof=1)
+    ratio = np.sqrt(np.mean(np.square(errors), axis=0)) / np.where(true > 1e-9, true, np.nan)
+    return 100 * np.mean(covered, axis=0), ratio
+
+
 def worker_pool(workers: int) -> ProcessPoolExecutor:
     """Return a pool of processes with one thread each."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):

@@ -39,7 +39,8 @@ from optid.identify.arguments import enough_rows
 from optid.identify.gauges import FIXED, scale_fixed
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.search import entry, search, starts_of
-from optid.identify.prediction_error.tangent_fit import TangentFit, refine
+from optid.identify.prediction_error.tangent_descent import refine
+from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.expressions import tangent_product

@@ -41,7 +41,7 @@ from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.state_errors import WILD, StateErrors, weight_root
-from optid.identify.prediction_error.tangent_fit import NO_BOUND
+from optid.identify.prediction_error.tangent_descent import NO_BOUND
 from optid.identify.subspace.plan import Plan
 from optid.models import HammersteinSS
 from optid.models.roots import spectral_radius

@@ -45,7 +45,8 @@ from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.latent_search import STAGES, first_samples
 from optid.identify.prediction_error.state_errors import STABLE, StateErrors
 from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
-from optid.identify.prediction_error.tangent_fit import TangentFit, refine
+from optid.identify.prediction_error.tangent_descent import refine
+from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.models import HammersteinSS
 from optid.models.roots import modal_weight

@@ -66,3 +66,13 @@ def by_hand(model, u, x0, y=None, gain=None, noise=None):
 
 def inputs(model, count=120, seed=1):
     return np.random.default_rng(seed).uniform(-0.7, 1.3, (count, model.m))
+
+
+def two_outputs(count=20_000, seed=1):
+    """Noise of two outputs by an autoregression: its coefficients, the root of the covariance, noise, white noise."""
+    lags = np.array([[[0.5, 0.2], [0.0, 0.3]], [[-0.3, 0.0], [0.1, 0.2]]])
+    root = np.linalg.cholesky([[1.0, 0.3], [0.3, 2.0]]).T
+    e, w = np.zeros((count, 2)), np.random.default_rng(seed).normal(size=(count, 2)) @ root
+    for k in range(2, count):
+        e[k] = lags[0] @ e[k - 1] + lags[1] @ e[k - 2] + w[k]
+    return lags, root, e, w

@@ -1,5 +1,8 @@
 """Every installed back end over the zoo of its classes, and the translator against CVXPY's own values."""
 
+import subprocess
+import sys
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -283,3 +286,13 @@ def search_angle(matrix, y, *, convex):
     best = float(min(grid, key=value))
     found = minimize_scalar(value, bounds=(best - 0.01, best + 0.01), method="bounded", options={"xatol": 1e-10})
     return float(found.fun)
+
+
+def test_a_solver_writes_nothing_to_standard_output(capfd):
+    """HiGHS prints its name on its first run, whatever its options say; what is printed is for other programmes."""
+    code = ("import optid\n"
+            "data = optid.examples.example('heater').data\n"
+            "optid.fit(data, 'arx', na=1, nb=1, nk=5, solver='highs', constraints=['stable:0.5'])\n"
+            "print('done')\n")
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert capfd.readouterr().out == "done\n"

@@ -161,7 +161,8 @@ def in_cone(rows, rng):
 @every
 def test_increments_make_f_monotone(basis):
     rng = np.random.default_rng(5)
-    u = basis.grid(201 if not basis.shape_exact and not isinstance(basis, BSpline) else 1501)
+    everywhere = basis.shape_exact or isinstance(basis, (BSpline, Polynomial))
+    u = basis.grid(1501 if everywhere else 201)
     for _ in range(5):
         mu = in_cone(basis.increments(), rng)
         assert np.min(np.diff(basis.values(u) @ mu)) >= -1e-7
@@ -172,7 +173,7 @@ def test_curvature_makes_f_convex(basis):
     if isinstance(basis, PiecewiseConstant):
         points = basis.centres
     else:
-        points = basis.grid(201 if not isinstance(basis, (BSpline, Triangular)) else 1501)
+        points = basis.grid(1501 if isinstance(basis, (BSpline, Triangular, Polynomial)) else 201)
     rng = np.random.default_rng(6)
     for _ in range(5):
         mu = in_cone(basis.curvature(), rng)
@@ -201,6 +202,29 @@ def test_slope_rows_bound_the_slope(basis):
         slopes = basis.slopes(basis.grid()) @ mu
     assert slopes.max() <= bounds.max() + 1e-9
     assert slopes.min() >= bounds.min() - 1e-9
+
+
+@pytest.mark.parametrize("basis", [
+    Polynomial(5).fitted(-0.7, 1.3), Polynomial(1).fitted(2, 3), Polynomial(12).fitted(-1, 1),
+    Triangular(5).fitted(-1, 2), PiecewiseConstant(400).fitted(0, 1), BSpline(5, 2).fitted(-1, 1),
+    BSpline(6, 3).fitted(0, 2)], ids=repr)
+def test_bounds_on_rows_are_bounds_between_all_points(basis):
+    rng = np.random.default_rng(11)
+    lo, hi = basis.interval
+    first, last = lo + 0.13 * (hi - lo), lo + 0.71 * (hi - lo)
+    u, whole = np.linspace(first, last, 20_001), basis.grid(20_001)
+    for _ in range(20):
+        mu = rng.normal(size=basis.size)
+        values, rows = basis.values(u) @ mu, basis.value_rows(first, last) @ mu
+        size = np.ptp(values)
+        assert rows.min() - 1e-9 <= values.min() and values.max() <= rows.max() + 1e-9
+        assert values.min() - rows.min() < 0.03 * size and rows.max() - values.max() < 0.03 * size
+        if isinstance(basis, Polynomial):
+            for row, order in ((basis.slope_rows(), 1), (basis.curvature(), 2)):
+                true, bounds = basis._derivative(whole, order) @ mu, row @ mu
+                size = np.ptp(true) + 1e-9
+                assert bounds.min() - 1e-9 * size <= true.min() and true.max() <= bounds.max() + 1e-9 * size
+                assert true.min() - bounds.min() < 0.05 * size and bounds.max() - true.max() < 0.05 * size
 
 
 @pytest.mark.parametrize("basis", SMOOTH + [FITTED[1]], ids=names(SMOOTH + [FITTED[1]]))

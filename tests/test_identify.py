@@ -1,8 +1,10 @@
 """The search for a structure: blocks, exact sums, the ladder, the choice, and what stops it."""
 
 import re
+import signal
 import warnings
 from dataclasses import replace
+from time import process_time
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from optid.identify.informativity import Informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
 from optid.identify.search import search as searching
+from optid.identify.search.cpu_limit import OutOfTime, cpu_limit
 from optid.identify.search.ladder import RUNGS, Ladder, bases
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import CLEAR, INPUTS, KINDS, LATENT, LINEAR, Candidate, Trial, free_parameters, tried
@@ -345,6 +348,21 @@ def test_a_spent_effort_ends_the_search_after_the_low_orders(short):
     found = identify(plant(400, cubic=0.4), effort=1e-3, workers=1)
     assert found.stopped == "its effort of 0.001 units" and {t.candidate.kind for t in found.trials} == set(KINDS[:2])
     assert found.units > 0.001
+
+
+@pytest.mark.skipif(not hasattr(signal, "ITIMER_PROF"), reason="no timer of CPU time here")
+def test_a_limit_that_ends_within_the_last_words_of_an_object_is_told_a_moment_later():
+    class Slow:
+        def __del__(self):
+            while process_time() < until:
+                pass
+
+    until = process_time() + 0.2
+    with pytest.raises(OutOfTime), cpu_limit(0.05):
+        Slow()
+        while process_time() < until + 5:
+            pass
+    assert process_time() < until + 5
 
 
 def test_a_budget_of_cpu_time_ends_the_search_wherever_it_is(short):

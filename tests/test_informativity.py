@@ -119,6 +119,25 @@ def test_an_integrator_is_told_and_its_slope():
     assert any("integrates input 'u'" in finding for finding in told.findings)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_plant_that_first_goes_the_wrong_way_has_its_own_dead_time(seed):
+    u = staircase(np.random.default_rng(seed), 500, 20)
+    y = driven(u, dead=5, gain=3.0, poles=(0.96,), noise=0.0) + driven(u, dead=5, gain=-1.5, poles=(0.88,), colour=0.9)
+    (response,) = processes(optid.Data(u, y))[0].responses
+    assert abs(response.nk - 6) <= 1 and response.gain == pytest.approx(1.5, rel=0.05)
+    np.testing.assert_allclose(np.sort(response.poles.real), [0.88, 0.96], atol=0.02)
+    assert np.sign(response.b[0]) != np.sign(response.gain)
+
+
+def test_a_pair_without_effect_has_no_dead_time():
+    rng = np.random.default_rng(3)
+    u = np.column_stack([staircase(rng, 800, 20), staircase(rng, 800, 35)])
+    y = np.column_stack([driven(u[:, c], dead=dead, seed=c) for c, dead in enumerate((4, 9))])
+    told = informativity(optid.Data(u, y))
+    assert [[told.acts(c, y) for c in range(2)] for y in told.outputs] == [[True, False], [False, True]]
+    assert sum("dead time" in finding for finding in told.findings) == 2 and told.lags == (5, 10)
+
+
 def test_two_inputs_have_responses_of_their_own():
     rng = np.random.default_rng(6)
     u = np.column_stack([staircase(rng, 1000, 20), staircase(rng, 1000, 35)])

@@ -1,9 +1,11 @@
 """Static functions of latent signals: the model, its simulation, its derivatives, and fits of plants that have them."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import scripts
 from scipy.signal import lfilter
 from state_systems import by_hand
 
@@ -13,7 +15,8 @@ from optid.bases import BSpline, Polynomial, UserFunctions
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError, StructureError
-from optid.identify.prediction_error.latent_search import _factors, _renewed
+from optid.identify.prediction_error.latent_directions import factors
+from optid.identify.prediction_error.latent_search import _confirmed, _renewed
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.models import HammersteinSS, Nonlinearity
 from optid.statistics.expansion import expand
@@ -205,16 +208,43 @@ def test_directions_contain_the_factors_of_a_transfer_function():
     errors, x = criterion_with_a_function(Polynomial(3, interval=(-1.0, 1.0), outside="extrapolate"))
     point = replace(errors.unknowns.unpack(x), A=np.array([[0.8, 0.0], [0.5, 0.5]]), b=np.array([[1.0], [1.0]]),
                     C=np.array([[0.0, 1.0]]), d=np.zeros((1, 1)))
-    found = list(_factors(point, np.ones(3), 50, np.random.default_rng(0)))
+    found = list(factors(point, np.ones(3), 50, np.random.default_rng(0)))
     assert any(row == pytest.approx([0.5, 0.0, 1.0], abs=1e-9) for row in found)
-    assert len(list(_factors(point, np.ones(3), 2, np.random.default_rng(0)))) == 2
+    assert len(list(factors(point, np.ones(3), 2, np.random.default_rng(0)))) == 2
+
+
+def test_a_function_that_is_worse_on_the_whole_record_begins_at_zero():
+    wider, x = criterion_with_a_function(Polynomial(3, interval=(-1.0, 1.0), outside="extrapolate"), 800)
+    errors = replace(wider, unknowns=replace(wider.unknowns, latent=()))
+    point = wider.unknowns.unpack(x)
+    without = replace(point, cs=(), Ez=point.Ez[:, :0], Fz=point.Fz[:, :0], Cz=point.Cz[:0], Dz=point.Dz[:0],
+                      offset_z=point.offset_z[:0])
+    before = errors.normalised(errors.unknowns.pack(without))
+    astray = wider.unknowns.pack(replace(point, Ez=30 * point.Ez, A=0.9 * point.A))
+    found, _ = _confirmed(wider, astray, errors, before, wider.data)
+    assert np.isfinite(wider.value(found)) and wider.value(found) <= errors.value(before) * (1 + 1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_one_more_function_never_makes_a_model_of_many_outputs_worse(seed):
+    """A boiler of four inputs and outputs: what few samples suggest leaves the range of the record."""
+    data = scripts.benchmark("search_plants").record("boiler", seed).train
+    objectives = [optid.fit(data, "ss.exact", nx=4, prove=False).solution.objective]
+    for channels in (1, 2, 4):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # a descent of many unknowns ends at its limit
+            fit = optid.fit(data, "lfr.exact", nx=4, channels=channels, prove=False, tries=1)
+        assert np.all(np.isfinite(fit.simulation_fit))
+        objectives.append(fit.solution.objective)
+    assert np.all(np.diff(objectives[1:]) <= 0) and objectives[-1] < objectives[0]
 
 
 def test_forgotten_initial_states_leave_no_subnormal_numbers():
     errors, x = criterion_with_a_function(Polynomial(2, interval=(-1.0, 1.0), outside="extrapolate"), 3000)
     point = errors.unknowns.unpack(x)
     x = errors.unknowns.pack(replace(point, A=0.5 * np.eye(2), Ez=0.01 * point.Ez))
-    (block,) = [block for block, _ in errors.blocks(x)(0)]
+    (block,) = [block for block, _ in errors.rows(x)(0)]
     small = np.abs(block[block != 0])
     assert np.all(block[-1, :2] == 0) and small.min() > 1e-160
 

@@ -369,3 +369,18 @@ def test_long_records_are_searched_in_part_unless_that_part_is_missing(kind):
     for one, error in ((data, 0.05), (Data(data.u, y), 0.1)):
         fit = quiet(one, pose, **orders)
         assert fit.model.a == pytest.approx(A, abs=error) and fit.model.c == pytest.approx(C, abs=error)
+
+
+@pytest.mark.sampled(1)
+@pytest.mark.filterwarnings("ignore:clarabel stopped")  # the best zero of C lies on the unit circle, where no step ends
+@pytest.mark.parametrize(("form", "seed", "gain"), [
+    ("bj.exact", 0, -2.4), ("armax.exact", 0, -2.0), ("armax.exact", 4, -3.0), ("bj.exact", 1, -2.5),
+    ("bj.exact", 2, -2.4), ("bj.exact", 3, -3.0)])
+def test_a_gain_is_kept_where_a_zero_of_c_comes_to_the_unit_circle(form, seed, gain):
+    rng, u, y = np.random.default_rng(seed), np.repeat([0.0, 1, 0, 1, 1, 0], 20), np.zeros(120)
+    for k in range(4, 120):
+        y[k] = 0.93 * y[k - 1] - 0.175 * u[k - 4]
+    data = optid.Data(u, y + 0.15 * rng.standard_normal(120), dt=2.0)
+    orders = {"na": 1, "nb": 1, "nk": 4, "nc": 1, **({"nd": 1} if form == "bj.exact" else {})}
+    model = optid.fit(data, form, **orders, constraints=[f"gain:{gain}"]).model
+    assert model.frequency_response(np.array([1e-9])).real.item() == pytest.approx(gain, abs=1e-9)

@@ -106,3 +106,24 @@ def test_every_word_has_the_price_that_moving_its_bound_gains(word, form):
     seed = 0 if form.endswith("exact") else 1
     multiplier, slope = benchmark("prices").checked(word, seed, form, r=1e3, s=1e-2)
     assert multiplier == pytest.approx(slope, rel=1e-2) and slope > 0
+
+
+@pytest.mark.parametrize("form", ["hammerstein_arx.overparametrised", "hammerstein_arx.exact"])
+def test_bounds_that_say_the_same_cost_nothing_one_by_one(form):
+    """Which of them is to have the multiplier is open, and to relax one alone gains nothing."""
+    def bounds(first, second=-1.0):
+        return [lambda v: {"one": v["a"][0] >= first}, lambda v: {"other": 2 * v["a"][0] >= 2 * second}]
+
+    twice = optid.fit(record(count=100), form, na=2, nb=2, basis=BASIS, constraints=bounds(-1.0))
+    relaxed = optid.fit(record(count=100), form, na=2, nb=2, basis=BASIS, constraints=bounds(-1.01))
+    once = optid.fit(record(count=100), form, na=2, nb=2, basis=BASIS, constraints=bounds(-1.0)[:1])
+    assert relaxed.solution.objective == pytest.approx(twice.solution.objective, rel=1e-7)
+    assert once.prices[0].multiplier > 0.1
+    assert [price.multiplier for price in twice.prices] == pytest.approx([0.0, 0.0], abs=1e-5)
+
+
+def test_rows_of_one_bound_that_say_the_same_move_together():
+    both = [lambda v: {"c": cp.hstack([v["a"][0], v["a"][0]]) >= -1.0}]
+    twice, once = (optid.fit(record(count=100), "hammerstein_arx.overparametrised", na=2, nb=2, basis=BASIS,
+                             constraints=one).prices[0] for one in (both, [lambda v: {"c": v["a"][0] >= -1.0}]))
+    assert twice.active == 2 and twice.multiplier == pytest.approx(once.multiplier, rel=1e-4)

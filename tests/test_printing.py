@@ -191,5 +191,6 @@ def test_an_output_error_model_shows_the_errors_of_every_coefficient():
     fit = output_error_fit()
     text, table = describe(fit), rows(describe(fit), "Parameters")
     assert "Hammerstein output-error model of y from u" in text
-    assert list(table) == [name for name, _ in fit.model.coefficients()]
+    assert list(table) == [*(name for name, _ in fit.model.coefficients()), "The"]
+    assert "The errors are coloured; the standard errors account for it." in text
     assert fit.one_step_fit == pytest.approx(fit.simulation_fit, abs=1e-6)

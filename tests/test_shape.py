@@ -156,6 +156,38 @@ def test_cones_of_smooth_bases_hold_between_their_points(basis, rule, order):
     assert min(np.max(-steps), np.max(steps)) < 1e-4 * np.max(np.abs(steps)) + 3e-5 * (order == 1)
 
 
+@pytest.mark.parametrize("degree", [4, 9])
+def test_words_about_a_polynomial_hold_between_any_points(degree):
+    rng = np.random.default_rng(degree)
+    u = rng.uniform(-1, 1, 300)
+    y = plant_response(np.tanh(4 * u) + 0.3 * np.sin(9 * u)) + 0.05 * rng.normal(size=300)
+    fine = np.linspace(-0.9999, 0.9999, 40_001)
+    for word, low, high in (("monotone", 0.0, np.inf), ("slope:0.2,3", 0.2, 3.0), ("range:-0.9,0.8", -0.9, 0.8)):
+        fit = optid.fit(optid.Data(u, y), "hammerstein_arx.exact", na=1, nb=1, nk=1, basis=f"polynomial:{degree}",
+                        constraints=[word], prove=False)
+        lo, hi = fit.model.nonlinearities[0].basis.interval
+        points = fine * (hi - lo) / 2 + (hi + lo) / 2
+        f = fit.model.nonlinearities[0]
+        gain = fit.model.b[0].sum() / (1 + fit.model.a.sum())
+        values = static(fit.model, points) if word[0] == "r" else f.slope(points) * gain
+        assert values.min() >= low - 1e-7 and values.max() <= high + 1e-7  # to the accuracy of the solver
+        assert min(values.min() - low, high - values.max()) < 0.05  # and not by much less than it allows
+
+
+def plant_response(f):
+    y = np.zeros(len(f))
+    for k in range(1, len(f)):
+        y[k] = 0.5 * y[k - 1] + 0.5 * f[k - 1]
+    return y
+
+
+@pytest.mark.parametrize("word", ["convex", "concave", "slope:0,1", "gain:1"])
+def test_steps_have_no_slope(word):
+    u = np.random.default_rng(0).uniform(-1, 1, 200)
+    refuses(StructureError, "piecewise constant", optid.fit, optid.Data(u, plant_response(u)),
+            "hammerstein_arx.exact", na=1, nb=1, nk=1, basis="piecewiseconstant:5", constraints=[word])
+
+
 @pytest.mark.parametrize("gain", [1.0, -1.0])
 def test_a_direction_of_b_decides_the_sign_of_a_monotone_f(gain):
     data = record(gain, noise=0.2)

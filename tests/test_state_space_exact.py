@@ -103,7 +103,7 @@ def test_directions_of_the_gauge_change_nothing(word, latent):
     rows = criterion.gauge_rows(x)
     assert len(rows) == 9 + 2 + bool(latent)  # n^2 changes of states, scales of functions
     assert rows @ rows.T == pytest.approx(np.eye(len(rows)), abs=1e-10)
-    plain = linearised(criterion.blocks(x), 2, 3, criterion.unknowns.shared)
+    plain = linearised(criterion.rows(x), 2, 3, criterion.unknowns.shared)
     assert np.abs(plain.root @ rows.T).max() < 1e-5 * np.abs(plain.root).max()
 
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from state_systems import two_outputs
 
 import optid
 from optid.bases import Polynomial
@@ -59,16 +60,21 @@ def test_a_change_of_the_states_changes_nothing():
 
 
 @pytest.mark.slow
-def test_coloured_errors_scatter_the_estimate():
+def test_coloured_errors_scatter_the_estimate(monkeypatch):
     """Errors with a long memory: the standard error is that of repeated experiments, not that of white errors."""
     quantity = [lambda m: m.static_gain(0.0)]
     found = [fitted(record(seed, process=0.03, sensor=0.01)).uncertainty.of(quantity[0]) for seed in range(24)]
     scatter = np.std([one.value for one in found], ddof=1)
     printed = np.sqrt(np.mean([one.error**2 for one in found]))
     assert 0.65 < printed / scatter < 1.5
-    white = optid.fit(record(0, process=0.03, sensor=0.01), "hammerstein_oe.exact", na=2, nb=2, nk=1,
-                      basis="polynomial:3").uncertainty.of(quantity[0]).error
-    assert white < 0.5 * scatter
+
+    def of_a_transfer_function():
+        return optid.fit(record(0, process=0.03, sensor=0.01), "hammerstein_oe.exact", na=2, nb=2, nk=1,
+                         basis="polynomial:3").uncertainty.of(quantity[0]).error
+
+    assert 0.65 < of_a_transfer_function() / scatter < 1.5
+    monkeypatch.setattr("optid.identify.prediction_error.error_noise.DEPENDENT", -1.0)  # no errors are coloured
+    assert of_a_transfer_function() < 0.5 * scatter
 
 
 def test_table_and_bands():
@@ -135,12 +141,7 @@ def test_scatter_of_coloured_errors_is_that_of_the_whole_covariance(cuts):
 
 
 def test_long_autoregression_and_its_response():
-    rng = np.random.default_rng(1)
-    lags = np.array([[[0.5, 0.2], [0.0, 0.3]], [[-0.3, 0.0], [0.1, 0.2]]])
-    root = np.linalg.cholesky([[1.0, 0.3], [0.3, 2.0]]).T
-    e, w = np.zeros((20_000, 2)), rng.normal(size=(20_000, 2)) @ root
-    for k in range(2, len(e)):
-        e[k] = lags[0] @ e[k - 1] + lags[1] @ e[k - 2] + w[k]
+    lags, root, e, _ = two_outputs()
     found, scale = long_autoregression([e[:9000], e[9000:]], 2)
     assert found == pytest.approx(lags, abs=0.03)
     assert scale.T @ scale == pytest.approx(root.T @ root, abs=0.05)

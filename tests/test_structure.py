@@ -177,6 +177,26 @@ def test_a_second_path_is_found_by_rank():
     assert not wiener.passed and wiener.p_values["y"][PRODUCTS] < 1e-6 and "not consistent" in wiener.finding
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_a_drifting_gain_leaves_is_no_noise(seed):
+    """A level is held for longer than the plant takes, so that what the gain leaves is as slow as coloured noise."""
+    u = optid.signals.uniform_levels(2000, hold=38, seed=seed)
+    e = np.random.default_rng(seed).normal(size=2000)
+    y = lfilter([0, 0.05], [1, -0.95], u)
+    still, moving = (Data(u, y * course + 0.05 * y.std() * e) for course in (1.0, np.linspace(1.0, 1.6, 2000)))
+    assert structure_test(still).passed
+    found = structure_test(moving)
+    assert not found.passed and found.alternative == "a gain that changes with time"
+    (process,) = processes(moving)
+    fitted = fit_hammerstein(Design.of(moving, 0, process), process.noise)
+    columns = alternatives(fitted)[found.alternative](fitted)
+    sizes = [np.sum(one.regression.noise**2) for one in (fitted, fitted.beside(columns))]  # 1 for white noise, as it is
+    assert sizes[1] < sizes[0]
+    for one in fitted.predicted, fitted.directions:  # what the hypothesis itself explains leaves its noise as it is
+        same = fitted.beside([x.reshape(2000, -1) for x in one]).regression.noise
+        assert same == pytest.approx(fitted.regression.noise, abs=0.02)
+
+
 def test_records_without_noise():
     model = siso(Polynomial(3))
     u = inputs(model, 1200)

@@ -11,7 +11,7 @@ from study_rows import run, table_of, times_of
 from optid.backends import Answer
 from optid.errors import DataError
 from optid.program.solution import Residuals, Status
-from optid.solving import solve as solving
+from optid.solving import claims
 from optid.studies.storage.rows import columns
 from optid.studies.verdicts.comparison import compare
 from optid.studies.verdicts.outcomes import states_of_rows, tabulate
@@ -27,7 +27,7 @@ NAN = float("nan")
 def test_at_its_own_accuracy_a_run_counts_exactly_where_solving_says_so(accuracy, exponents):
     violation, stationarity, complementarity = (float(10**e) for e in exponents)
     residuals = Residuals(violation, "gain", stationarity, complementarity)
-    status, _ = solving._status(Answer(Status.OPTIMAL, "solved"), residuals, accuracy, "a")
+    status, _ = claims._status(Answer(Status.OPTIMAL, "solved"), residuals, accuracy, "a")
     row = run("a", accuracy=accuracy, violation=violation, stationarity=stationarity, complementarity=complementarity)
     assert (tabulate(columns([row])).state[0, 0] == "solved") == (status is Status.LOCAL)
 

@@ -18,7 +18,7 @@ and every iterate is stable by construction.
 the slope with which the level of the output drifts while the input is held where f vanishes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,7 +39,7 @@ MARGIN = 1e-6  # by how much (of the radius of a disc) a region is shrunk, so th
 CHORDS = 12  # sides of the polygon inscribed in half of the region of a damping ratio
 
 FREQUENCIES = 128
-NEARBY = 1e-4  # relative change of the radius by which the price of a larger one is found
+NEARBY = 1e-4  # relative change of a bound by which its price is found
 GAP = 1e-3  # least Re(A / C) on the grid, for what happens between its points
 NO_EQUATION = ("constraint 'integrator' applies to the coefficients of A; a pole at 1 of a state-space model is no "
                "linear equation in its matrices. Use 'oe.exact' or 'hammerstein_oe.exact' with it, or 'ss.exact' with "
@@ -60,6 +60,32 @@ class Side:
         return float(np.min(np.linalg.eigvalsh(matrix)))
 
 
+@dataclass(frozen=True)
+class Region:
+    """Sides that move with one number of the user: its value, what it is called, and the sides as a function of it."""
+
+    value: float
+    words: str
+    sides_at: Callable[[float], list[Side]]
+
+    @property
+    def sides(self) -> list[Side]:
+        """The inequalities at the value."""
+        return self.sides_at(self.value)
+
+    @property
+    def rates(self) -> list[Side]:
+        """Derivatives of the inequalities by the value."""
+        near = NEARBY * (abs(self.value) or 1.0)
+        above, below = self.sides_at(self.value + near), self.sides_at(self.value - near)
+        return [Side((one.constant - other.constant) / (2 * near), (one.linear - other.linear) / (2 * near))
+                for one, other in zip(above, below)]
+
+    def moving(self, member: Any, shift: Any) -> Limit:
+        """Return an inequality whose rows move with the value."""
+        return Limit(member, shift, self.words, step=lambda: 0.01 * abs(self.value), words=self.words)
+
+
 def disc_side(radius: float, centre: float = 0.0) -> Side:
     """|z - centre| <= radius, by the Schur complement of ``radius² - |z - centre|²``."""
     return Side(np.array([[radius, -centre], [-centre, radius]]), np.array([[0.0, 1.0], [0.0, 0.0]]))
@@ -76,29 +102,45 @@ def wedge_side(angle: float, level: float) -> Side:
     return Side(2 * level * np.eye(2), np.array([[-c, s], [-s, -c]]))
 
 
-def region_rule(name: str, sides: Sequence[Side], text: str) -> Rule:
-    """Return a rule that keeps all poles in the intersection of several sides, which are shrunk by `MARGIN` already."""
+def region_rule(name: str, regions: Sequence[Region], text: str) -> Rule:
+    """Return a rule that keeps all poles in the intersection of regions, which are shrunk by `MARGIN` already."""
+    sides = [side for region in regions for side in region.sides]
+
+    def depth(poles: np.ndarray) -> float:
+        return min((side.slack(z) for z in poles for side in sides), default=np.inf)
 
     def verify(model: Any) -> str:
         poles = np.atleast_1d(model.poles)
-        slack = [min(side.slack(z) for side in sides) for z in poles]
-        if not slack or min(slack) >= -10 * MARGIN:
+        if depth(poles) >= -10 * MARGIN:
             return ""
-        worst = poles[int(np.argmin(slack))]  # the one furthest outside
+        worst = min(poles, key=lambda z: depth(np.array([z])))  # the one furthest outside
         shown = f"{worst.real:.6g}" if abs(worst.imag) < 1e-12 else f"{worst.real:.6g} {worst.imag:+.6g}i"
         return f"constraint {name!r}: the pole {shown} lies outside {text}"
 
-    return Rule(name, lambda view: lmi(view, sides, name), verify, frozenset({"poles"}))
+    return Rule(name, lambda view: lmi(view, regions, name), verify, frozenset({"poles"}), depth=depth)
 
 
-def lmi(view: View, sides: Sequence[Side], name: str) -> list[Any]:
-    """Return the inequalities in the P and Q of a shift step; refuse a formulation without (`StructureError`)."""
+def lmi(view: View, regions: Sequence[Region], name: str) -> list[Any]:
+    """Return the inequalities in the P and Q of a shift step; refuse a formulation without (`StructureError`).
+
+    Their prices hold P: at an active pole the derivatives by A and by the bound are in the same proportion for any P.
+    """
     if not isinstance(view.poles, tuple):
         raise StructureError(f"constraint {name!r} applies to the poles of a state-space model; this step has the "
                              "coefficients of a polynomial, for which only 'stable' is available, and up to na = 2 "
                              "'disc'")
     p, q = view.poles
-    return [cp.kron(side.constant, p) + cp.kron(side.linear, q) + cp.kron(side.linear.T, q.T) >> 0 for side in sides]
+
+    def matrix(side: Side) -> Any:
+        return cp.kron(side.constant, p) + cp.kron(side.linear, q) + cp.kron(side.linear.T, q.T)
+
+    return [region.moving(matrix(side) >> 0, matrix(rate))
+            for region in regions for side, rate in zip(region.sides, region.rates)]
+
+
+def disc_region(radius: float, centre: float = 0.0) -> Region:
+    """The disc |z - centre| <= radius."""
+    return Region(radius, "the radius", lambda r: [disc_side(r, centre)])
 
 
 @recorded
@@ -112,18 +154,19 @@ def disc(centre: float, radius: float) -> Rule:
     """
     if not (np.isfinite(centre) and 0 < radius < np.inf):
         raise StructureError(f"disc needs a finite centre and a positive radius; got {centre!r} and {radius!r}")
-    held, sides = radius * (1 - MARGIN), [disc_side(radius * (1 - MARGIN), float(centre))]
-    rule = region_rule(f"disc:{centre:g},{radius:g}", sides, f"the disc of radius {radius:g} around {centre:g}")
+    held = radius * (1 - MARGIN)
+    region = disc_region(held, float(centre))
+    rule = region_rule(f"disc:{centre:g},{radius:g}", [region], f"the disc of radius {radius:g} around {centre:g}")
 
     def build(view: View) -> Any:
         a = view.poles
         if a is None or isinstance(a, tuple) or a.ndim != 1 or a.size > 2:
-            return lmi(view, sides, rule.name)
+            return lmi(view, [region], rule.name)
         if a.size == 1:
-            return [Limit(centre + a <= held), Limit(centre + a >= -held)]
+            return [region.moving(centre + a <= held, 1.0), region.moving(centre + a >= -held, 1.0)]
         # the triangle of the polynomial in w, for z = centre + w
         first, second = 2 * centre + a[0], centre**2 + centre * a[0] + a[1]
-        return _triangle(first, second, held)
+        return _triangle(first, second, region)
 
     return replace(rule, build=build)
 
@@ -136,10 +179,12 @@ def strip(low: float | None = None, high: float | None = None) -> Rule:
         StructureError: no bound, or an empty strip.
     """
     check_bounds("strip", low, high, apart=True)
-    sides = ([wedge_side(np.pi, -low - MARGIN)] if low is not None else []) + (
-        [wedge_side(0.0, high - MARGIN)] if high is not None else [])
+    both: list[tuple[float | None, str, Callable[[float], list[Side]]]] = [
+        (low, "the lower bound", lambda x: [wedge_side(np.pi, -x - MARGIN)]),
+        (high, "the upper bound", lambda x: [wedge_side(0.0, x - MARGIN)])]
+    regions = [Region(bound, words, sides) for bound, words, sides in both if bound is not None]
     ends = ["-inf" if low is None else f"{low:g}", "inf" if high is None else f"{high:g}"]
-    return region_rule(f"strip:{','.join(ends)}", sides, f"the strip {ends[0]} <= Re z <= {ends[1]}")
+    return region_rule(f"strip:{','.join(ends)}", regions, f"the strip {ends[0]} <= Re z <= {ends[1]}")
 
 
 @recorded
@@ -151,8 +196,8 @@ def sector(angle: float) -> Rule:
     """
     if not 0 < angle <= np.pi / 2 + 1e-12:
         raise StructureError(f"the angle of a sector must lie in (0, pi/2], where it is convex; got {angle!r}")
-    return region_rule(f"sector:{angle:g}", [wedge_side(angle + np.pi / 2, -MARGIN)],
-                       f"the sector |arg z| <= {angle:g}")
+    region = Region(angle, "the angle", lambda x: [wedge_side(x + np.pi / 2, -MARGIN)])
+    return region_rule(f"sector:{angle:g}", [region], f"the sector |arg z| <= {angle:g}")
 
 
 @recorded
@@ -168,8 +213,8 @@ def damped(ratio: float) -> Rule:
     """
     if not 0 < ratio < 1:
         raise StructureError(f"the damping ratio must lie in (0, 1); got {ratio!r}")
-    rate = float(ratio / np.sqrt(1 - ratio**2))
-    return region_rule(f"damped:{ratio:g}", damping_sides(rate), f"the region of damping ratio {ratio:g}")
+    region = Region(ratio, "the damping ratio", lambda x: damping_sides(float(x / np.sqrt(1 - x**2))))
+    return region_rule(f"damped:{ratio:g}", [region], f"the region of damping ratio {ratio:g}")
 
 
 def damping_sides(rate: float) -> list[Side]:
@@ -206,13 +251,14 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         raise StructureError(f"the pole radius must lie in (0, 1]; got {radius!r}")
     points = None if real is None else np.atleast_1d(np.asarray(real, dtype=float))
     name, radius = f"stable:{radius:g}", radius * (1 - MARGIN)
+    region = disc_region(radius)
 
     def build(view: View) -> Any:
         a = view.poles
         if isinstance(a, tuple):
             if points is not None:
                 raise StructureError("real= is defined for the coefficients of a polynomial, not for a matrix A")
-            return lmi(view, [disc_side(radius)], name)
+            return lmi(view, [region], name)
         if a is None:
             raise StructureError("there is nothing to stabilise: na is 0")
         if a.ndim != 1:
@@ -221,9 +267,9 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         if points is not None:
             return _real(a, na, radius, points)
         if na == 1:
-            return [Limit(a <= radius), Limit(a >= -radius)]
+            return [region.moving(a <= radius, 1.0), region.moving(a >= -radius, 1.0)]
         if na == 2:
-            return _triangle(a[0], a[1], radius)
+            return _triangle(a[0], a[1], region)
         reference = np.asarray(view.reference.get("a", np.zeros(na)), dtype=float)
         rows, levels, centre = inner_region(reference, radius, keep=view.iterate)
         grid = frequencies(roots_of(scaled(centre, radius)))
@@ -231,7 +277,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         (above, high), (below, low) = (_positive_real(centre * (near / radius) ** np.arange(1, na + 1), near, grid)
                                        for near in (wider, narrower))
         width = wider - narrower
-        return Limit(rows @ a >= levels, ((above - below) @ a - (high - low)) / width)
+        return region.moving(rows @ a >= levels, ((above - below) @ a - (high - low)) / width)
 
     def verify(model: Any) -> str:
         largest = float(np.max(np.abs(model.poles), initial=0.0))
@@ -243,7 +289,10 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
         na = arguments.get("na", 0)
         return "an inner region" if points is not None or isinstance(na, int) and na > 2 else ""
 
-    return Rule(name, build, verify, frozenset({"poles"}), stand_in)
+    def depth(poles: np.ndarray) -> float:
+        return radius - float(np.max(np.abs(poles), initial=0.0))
+
+    return Rule(name, build, verify, frozenset({"poles"}), stand_in, depth if points is None else None)
 
 
 def asks_for_integrator(constraints: Sequence[Any]) -> bool:
@@ -280,12 +329,13 @@ def integrator() -> Rule:
     return Rule("integrator", build, verify, frozenset({"poles", "integrator"}))
 
 
-def _triangle(first: Any, second: Any, radius: float) -> list[Limit]:
-    """The roots of ``z² + first z + second`` in the disc of a radius around zero."""
+def _triangle(first: Any, second: Any, region: Region) -> list[Limit]:
+    """The roots of ``z² + first z + second`` in a disc around zero."""
+    radius = region.value
     first, second = first / radius, second / radius**2
     along, across = first / radius, 2 * second / radius  # minus the derivatives by the radius
-    return [Limit(1 + first + second >= 0, -along - across), Limit(1 - first + second >= 0, along - across),
-            Limit(second <= 1, across)]
+    return [region.moving(1 + first + second >= 0, -along - across),
+            region.moving(1 - first + second >= 0, along - across), region.moving(second <= 1, across)]
 
 
 def inner_region(reference: np.ndarray, radius: float, *, keep: bool = False

@@ -27,6 +27,7 @@ class Rule:
             choose these.
         stand_in: {argument: value} of a formulation -> by what it replaces a condition that is not convex, such as "its
             tangent": a proof would be one for that; "" where it is the condition itself.
+        depth: complex numbers -> by how much poles there obey it, negative where they do not; None for other rules.
         call: module, name and arguments of the function that returned it, from which a pickled rule is built again.
     """
 
@@ -35,6 +36,7 @@ class Rule:
     verify: Callable[[Any], str] | None = None
     about: frozenset[str] = frozenset({"coefficients"})
     stand_in: Callable[[Mapping[str, Any]], str] | None = None
+    depth: Callable[[np.ndarray], float] | None = None
     call: tuple[str, str, tuple[Any, ...], Mapping[str, Any]] | None = field(default=None, repr=False, compare=False)
 
     def __reduce__(self) -> Any:

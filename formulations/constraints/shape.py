@@ -28,7 +28,7 @@ import numpy as np
 
 from formulations.constraints.poles import stable
 from formulations.constraints.rule import Rule, check_bounds, label, recorded, sign_of
-from optid.bases import Triangular
+from optid.bases import PiecewiseConstant
 from optid.errors import StructureError
 from optid.program.limits import Limit
 from optid.program.view import View
@@ -44,7 +44,8 @@ SETTLES = 1e-6  # least 1 + sum(a) of a model that has a static characteristic; 
 def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
     """The nonlinearity, and the static characteristic with it, is "increasing" or "decreasing" over its interval.
 
-    Exact for piecewise linear and constant bases, sufficient for splines (control points), on a dense grid otherwise.
+    On the whole interval; with sines, cosines and functions of your own, at 201 points of it. Exact for piecewise
+    linear and constant bases, sufficient for splines (control points) and polynomials (Bernstein coefficients).
 
     Raises:
         StructureError: unknown direction or channel.
@@ -55,14 +56,23 @@ def monotone(direction: str = "increasing", channel: str | None = None) -> Rule:
 
 @recorded
 def convex(channel: str | None = None) -> Rule:
-    """The nonlinearity, and the static characteristic with it, is convex over the interval of its basis."""
-    return _cone("convex", "", channel, lambda basis: basis.curvature(), heights=False)
+    """The nonlinearity, and the static characteristic with it, is convex over the interval of its basis.
+
+    It holds between samples as `monotone` does.
+
+    Raises:
+        StructureError: a basis of steps, which are neither convex nor concave.
+    """
+    return _cone("convex", "", channel, lambda basis: _smooth(basis, "convex").curvature(), heights=False)
 
 
 @recorded
 def concave(channel: str | None = None) -> Rule:
-    """The nonlinearity, and the static characteristic with it, is concave over the interval of its basis."""
-    return _cone("concave", "", channel, lambda basis: -basis.curvature(), heights=False)
+    """The nonlinearity, and the static characteristic with it, is concave over the interval of its basis.
+
+    As `convex`.
+    """
+    return _cone("concave", "", channel, lambda basis: -_smooth(basis, "concave").curvature(), heights=False)
 
 
 @recorded
@@ -117,8 +127,15 @@ def saturation(low: float | None = None, high: float | None = None, channel: str
 @recorded
 def slope(low: float | None = None, high: float | None = None, channel: str | None = None,
           output: str | None = None) -> Rule:
-    """The slope of the static characteristic lies in [low, high] (units of output per unit of input)."""
-    return _static("slope", low, high, channel, output, lambda basis: basis.slope_rows(), offset=False)
+    """The slope of the static characteristic lies in [low, high] (units of output per unit of input).
+
+    It holds between samples as `monotone` does.
+
+    Raises:
+        StructureError: no bound, crossing bounds, or a basis of steps, which have no slope.
+    """
+    return _static("slope", low, high, channel, output, lambda basis: _smooth(basis, "slope").slope_rows(),
+                   offset=False)
 
 
 @recorded
@@ -126,7 +143,7 @@ def value_range(low: float | None = None, high: float | None = None, channel: st
                 output: str | None = None, first: float | None = None, last: float | None = None) -> Rule:
     """The static characteristic lies in [low, high] (units of the output) where the input lies in [first, last].
 
-    Exact for `Triangular`, on a dense grid for the other bases.
+    On the whole corridor, also between samples; for sines, cosines and functions of your own at 201 points.
 
     Args:
         low: lower bound.
@@ -143,8 +160,7 @@ def value_range(low: float | None = None, high: float | None = None, channel: st
         if ends[0] > ends[1] or ends[1] < basis.interval[0] or ends[0] > basis.interval[1]:
             raise StructureError(f"the corridor [{ends[0]:g}, {ends[1]:g}] lies outside the interval "
                                  f"[{basis.interval[0]:g}, {basis.interval[1]:g}] of the input")
-        points = basis.nodes if isinstance(basis, Triangular) else basis.grid()
-        return basis.values(np.unique([*inside, *points[(points > inside[0]) & (points < inside[1])]]))
+        return basis.value_rows(*inside)
 
     return _static("range", low, high, channel, output, rows, offset=True)
 
@@ -264,7 +280,15 @@ def sign(name: str = "b", direction: str = "positive") -> Rule:
 
 def slopes_at(basis: Any, at: float | None) -> np.ndarray:
     """Return the slopes (1, P) of the functions at an operating point, None for the middle of the interval."""
-    return basis.slopes(np.array([float(np.mean(basis.interval)) if at is None else float(at)]))
+    return _smooth(basis, "gain").slopes(np.array([float(np.mean(basis.interval)) if at is None else float(at)]))
+
+
+def _smooth(basis: Any, word: str) -> Any:
+    """Refuse a basis of steps for a rule about slopes."""
+    if isinstance(basis, PiecewiseConstant):
+        raise StructureError(f"{word!r} is about slopes, and a piecewise constant function has none: choose "
+                             f"'triangular:{basis.p}', or bound its steps by monotone or range")
+    return basis
 
 
 def _inputs(view: View, channel: str | None) -> Sequence[str]:

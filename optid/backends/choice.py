@@ -88,8 +88,9 @@ FALLBACKS = ("daqp", "qoco", "highs", "cvxopt", "ipopt")
 
 
 def fallbacks(program: "Program", failed: str) -> Iterator[BackEnd]:
-    """Yield the installed back ends that can solve a convex programme in place of one that gave no usable answer."""
-    for name in FALLBACKS if program.kind != "NLP" and failed in AUTO["convex"] else ():
-        back_end = back_ends().get(name)
+    """Yield the installed back ends that can solve a programme in place of one that gave no usable answer."""
+    names = AUTO["NLP"] if program.kind == "NLP" else FALLBACKS if failed in AUTO["convex"] else ()
+    for name in names:
+        back_end = back_ends().get(name) if name != failed else None
         if back_end is not None and back_end.installed and not back_end.refuses(program):
             yield back_end

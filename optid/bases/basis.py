@@ -4,6 +4,7 @@ A basis spans f(u) = eta(u)^T mu and never contains the constant function: hats 
 regressor matrix of a model with two or more numerator lags is singular whatever the data. The model carries one offset.
 """
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any, ClassVar, Literal, Self, cast
 
@@ -154,6 +155,11 @@ class Basis:
         """(r, P): bounds on all rows @ mu bound the slope of f; here the slopes at the points of `grid`."""
         return self.slopes(self.grid())
 
+    def value_rows(self, first: float, last: float) -> Array:
+        """(r, P): bounds on all rows @ mu bound f on [first, last] of the interval; here the points of `grid` there."""
+        points = self.grid()
+        return self.values(np.unique([first, last, *points[(points > first) & (points < last)]]))
+
     def curvature(self) -> Array:
         """(r, P): all rows @ mu >= 0 makes f convex; here second differences at the points of `grid`."""
         points = self.grid()
@@ -220,6 +226,26 @@ class Basis:
     def _reduced(self, complete: Array) -> Array:
         """Multiply the complete family by the contrast: remove the column that is redundant."""
         return complete if self.dropped is None else np.delete(complete, self.dropped, axis=1)
+
+
+def bernstein(function: Callable[[Array], Array], edges: Array, degree: int) -> Array:
+    """Return Bernstein coefficients (r, P) of functions that are polynomials of a degree between edges (c + 1,).
+
+    On every part a combination of the functions lies between the smallest and the largest of its coefficients there;
+    the smaller the part, the nearer.
+    """
+    from scipy.special import comb
+
+    if degree < 0 or not edges[0] < edges[-1]:
+        return function(edges[[0, -1]])
+    j = np.arange(degree + 1)
+    x = (1 - np.cos((2 * j + 1) * np.pi / (2 * degree + 2))) / 2
+    matrix = comb(degree, j) * x[:, None] ** j * (1 - x[:, None]) ** (degree - j)
+    points = edges[:-1, None] + np.diff(edges)[:, None] * x
+    values = function(points.ravel())
+    found = np.linalg.solve(matrix, values.reshape(len(points), degree + 1, values.shape[1]))
+    # continuous functions share a coefficient with their neighbours, the value between them
+    return np.vstack([found[0, :1], found[:, 1:].reshape(-1, values.shape[1])]) if degree else found[:, 0]
 
 
 def spread(first: NDArray[np.int32], weights: Array, size: int) -> Array:

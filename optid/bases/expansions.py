@@ -1,6 +1,8 @@
 """Bases whose functions vanish nowhere in particular: polynomials, sines and cosines, the user's own, the identity.
 
-Their shape matrices act on values at the points of `grid`: f is monotone, convex or bounded in slope at those points.
+The shape matrices of polynomials act on Bernstein coefficients, between the smallest and the largest of which a
+polynomial lies (Farouki 2012): what they ask for holds on the whole interval. Those of sines, cosines and the user's
+own functions act on values at the points of `grid`: f is monotone, convex or bounded in slope at those points.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
-from optid.bases.basis import Basis, Outside, span
+from optid.bases.basis import Basis, Outside, bernstein, span
 from optid.errors import StructureError
 
 Function = Callable[[Array], ArrayLike]
+PIECES = 40  # of an interval, on each of which a polynomial lies between its Bernstein coefficients
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,25 @@ class Polynomial(Basis):
     def full_size(self) -> int:
         """Number of functions, p."""
         return self.p
+
+    def increments(self) -> Array:
+        """Bernstein coefficients of the slope on `PIECES` parts of the interval."""
+        return self._bernstein(1)
+
+    slope_rows = increments
+
+    def curvature(self) -> Array:
+        """Bernstein coefficients of the second derivative on `PIECES` parts of the interval."""
+        return self._bernstein(2)
+
+    def value_rows(self, first: float, last: float) -> Array:
+        """Bernstein coefficients of the functions on `PIECES` parts of [first, last]."""
+        return self._bernstein(0, first, last)
+
+    def _bernstein(self, order: int, first: float | None = None, last: float | None = None) -> Array:
+        lo, hi = span(self)
+        edges = np.linspace(lo if first is None else first, hi if last is None else last, PIECES + 1)
+        return bernstein(lambda x: self._derivative(x, order), edges, self.p - order)
 
     def _quadrature(self) -> tuple[Array, int]:
         return np.array(span(self)), self.p  # exact

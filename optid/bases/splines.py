@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.bases.basis import Basis, Outside, span
+from optid.bases.basis import Basis, Outside, bernstein, span
+
+PARTS = 8  # of every cell, by which the values of a spline of degree 2 or more are bounded
 
 
 class _Splines(Basis):
@@ -54,6 +56,16 @@ class _Splines(Basis):
     def curvature(self) -> Array:
         """(full_size - 2, P) changes of the slope rows."""
         return np.diff(self.slope_rows(), axis=0)
+
+    def value_rows(self, first: float, last: float) -> Array:
+        """Values in the cells that [first, last] meets, or Bernstein coefficients of parts of them."""
+        inner = np.unique(self.knots)
+        if not self.degree:
+            centres = (inner[:-1] + inner[1:]) / 2
+            return self.values(centres[(inner[1:] > first) & (inner[:-1] <= last)])
+        parts = 1 if self.degree == 1 else PARTS
+        inner = np.interp(np.arange(parts * (len(inner) - 1) + 1) / parts, np.arange(len(inner)), inner)
+        return bernstein(self.values, np.unique([first, *inner[(inner > first) & (inner < last)], last]), self.degree)
 
     def penalty(self, order: int = 2) -> Array:
         """Integral of (f^(order))^2, exact up to the degree; beyond it squared differences over the cell width."""

@@ -55,7 +55,7 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
 
 def _least_squares_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float
                          ) -> tuple[float, str]:
-    best = _quadratic_bound(program, form, duals, objective), "least-squares dual of the solver's multipliers"
+    best = _quadratic_bound(program, form, duals, objective), "least-squares dual of the multipliers"
     if relative_gap(objective, best[0], program.scale) > CLOSED and (own := _own_multipliers(program, form)):
         value = _quadratic_bound(program, form, own, objective)
         best = max(best, (value, "least-squares dual of multipliers by least-distance programming"))

@@ -56,7 +56,8 @@ def satisfiable(program: Program, names: Sequence[str]) -> bool:
     """Whether the named constraints can hold together, as far as a convex outer approximation tells."""
     form = rank_one_of(program)
     # a structural constraint that is not convex (the norm of b) only fixes a scale: it cannot cause a conflict
-    found = [c for name in program.structural for c in program.constraints[name] if c.is_dcp()]
+    structural = [c for name, group in program.constraints.items() if name in program.structural for c in group]
+    found = [c for c in structural if c.is_dcp()]
     where = None if form is None else places(program, form)
     if program.start:
         program.assign(program.start)

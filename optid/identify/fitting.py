@@ -13,6 +13,7 @@ import numpy as np
 
 from optid.annotations import check_values
 from optid.bases import Linear, fitted_bases
+from optid.certificate.multipliers import least_multipliers
 from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
 from optid.errors import (
@@ -369,11 +370,11 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
         _raise_failure(outcome)
     _in_raw_units(outcome.model, data)  # a model without an equivalent in raw units is refused here
     findings = findings + _violated(outcome.model, arguments.get("constraints", ()))
-    compressed, figures = outcome.program.compressed, dict(outcome.figures)
-    if compressed is not None:
-        figures |= {key: getattr(compressed.statistics, key) for key in ("rows", "candidates", "condition", "method")}
+    compressed, words = outcome.program.compressed, ("rows", "candidates", "condition", "method")
+    told = {} if compressed is None else {word: getattr(compressed.statistics, word) for word in words}
+    figures = {**told, **outcome.figures}
     findings = findings + examine_figures(figures)
-    prices = price_constraints(outcome.program, outcome.solution)
+    prices = price_constraints(outcome.program, outcome.solution, least_multipliers)
     earlier = price_earlier_steps(outcome.constrained, outcome.program)
     log.debug("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
               time.perf_counter() - started)

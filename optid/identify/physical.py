@@ -163,7 +163,7 @@ class PhysicalErrors(Criterion):
         """Return no directions."""
         return np.zeros((0, self.unknowns.shared))
 
-    def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
+    def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
         """Return a generator of weighted rows [x0 | parameters | errors] of experiment i, zero if y is missing."""
         p, states = self.split(x)
         weigh = np.sqrt(np.diag(self.weight))
@@ -183,13 +183,13 @@ class PhysicalErrors(Criterion):
 
     def linearise(self, x: Array, method: Method = "auto") -> Linearised:
         """Return the errors near x; of infinite size where they or their sensitivities are not finite."""
-        unknowns, blocks, infinite = self.unknowns, self.blocks(x), []
+        unknowns, rows, infinite = self.unknowns, self.rows(x), []
 
         def bounded(i: int) -> Iterator[tuple[Array, int]]:
-            for rows, count in blocks(i):
-                finite = np.abs(rows) < LIMIT
+            for block, count in rows(i):
+                finite = np.abs(block) < LIMIT
                 infinite.extend([i] * (not finite.all()))
-                yield np.where(finite, rows, 0.0), count
+                yield np.where(finite, block, 0.0), count
 
         found = linearised(bounded, unknowns.experiments, unknowns.n, unknowns.shared, method=method)
         return replace(found, remainder=np.inf) if infinite else found

@@ -49,7 +49,13 @@ class Tangent:
     directions: Array  # (n_x, n) dx/dv, v the whitened tangent coordinates
     local: LocalEstimate = field(repr=False)  # the estimate in these coordinates
     noise: Array  # (l, l) covariance of the equation error e, in raw units
-    meaning: str  # of the intervals, one of `MEANINGS`
+    kind: str  # of the intervals, one of `MEANINGS`
+    words: tuple[str, ...] = ()  # what the errors are that white ones of one level are not
+
+    @property
+    def meaning(self) -> str:
+        """Description of the intervals."""
+        return "; ".join([MEANINGS[self.kind], *(f"errors {word}" for word in self.words)])
 
     def __getstate__(self) -> dict[str, Any]:
         _ = self.neighbours  # `rebuild`, which holds the programme, is not needed afterwards
@@ -122,11 +128,11 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     # drawn in the rows of the problem, where no choice of a basis of the tangent space changes the draws
     scatter = symmetric_root(spread.covariance) @ basis.T
     local = LocalEstimate(centre, scatter, spread.dof, inequalities @ directions, slack, draws, seed)
-    meaning = "penalised" if spread.penalised else "projected" if local.held else "gaussian"
+    kind = "penalised" if spread.penalised else "projected" if local.held else "gaussian"
     transform = getattr(fit.data, "transform", None)
     scale = np.ones(len(spread.noise)) if transform is None else np.array(transform.y_scale)
     return Tangent(rebuild, shapes, x, directions, local, program.unit * spread.noise * np.outer(scale, scale),
-                   MEANINGS[meaning])
+                   kind, spread.words)
 
 
 def _unpacked(shapes: dict[str, tuple[int, ...]], x: Array) -> dict[str, Array]:

@@ -31,7 +31,7 @@ OVERFIT = 12.0  # points that the cross-validated fit may be below that on the r
 GAP = 15.0  # points that the one-step prediction may be better than the free run
 # errors of the response that inputs explain, over the spread of the simulated output: of a model that is not good, and
 NOTED, WRONG = 0.07, 0.10  # of one that is poor
-UNCERTAIN = 0.1  # standard error of the step response, over its size
+UNCERTAIN = 0.07  # standard error of the step response, over its size
 POINTS = 20  # of a step response, at which it is looked at
 APART = 0.12  # difference of the response from that of the low-order model, in a loop
 STRUCTURE = 0.1  # share of the residual variance that another structure may save in a model that is called good
@@ -137,7 +137,9 @@ def _residuals(model: Any, data: Data, predicted: Sequence[Array]) -> list[Findi
         failed = [test for test in tests[kind].values() if not test.passed]
         known = any(np.isfinite(test.p_value) for test in tests[kind].values())
         words = ", ".join(f"{test.output} {f'on {test.input}' if kind[0] == 'c' else 'on its past'}" for test in failed)
-        found.append(Finding(name, words or ("kept" if known else UNKNOWN), not failed, known))
+        coloured = any(test.significant for test in tests[kind].values())  # of which a model without noise says nothing
+        found.append(Finding(name, words or (("coloured" if coloured else "kept") if known else UNKNOWN), not failed,
+                             known))
     return found
 
 

@@ -18,6 +18,7 @@ class Spread:
     noise: Array  # (l, l) covariance of the errors, in units of the objective
     dof: float  # degrees of freedom that are left to estimate it
     penalised: bool = False  # whether a penalty is part of the objective
+    words: tuple[str, ...] = ()  # what the errors are found to be that white ones of one level are not
 
 
 class Compressed(Protocol):

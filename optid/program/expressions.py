@@ -1,8 +1,11 @@
 """CVXPY expressions: how they are written and solved, their derivatives and sizes at the assigned point."""
 
+import ctypes
+import os
+import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -39,7 +42,8 @@ def solve_quietly(problem: cp.Problem, solver: str = "CLARABEL", **options: Any)
 
     A solver that crashes is a `cvxpy.SolverError`, also where a panic of Rust ends it, which is no `Exception`.
     """
-    with warnings.catch_warnings():
+    greets = solver == "HIGHS" and not options.get("verbose")
+    with warnings.catch_warnings(), _unprinted() if greets else nullcontext():
         warnings.simplefilter("ignore")
         try:
             problem.solve(solver=solver, **options)
@@ -47,6 +51,28 @@ def solve_quietly(problem: cp.Problem, solver: str = "CLARABEL", **options: Any)
             if isinstance(error, Exception) or not is_crash(error):
                 raise
             raise cp.SolverError(f"{solver} crashed: {error}") from error
+
+
+@contextmanager
+def _unprinted() -> Iterator[None]:
+    """Drop what compiled code writes to standard output: HiGHS says its name whatever its options are."""
+    try:
+        kept = os.dup(1)
+    except OSError:  # there is no standard output
+        yield
+        return
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        with suppress(OSError, TypeError, AttributeError):  # its buffer; Windows keeps one for every library
+            ctypes.CDLL(None).fflush(None)
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def is_crash(error: BaseException) -> bool:

@@ -12,7 +12,7 @@ from optid.program.expressions import flat_value, jacobians
 from optid.program.limits import EQUALITIES, INEQUALITIES, rows_of, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals
-from optid.program.structure import relative_gradient, variable_size
+from optid.program.structure import variable_size
 
 KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
          "sum_largest", "lambda_sum_largest", "pos", "neg"}
@@ -194,8 +194,15 @@ class Lagrangian:
             part = self.free_part(variable)
             if part is None:
                 return float("nan")
-            worst = max(worst, relative_gradient(part, self.terms[variable.id], yardstick, _size(variable, self.usual)))
+            here = float(np.max(part / self.floor(variable, yardstick), initial=0.0))
+            if not here <= worst:  # also true for nan
+                worst = here
         return worst
+
+    def floor(self, variable: cp.Variable, yardstick: float) -> np.ndarray:
+        """Return what the components of the gradient by a variable are relative to, (size,)."""
+        floor = yardstick / _size(variable, self.usual) + self.terms[variable.id]
+        return np.where(floor > 0, floor, 1.0)
 
     def gradient(self, variable: cp.Variable) -> np.ndarray:
         """Return the gradient in the shape of a variable, symmetric where the variable is."""

@@ -31,8 +31,8 @@ class Limit:
     """
 
     member: Constraint  # the constraint as the user wrote it
-    # by how much every row moves per unit of the bound: a number or an expression; for a cone an array, flat, or a
-    # number where that is not known
+    # by how much every row moves per unit of the bound: a number or an expression; for a cone an array or an
+    # expression, or a number where that is not known
     shift: Any = 1.0
     bound: str | None = ""  # name of the bound; rows of one name move together. None: each row has its own bound
     # (rows, entries) for an equality that stands for ``|rows @ x| <= t`` with t = 0: the rows
@@ -82,20 +82,26 @@ def spans(group: Sequence[Constraint]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges, edges[1:])]
 
 
-def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray) -> tuple[float, int]:
+def slope_of(limits: tuple[Limit, ...], steps: Sequence[float], multipliers: np.ndarray,
+             least: Callable[[np.ndarray], np.ndarray] | None = None) -> tuple[float, int]:
     """Return the derivative of the objective by the most expensive bound of a constraint, and its limit's position.
 
     Bounds are compared by what a small step of each gains. The multipliers are those of the rows as they are scaled,
-    flat over the members, per unit of the objective.
+    flat over the members, per unit of the objective; `least` returns, for an effect of them, others with the least.
     """
-    totals = {}
-    for number, (limit, span) in enumerate(zip(limits, spans([limit.member for limit in limits]))):
-        part = multipliers[span]
-        if not isinstance(limit.member, EQUALITIES | INEQUALITIES):
-            known = isinstance(limit.shift, np.ndarray)
-            totals[number] = float(part @ limit.shift if known else np.max(np.abs(part), initial=0.0)), number
+    totals, places = {}, spans([limit.member for limit in limits])
+    effects: dict[Any, np.ndarray] = {}
+    for limit, span in zip(limits, places) if least is not None else ():
+        if limit.bound is not None and limit.band is None and isinstance(limit.member, EQUALITIES | INEQUALITIES):
+            effects.setdefault(limit.bound, np.zeros_like(multipliers))[span] = limit.speeds() / limit.sizes
+    said = {name: least(effect) for name, effect in effects.items()} if least is not None else {}
+    for number, (limit, span) in enumerate(zip(limits, places)):
+        part = said.get(limit.bound, multipliers)[span]
+        cone = not isinstance(limit.member, EQUALITIES | INEQUALITIES)
+        if cone and not isinstance(limit.shift, np.ndarray | cp.Expression):
+            totals[number] = float(np.max(np.abs(part), initial=0.0)), number
             continue
-        part = part / limit.sizes
+        part = part if cone else part / limit.sizes
         if limit.band is not None and limit.span is not None:
             totals[number] = _band_slope(part, limit.band, limit.span), number
         elif limit.bound is None:

@@ -1,7 +1,8 @@
 """What every constraint costs: activity, slack, multiplier, and the multiplier in points of fit."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
@@ -48,8 +49,14 @@ class Price:
         return self.fit_points * self.step
 
 
-def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]:
+Least = Callable[[Program, Mapping[str, np.ndarray]], Callable[[str, np.ndarray], np.ndarray] | None]
+"""`optid.certificate.multipliers.least_multipliers`."""
+
+
+def price_constraints(program: Program, solution: Solution, least: Least | None = None) -> tuple[Price, ...]:
     """Return the price of every user constraint; empty without a point.
+
+    Where the multipliers of a point are not unique, those count that say least (``least``).
 
     ``fit = 100 (1 - sqrt(F / S))`` with S the energy of the outputs about their means, so that a multiplier
     lambda = -dF/d(bound) is worth ``50 lambda / sqrt(F S)`` points.
@@ -62,6 +69,7 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
     # two roots: the product of two sums of squares may leave the range of numbers
     worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy)) / np.sqrt(energy) if energy > 0 else np.nan
     found, usual = [], program.usual_sizes
+    exchanged = least(program, solution.duals) if least is not None and solution.duals else None
     for name, group in program.user_constraints.items():
         limits = program.limits.get(name) or tuple(Limit.of(member) for member in group)
         active, rows, slack = 0, 0, np.inf
@@ -72,7 +80,8 @@ def price_constraints(program: Program, solution: Solution) -> tuple[Price, ...]
             slack = min(slack, float(np.min(gaps, initial=np.inf)))
         dual = solution.duals.get(name)
         steps = [0.01 * term_size(limit.member, usual) if limit.step is None else limit.step() for limit in limits]
-        slope, chosen = slope_of(limits, steps, dual) if dual is not None else (np.nan, 0)
+        choose = None if exchanged is None else partial(exchanged, name)
+        slope, chosen = slope_of(limits, steps, dual, choose) if dual is not None else (np.nan, 0)
         found.append(Price(name, active, rows, max(slack, 0.0), unit * slope, unit * slope * worth, steps[chosen],
                            limits[chosen].words or "the size of what it bounds"))
     return tuple(found)

@@ -130,10 +130,10 @@ class Solution:
 
     @property
     def false_claim(self) -> bool:
-        """Whether the solver claimed a success, or infeasibility, and our measurements took it back."""
+        """Whether the solver claimed a success, or that there can be none, and our measurements took it back."""
         if self.claim in (Status.OPTIMAL, Status.LOCAL):
             return self.status not in (Status.OPTIMAL, Status.LOCAL)
-        return self.claim is Status.INFEASIBLE and self.status is Status.FAILED
+        return self.claim in (Status.INFEASIBLE, Status.UNBOUNDED) and self.status is Status.FAILED
 
     def in_units(self, unit: float) -> "Solution":
         """Return the same with objective, bound and scale multiplied by a unit."""

@@ -29,7 +29,7 @@ def parameter_tables(fit: "Fit") -> list[Table]:
         rows = [interval_row(name, *row) for name, *row in known.table()]
         state_space = fit.model.structure == "ss"
         found.append(Table("Poles and static gain" if state_space else "Parameters",
-                           ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows))
+                           ("parameter", "estimate", "std. error", "95 % low", "95 % high"), rows, _remark(known)))
         if not state_space:
             return found
     rows = [(name, number(value)) for name, value in fit.model.coefficients()]
@@ -38,6 +38,11 @@ def parameter_tables(fit: "Fit") -> list[Table]:
     if len(rows) <= MOST_ROWS:
         return [*found, Table(title, ("parameter", "estimate"), rows, note)]
     return [*found, Table(title, ("parameter", "estimate") * ABREAST, _abreast(rows), note)]
+
+
+def _remark(known: Any) -> str:
+    words = getattr(known.source, "words", ())
+    return f"The errors are {' and '.join(words)}; the standard errors account for it." if words else ""
 
 
 def nonlinearity_tables(fit: "Fit", inputs: bool) -> list[Table]:

@@ -5,31 +5,19 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
-from optid.arrays import LARGEST
-from optid.backends.back_end import Answer, BackEnd, Settings
+from optid.backends.back_end import BackEnd, Settings
 from optid.backends.choice import choose, fallbacks, find
-from optid.certificate.convex import TANGENT, certify_convex
-from optid.certificate.infeasibility import satisfiable
-from optid.errors import SolverRefused, StructureError
-from optid.packing import Unsendable
-from optid.processes import LONGEST, run_apart
-from optid.program.expressions import is_crash
-from optid.program.judging import judge, measure_violation
-from optid.program.program import Program, Values
-from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, Times, relative_gap, tolerance
-from optid.structures.least_squares import rank_one_of
+from optid.errors import SolverRefused
+from optid.processes import LONGEST
+from optid.program.program import Program
+from optid.program.solution import Bound, Solution, Status, Times
+from optid.solving.answers import answer_of
+from optid.solving.claims import FALSE_CLAIM, verdict
 
 Procedure = Generator[Program, Solution, Any]
 
-FALSE_CLAIM = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
 ENDLESS = LONGEST / 2  # seconds; a longer time limit, such as infinity, is none
-GRACE = 0.5  # seconds after its time limit at which a solver is killed
 UNUSABLE = (Status.FAILED, Status.LIMIT)
-OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
-CONFLICT = "the constraints contradict each other"
-NOT_FINITE = "returned non-finite numbers"  # the reason of such a solution, after its solver
 
 
 def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
@@ -75,18 +63,19 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
 
     def attempt(back_end: BackEnd, settings: Settings, chosen: str, spent: float = 0.0) -> Solution:
         clock = time.perf_counter()
-        answer = _attempt(program, back_end, settings, separate)
+        answer = answer_of(program, back_end, settings, separate)
         seconds = spent + time.perf_counter() - clock
         base = Solution(answer.status, answer.word, back_end.name, chosen=chosen, scale=program.scale,
                         iterations=answer.iterations, times=Times(solve=seconds, compile=answer.compile),
                         claim=answer.status)
-        return _verdict(program, back_end, answer, base, settings, prove, separate).in_units(program.unit)
+        return verdict(program, back_end, answer, base, settings, prove, separate).in_units(program.unit)
 
     solution = attempt(back_end, settings, chosen)
     if not chosen or options:
         return solution
     outside = solution.residuals is not None and solution.residuals.violation > FALSE_CLAIM
-    if solution.status is Status.FAILED or (solution.status is Status.LIMIT and outside):
+    ended = solution.status is Status.LIMIT and (outside or time_limit is None)
+    if solution.status is Status.FAILED or ended:
         for other in fallbacks(program, back_end.name):
             found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")
             if found.status is Status.INFEASIBLE or (found.has_point and found.status not in UNUSABLE):
@@ -106,185 +95,6 @@ def _substitutions(steps: Sequence[tuple[str, Solution]]) -> dict[str, str]:
     first, others = replaced[0].failed, ", ".join(dict.fromkeys(solution.solver for solution in replaced))
     return {"solver fallback": f"{first} gave no usable answer for {len(replaced)} of {len(steps)} programmes, which "
                                f"{others} solved"}
-
-
-def _attempt(program: Program, back_end: BackEnd, settings: Settings, separate: bool) -> Answer:
-    """Run a back end from the programme's start, in another process where it is to be separate; every outcome counts.
-
-    What only models and proofs need may stay here (`optid.packing.Absent`).
-    """
-    program.clear_duals()
-    if settings.warm and program.start:
-        program.assign(program.start)
-    if not separate:
-        return _run(back_end, program, settings)
-    clock = time.monotonic()
-    try:
-        limit = None if settings.time_limit is None else settings.time_limit + GRACE
-        return run_apart(_run, back_end, program, settings, seconds=limit, lenient=True)
-    except TimeoutError:
-        return Answer(Status.LIMIT, f"stopped after {time.monotonic() - clock:.1f} s: it did not keep its time limit")
-    except ChildProcessError as death:
-        return Answer(Status.FAILED, f"the solver's process died: {death}")
-    except Unsendable as refusal:
-        raise SolverRefused(f"a separate process for {back_end.name!r} is not possible: {refusal}; or use neither "
-                            "time_limit nor isolate") from refusal
-
-
-def _run(back_end: BackEnd, program: Program, settings: Settings) -> Answer:
-    """Run a back end; an exception of its own is an answer, too, also in a child."""
-    try:
-        return back_end.run(program, settings)
-    except Unsendable:
-        raise
-    except StructureError as refusal:  # its message has the remedy for the user
-        raise SolverRefused(str(refusal)) from refusal
-    except BaseException as error:  # a solver that crashes is an outcome, not a traceback
-        if not is_crash(error):
-            raise
-        return Answer(Status.FAILED, f"{type(error).__name__}: {error}")
-
-
-def _verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution, settings: Settings, prove: bool,
-             separate: bool) -> Solution:
-    values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
-    if not values:
-        status, reason = _without_point(program, answer, back_end.name)
-        if status is Status.FAILED and _contradictory(program):
-            return _conflict(base, reason)
-        return replace(base, status=status, reason=reason)
-    if not all(np.all(np.isfinite(value)) for value in values.values()):
-        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
-    if missing := program.shapes.keys() - values.keys():
-        return replace(base, status=Status.FAILED,
-                       reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
-
-    clock = time.perf_counter()
-    try:
-        point = _judged(program, answer, base)
-    except ValueError as error:  # CVXPY takes no value of another shape, and none that overflowed
-        why = NOT_FINITE if _overflowed(program) else f"returned a point that cannot be judged: {error}"
-        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
-    judged = time.perf_counter()
-    assert point.residuals is not None
-    if not abs(point.objective) <= LARGEST:  # models refuse such numbers, since their squares overflow
-        return replace(point, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}", values={}, duals={})
-    status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
-    if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
-        return _conflict(base, reason)
-    bound: Bound | None = None
-    if status in (Status.LOCAL, Status.INACCURATE) and prove:
-        point, bound = _proof(program, back_end, settings, point, separate)
-        assert point.residuals is not None
-        outside = point.residuals.violation > tolerance(settings.accuracy)
-        if bound is not None and bound.proved and outside:  # a point outside may well lie below the optimum
-            bound = replace(bound, proved=False, reason=f"no proof: the point violates {point.residuals.worst!r}")
-        if bound is not None and bound.proved and status is Status.LOCAL:
-            status = Status.OPTIMAL
-        elif bound is not None and status is Status.LOCAL and _refuted(program, point, bound, settings.accuracy):
-            status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
-    done = time.perf_counter()
-    return replace(point, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
-                   bound=bound, times=replace(base.times, judge=judged - clock, prove=done - judged))
-
-
-def _conflict(base: Solution, reason: str) -> Solution:
-    """Report that no point satisfies the constraints; the point of the solver is dropped."""
-    return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}")
-
-
-def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
-    """Return a solution at the answer's point, with what we measured there."""
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
-        values, objective, residuals = judge(program, answer.values, answer.duals)
-    return replace(base, values=values, duals=dict(answer.duals), objective=objective, residuals=residuals)
-
-
-def _overflowed(program: Program) -> bool:
-    """Whether quantities that follow from the assigned variables are not finite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        values = [np.asarray(expression.value) for expression in program.derived.values()]
-    return any(value.dtype == object or not np.all(np.isfinite(value)) for value in values)
-
-
-def _contradictory(program: Program) -> bool:
-    """Whether the constraints of a bilinear programme contradict each other: its descents cannot tell."""
-    return rank_one_of(program) is not None and bool(program.user_constraints) and not satisfiable(
-        program, list(program.user_constraints))
-
-
-def _without_point(program: Program, answer: Answer, name: str) -> tuple[Status, str]:
-    """Judge a claim that comes without a point."""
-    if answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
-        return Status.FAILED, f"{name} claims success, but returned no point"
-    if answer.status is Status.INFEASIBLE and program.start:
-        program.assign(program.start)
-        if all(v.value is not None for v in program.variables.values()) and measure_violation(program)[0] < 1e-9:
-            return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
-    return answer.status, answer.word
-
-
-def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
-    """Turn a claim and our measurements into a status: success at a bad point is downgraded."""
-    limit = tolerance(accuracy)
-    claims = answer.status in (Status.OPTIMAL, Status.LOCAL)
-    outside = residuals.violation > limit
-    amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)" if outside else ""
-    if answer.status is Status.INFEASIBLE and not outside:
-        return Status.FAILED, f"{name} claims infeasibility at a point that satisfies every constraint"
-    if answer.status not in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
-        return answer.status, f"{answer.word}; {amount}" if amount else answer.word
-    if outside:
-        if residuals.violation > FALSE_CLAIM:
-            return Status.FAILED, f"{name} claims success, but {amount}" if claims else f"{answer.word}; {amount}"
-        return Status.INACCURATE, amount
-    if residuals.stationarity > GRADIENT * limit or residuals.complementarity > limit:
-        return Status.INACCURATE, (
-            f"{name + ' claims success' if claims else answer.word}, but the point is not stationary: "
-            f"residual {residuals.stationarity:.1e}, complementarity {residuals.complementarity:.1e}")
-    if not claims and not np.isfinite(residuals.stationarity):
-        return Status.INACCURATE, answer.word
-    return Status.LOCAL, ""
-
-
-def _refuted(program: Program, point: Solution, bound: Bound, accuracy: float) -> bool:
-    """Whether the dual bound of a convex programme leaves room for a better point, beyond the tolerance."""
-    if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or program.kind == "NLP":
-        return False
-    return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
-
-
-def _proof(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool
-           ) -> tuple[Solution, Bound | None]:
-    """Ask for a proof; what the attempt proposes as a better start, and a wider search, may lead to a better point."""
-    if program.certify is None:
-        if program.kind == "NLP":
-            return point, None
-        try:
-            return point, certify_convex(program, point.values, point.duals, point.objective)
-        except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-            return point, None
-    bound, start = program.certify(program, point.values, point.duals)
-    if start is not None and not bound.proved:
-        point, bound = _lowered(program, start, back_end, settings, point, bound, separate)
-    if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
-        wider = replace(settings, options={**back_end.thorough, **settings.options})
-        point, bound = _lowered(program, program.start, back_end, wider, point, bound, separate)
-    return point, bound
-
-
-def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: Solution, bound: Bound,
-             separate: bool) -> tuple[Solution, Bound]:
-    """Solve again from a start, and certify the point found there where it lies lower."""
-    answer = _attempt(replace(program, start=start), back_end, settings, separate)
-    if answer.values and program.certify is not None:
-        again = _judged(program, answer, point)
-        assert again.residuals is not None and point.residuals is not None
-        lower = again.objective < point.objective - 1e-10 * abs(point.objective)
-        if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
-            point, bound = again, program.certify(program, again.values, again.duals)[0]
-    program.assign(point.values)
-    return point, bound
 
 
 @dataclass(frozen=True)

@@ -70,25 +70,49 @@ def _added(total: Array, filtered: Array, root: Array) -> Array:
 
 
 def short_autoregression(errors: Sequence[Array], most: int) -> Array:
-    """Fit [1, a_1, ...] to errors (N,) per experiment, NaN = missing, by Yule and Walker; its order by Akaike."""
-    from scipy.linalg import solve_toeplitz
+    """Fit [1, a_1, ...] to errors (N,) per experiment by `autoregression`."""
+    found, _ = autoregression([e[:, None] for e in errors], most)
+    return np.concatenate([[1.0], -found[:, 0, 0]])
 
+
+def autoregression(errors: Sequence[Array], most: int) -> tuple[Array, Array]:
+    """Fit e(k) = A_1 e(k-1) + ... + w(k) to errors (N, l) per experiment, NaN = missing, by Yule and Walker.
+
+    Return A (lags, l, l), stable, of the order that Akaike's criterion chooses, and the covariance (l, l) of w. Pairs
+    of samples count that are both present.
+    """
+    outputs = errors[0].shape[1]
     present = [np.isfinite(e) for e in errors]
     filled = [np.where(here, e, 0.0) for e, here in zip(errors, present)]
-    total = sum(int(here.sum()) for here in present)
-    most = min(most, total - 1)
-    sums, counts = np.zeros((2, max(most, 0) + 1))
+    total = int(np.sum([here.sum(axis=0) for here in present], axis=0).min())
+    most = max(min(most, total - 1), 0)
+    sums, counts = np.zeros((2, most + 1, outputs, outputs))
     for e, here in zip(filled, present):
         for lag in range(min(most, len(e) - 1) + 1):
-            sums[lag] += e[lag:] @ e[: len(e) - lag]
-            counts[lag] += np.count_nonzero(here[lag:] & here[: len(e) - lag])
-    covariance = sums / np.maximum(counts, 1) * (1 - np.arange(sums.size) / max(total, 1))
-    best, least = np.ones(1), total * np.log(max(covariance[0], 1e-300))
-    for order in range(1, most + 1 if covariance[0] > 0 else 0):
-        a = np.concatenate([[1.0], -solve_toeplitz(covariance[:order], covariance[1 : order + 1])])
-        variance = float(a @ covariance[: order + 1])
-        if variance <= 0:
+            sums[lag] += e[lag:].T @ e[: len(e) - lag]
+            counts[lag] += here[lag:].astype(float).T @ here[: len(e) - lag]
+    taper = 1 - np.arange(most + 1) / max(total, 1)
+    r = sums / np.maximum(counts, 1) * taper[:, None, None]
+    best, noise = np.zeros((0, outputs, outputs)), r[0]
+    if not np.linalg.slogdet(noise)[0] > 0:
+        return best, noise
+    least = total * np.linalg.slogdet(noise)[1]
+    for order in range(1, most + 1):
+        lags = np.arange(order)
+        whole = np.block([[r[j - i] if j >= i else r[i - j].T for j in lags] for i in lags])
+        right = np.concatenate(r[1 : order + 1], axis=1)
+        found = np.linalg.solve(whole.T, right.T).T.reshape(outputs, order, outputs)
+        left = r[0] - np.einsum("oip,iqp->oq", found, r[1 : order + 1])
+        sign, size = np.linalg.slogdet(left)
+        if sign <= 0 or left.diagonal().min() <= 0:
             break
-        if (criterion := total * np.log(variance) + 2 * order) < least:
-            best, least = a, criterion
-    return best
+        if (criterion := total * size + 2 * order * outputs**2) < least and _stable(found):
+            best, noise, least = found.transpose(1, 0, 2), (left + left.T) / 2, criterion
+    return best, noise
+
+
+def _stable(found: Array) -> bool:
+    outputs, order = found.shape[:2]
+    companion = np.eye(order * outputs, k=-outputs)
+    companion[:outputs] = found.reshape(outputs, -1)
+    return float(np.abs(np.linalg.eigvals(companion)).max()) < 1

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 from optid.arrays import Array
 from optid.data.record import Data
@@ -13,6 +14,25 @@ from optid.models.layout import Layout
 from optid.statistics.blocks import check_lengths
 from optid.statistics.factors import ROUNDING, add_to_root, any_root_of_gram
 from optid.statistics.regression import CONDITION_LIMIT, LEAST_REMAINDER, Statistics, accumulate, factorise
+
+FEW = 20  # errors of an experiment that tell its level
+UNEQUAL = 0.01  # p value below which the levels of experiments are different
+OF_EXPERIMENTS = "of another level in every experiment"
+
+
+def equal_levels(counts: Array, squares: Array, scatter: float = 2.0) -> float:
+    """Return the p value of Bartlett's test that experiments have errors of one level.
+
+    Args:
+        counts: (E,) errors.
+        squares: (E,) their mean squares.
+        scatter: variance of the square of an error over that of its mean: 2 for normal ones, more for heavy tails.
+    """
+    if len(counts) < 2 or min(counts) < FEW or not np.all(squares > 0):
+        return 1.0
+    whole = float(counts @ squares) / counts.sum()
+    statistic = 2 / scatter * float(counts @ np.log(whole / squares))
+    return float(chdtrc(len(counts) - 1, max(statistic, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +67,7 @@ def collect_by_experiment(data: Data, layout: Layout, weights: Sequence[Array] |
     weight that leaves the information about the mean of the constants as it is. Arguments and errors as `collect`; a
     column that is constant within every experiment is refused as well (`RankError`).
     """
-    parts = _by_experiment(accumulate, data, layout, weights)
+    parts = by_experiment(accumulate, data, layout, weights)
     for i, part in enumerate(parts, start=1):
         if not part.rows:
             raise RankError(f"Experiment {i} has no complete row, so that its constant is unknown: leave it out, or "
@@ -55,16 +75,31 @@ def collect_by_experiment(data: Data, layout: Layout, weights: Sequence[Array] |
     found, means = _about_means(parts)
     found.check()
     if found.condition > CONDITION_LIMIT or found.remainder < LEAST_REMAINDER:
-        found, means = _about_means(_by_experiment(factorise, data, layout, weights))
+        found, means = _about_means(by_experiment(factorise, data, layout, weights))
         _ = found.root  # refuses dependent columns by name
     return found, means
 
 
-def _by_experiment(take: Callable[..., Statistics], data: Data, layout: Layout, weights: Sequence[Array] | None
-                   ) -> list[Statistics]:
+def by_experiment(take: Callable[..., Statistics], data: Data, layout: Layout, weights: Sequence[Array] | None = None
+                  ) -> list[Statistics]:
+    """Take the statistics of every experiment by `accumulate` or `factorise`."""
     check_lengths([e.n_samples for e in data.experiments], layout)
     own: list[Any] = [None] * data.n_experiments if weights is None else [[one] for one in weights]
     return [take(data.select(experiments=i), layout, one) for i, one in enumerate(own)]
+
+
+def rows_factor(part: Statistics, about_mean: bool) -> Array:
+    """Return a factor (r, n + l) of the rows of an experiment, dependent or not, about their mean if asked."""
+    first = [part.layout.offset] if about_mean else []
+    order = np.r_[first, np.delete(np.arange(part.layout.n_columns + part.layout.l), first)].astype(int)
+    return _ordered(part, order)[len(first) :, np.argsort(order)]
+
+
+def _ordered(part: Statistics, order: Any) -> Array:
+    """Return the triangular factor of the columns in another order."""
+    if part.factor is None:
+        return any_root_of_gram(part.gram[np.ix_(order, order)])
+    return np.asarray(np.linalg.qr(part.factor[:, order], mode="r"))
 
 
 def _about_means(parts: Sequence[Statistics]) -> tuple[Statistics, ExperimentMeans]:
@@ -73,8 +108,7 @@ def _about_means(parts: Sequence[Statistics]) -> tuple[Statistics, ExperimentMea
     order = np.r_[one, np.delete(np.arange(layout.n_columns + layout.l), one)]
     back, means, weights, inner = np.argsort(order), [], [], np.zeros((0, order.size))
     for part in parts:
-        triangle = any_root_of_gram(part.gram[np.ix_(order, order)]) if part.factor is None else (
-            np.asarray(np.linalg.qr(part.factor[:, order], mode="r")))
+        triangle = _ordered(part, order)
         means.append((triangle[0] / triangle[0, 0])[back])
         weights.append(float(triangle[0, 0] ** 2))
         inner = np.asarray(np.linalg.qr(np.vstack([inner, triangle[1:]]), mode="r"))

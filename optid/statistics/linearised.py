@@ -34,6 +34,7 @@ class Linearised:
     rows: int  # outputs present
     condition: float  # estimated condition number of the column-scaled factor
     method: Literal["gram", "qr"]  # "gram" or "qr"
+    given: tuple[Array, Array] | None = None  # another factor and errors of all unknowns, with the same gradient
 
     @property
     def exact(self) -> bool:
@@ -59,11 +60,19 @@ class Linearised:
         """Return the sum of squares of the linear errors after a step of all unknowns."""
         matrix, errors = self.whole
         rest = matrix @ step + errors
-        return float(rest @ rest) + self.remainder
+        return self.value + float(rest @ rest - errors @ errors)
+
+    @property
+    def pulled(self) -> Array:
+        """Half the gradient (p + E n,) of the sum of squares."""
+        matrix, errors = self.whole
+        return matrix.T @ errors
 
     @cached_property
     def whole(self) -> tuple[Array, Array]:
         """Factor (p + E n, p + E n) and errors of all unknowns together, initial states last."""
+        if self.given is not None:
+            return self.given
         p, n = len(self.pull), len(self.states[0][0])
         total = p + n * len(self.states)
         matrix, errors = np.zeros((total, total)), np.zeros(total)

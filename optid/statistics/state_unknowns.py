@@ -1,7 +1,7 @@
 """The unknowns of a state-space model: matrices, static functions and one initial state per experiment."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -197,14 +197,14 @@ class StateUnknowns(Unknowns):
 
     def similarity(self, x: Array) -> Array:
         """Return directions (n^2, shared) of theta that a change of the states moves it along."""
-        point, nothing, found = self.unpack(x), self._known(), []
-        for place in np.ndindex(self.n, self.n):
-            one = np.zeros((self.n, self.n))
-            one[place] = 1.0
-            moved = replace(nothing, A=one @ point.A - point.A @ one, C=-point.C @ one, K=one @ point.K,
-                            b=one @ point.b, e=one @ point.e, Ez=one @ point.Ez, Cz=-point.Cz @ one)
-            found.append(self.pack(moved)[: self.shared])
-        return np.array(found).reshape(-1, self.shared)
+        point, one = self.unpack(x), np.eye(self.n**2).reshape(self.n**2, self.n, self.n)
+        moved = {"A": one @ point.A - point.A @ one, "C": -point.C @ one, "K": one @ point.K, "b": one @ point.b,
+                 "e": one @ point.e, "Ez": one @ point.Ez, "Cz": -point.Cz @ one}
+        found = np.zeros((self.n**2, self.shared))
+        for name, change in moved.items():
+            columns = getattr(self._columns, name)
+            found[:, columns[columns >= 0].astype(int) - self.memory] = change[:, columns >= 0]
+        return found
 
     @cached_property
     def signals(self) -> dict[str, NDArray[np.intp]]:

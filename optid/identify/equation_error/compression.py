@@ -4,8 +4,9 @@
 ``Theta_c = mu_c vec(b_c)ᵀ``; one pass over the record leaves a triangular system of the size of z.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import cvxpy as cp
@@ -26,7 +27,8 @@ from optid.program.compressed import Spread, white_spread
 from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
 from optid.program.view import View
-from optid.statistics import ExperimentMeans, Layout, Statistics, collect, collect_by_experiment
+from optid.statistics import ExperimentMeans, Layout, Statistics, accumulate, collect, collect_by_experiment
+from optid.statistics.experiments import OF_EXPERIMENTS, UNEQUAL, by_experiment, equal_levels, rows_factor
 from optid.structures.lifted_regression import lifted_problem, positions
 from optid.structures.rank_one import RankOne
 
@@ -46,6 +48,8 @@ class EquationError:
     means: ExperimentMeans | None = None  # of the rows of every experiment, where each has its own constant
     shifts: np.ndarray | None = None  # (E, l) what `levelled` subtracted from the outputs
     between: np.ndarray | float = 0.0  # (l,) sum of squares of the mean outputs of the experiments about their mean
+    # takes the statistics of every experiment, of a record of several without weights
+    parts: Callable[[], list[Statistics]] | None = None
 
     @property
     def layout(self) -> Layout:
@@ -121,8 +125,23 @@ class EquationError:
         return np.where(self.energy > 0, 100.0 * (1.0 - np.sqrt(rest / np.maximum(self.energy, 1e-300))), np.nan)
 
     def spread(self, z: np.ndarray, moves: np.ndarray) -> Spread:
-        """Return the scatter under white equation errors."""
-        return white_spread(self, z, moves)
+        """Return the scatter under white equation errors, of a level of their own in every experiment if that shows."""
+        found = white_spread(self, z, moves)
+        if found.penalised or self.parts is None:
+            return found
+        (n, l), parts = self.columns.shape, self.parts()  # noqa: E741
+        counts = np.array([part.rows for part in parts])
+        if not counts.all():
+            return found
+        roots = [rows_factor(part, self.means is not None) for part in parts]
+        left = [root @ np.vstack([z[self.columns], -np.eye(l)]) for root in roots]
+        noises = [rest.T @ rest / count for rest, count in zip(left, counts)]
+        squares = np.array([float(np.trace(np.linalg.solve(found.noise, noise))) for noise in noises])
+        if equal_levels(counts * l, squares) > UNEQUAL:
+            return found
+        effects = [np.einsum("ij,jok->oik", root[:, :n], moves[self.columns]) for root in roots]
+        covariance = sum(np.einsum("oij,op,pik->jk", s, noise, s) for s, noise in zip(effects, noises))
+        return replace(found, covariance=counts.sum() / found.dof * covariance, words=(OF_EXPERIMENTS,))
 
     def model(self, values: Mapping[str, np.ndarray], mus: Sequence[np.ndarray], bs: Sequence[np.ndarray], *,
               gauge: str, flip: bool = True) -> HammersteinTF:
@@ -191,7 +210,7 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
     shifts, means, between = None, None, 0.0
     if isinstance(data, Data) and constants == "each":
         data, shifts = levelled(data)
-    bases = fitted_bases(data, basis)
+    bases, before = fitted_bases(data, basis), data
     units = Transform.identity(len(inputs), len(outputs))
     if own:
         units = own_units(data, [isinstance(one, Linear) for one in bases])
@@ -215,6 +234,12 @@ def compress(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int |
         from optid.identify.equation_error.priors import likeliest
 
         rows = likeliest(prior, statistics).rows(columns)
+    parts = partial(_parts, before, units, layout) if isinstance(before, Data) and weights is None and (
+        before.n_experiments > 1) else None
     problem = lifted_problem(statistics, columns, share * ridge, share * curvature, units.u_scale, prior=rows)
     return EquationError(statistics, problem, columns, model_meta(data), units, bases, unit, means=means, shifts=shifts,
-                         between=between)
+                         between=between, parts=parts)
+
+
+def _parts(data: Data, units: Transform, layout: Layout) -> list[Statistics]:
+    return by_experiment(accumulate, in_units(data, units), layout)

@@ -4,7 +4,7 @@ The least-squares fit of y by level and one delayed response needs a few sums of
 by fast Fourier transforms, energies by running sums. A pair of real poles is a combination of two single ones.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +22,12 @@ FLAT = 1e-9  # share of its energy that a response must keep beside the level to
 
 @dataclass(frozen=True)
 class Start:
-    """Poles and delay that reduce the sum of squares of the output to `energy`."""
+    """Poles, delay and zeros that reduce the sum of squares of the output to `energy`."""
 
     energy: float
     poles: tuple[float, ...]
     lag: int
+    zeros: int = 0
 
 
 def bank(longest: int) -> Array:
@@ -35,16 +36,17 @@ def bank(longest: int) -> Array:
     return np.concatenate([[0.0], np.exp(-1 / taus)])
 
 
-def scan(regression: WhitenedRegression, drive: Sequence[Array], longest: int, order: int) -> list[Start]:
-    """Return for every delay up to `longest` the best one or two poles of the bank, the best delay first."""
+def scan(regression: WhitenedRegression, drive: Sequence[Array], longest: int, pairs: bool = True
+         ) -> Iterator[list[Start]]:
+    """Yield the best pole of the bank for every delay up to `longest`, the best delay first.
+
+    With `pairs` also the best two poles, and then the best two whose weights are free: with a zero, for responses that
+    first go the wrong way.
+    """
     poles = bank(max(len(u) for u in drive))
-    if order == 2:
-        first, second = np.triu_indices(poles.size, 1)
-        weights = _weights(poles[first], poles[second])
-    else:
-        first = second = np.arange(poles.size)
-        weights = np.array([[1.0], [0.0]])
-    inner, squares, whole = np.zeros((first.size, longest + 1)), np.zeros((first.size, longest + 1)), 0.0
+    single_poles, (first, second) = np.arange(poles.size), np.triu_indices(poles.size if pairs else 0, 1)
+    inner, own = np.zeros((poles.size, longest + 1)), np.zeros((poles.size, longest + 1))
+    both, whole = np.zeros((first.size, longest + 1)), 0.0
     for u, y in zip(drive, regression.y):
         white = whitened(regression.noise, y)
         if len(white) < 2:
@@ -52,39 +54,42 @@ def scan(regression: WhitenedRegression, drive: Sequence[Array], longest: int, o
         white = white - white.mean()
         whole += float(white @ white)
         single = np.array([whitened(regression.noise, respond((p,), u)) for p in poles])
-        found, energy = _products(white, single, first, second, weights, longest)
-        inner += found
-        squares += energy
-    full = squares[:, :1]
-    gain = np.where(squares > FLAT * full + 1e-300, inner**2 / np.maximum(squares, 1e-300), 0.0)
-    best = np.argmax(gain, axis=0)
-    starts = [Start(whole - float(gain[b, lag]), tuple(float(poles[i]) for i in (first[b], second[b])[:order]), lag)
-              for lag, b in enumerate(best.tolist())]
-    return sorted(starts, key=lambda one: one.energy)
+        lags = min(longest, len(white) - 1) + 1
+        inner[:, :lags] += _correlations(white, single, lags)
+        own[:, :lags] += _energies(single, single_poles, single_poles, lags)
+        if pairs:
+            both[:, :lags] += _energies(single, first, second, lags)
+
+    def best(reached: Array, size: Array, full: Array, *places: NDArray[np.intp], zeros: int = 0) -> list[Start]:
+        gain = np.where(size > FLAT * full + 1e-300, reached / np.maximum(size, 1e-300), 0.0)
+        chosen = np.argmax(gain, axis=0)
+        return sorted((Start(whole - float(gain[b, lag]), tuple(float(poles[i[b]]) for i in places), lag, zeros)
+                       for lag, b in enumerate(chosen.tolist())), key=lambda one: one.energy)
+
+    yield best(inner**2, own, own[:, :1], single_poles)
+    if pairs:
+        x, y, xx, yy = inner[first], inner[second], own[first], own[second]
+        a, b = _weights(poles[first], poles[second])[:, :, None]
+        size = a**2 * xx + 2 * a * b * both + b**2 * yy
+        yield best((a * x + b * y) ** 2, size, size[:, :1], first, second)
+        yield best(x**2 * yy - 2 * x * y * both + y**2 * xx, xx * yy - both**2, xx[:, :1] * yy[:, :1], first, second,
+                   zeros=1)
 
 
-def _products(white: Array, single: Array, first: NDArray[np.intp], second: NDArray[np.intp], weights: Array,
-              longest: int) -> tuple[Array, Array]:
-    """Return sum y(k) v(k - d), and the energy of v(k - d) beside its mean, for every combination v and delay d."""
-    samples = len(white)
-    size = next_fast_len(2 * samples, real=True)
+def _correlations(white: Array, single: Array, lags: int) -> Array:
+    """Return sum y(k) v(k - d) for every row v and delay d."""
+    size = next_fast_len(2 * len(white), real=True)
     spectra = np.asarray(rfft(single, size, axis=1))
-    correlation = np.asarray(irfft(np.asarray(rfft(white, size)) * np.conj(spectra), size, axis=1))
-    lags = np.arange(min(longest, samples - 1) + 1)
-    shape = (first.size, longest + 1)
-    inner, energy = np.zeros(shape), np.zeros(shape)
-    places = samples - 1 - lags
-    total = np.cumsum(single, axis=1)[:, places]
-    own = np.cumsum(single**2, axis=1)[:, places]
-    a, b = weights[0][:, None], weights[1][:, None]
-    inner[:, lags] = a * correlation[first][:, lags] + b * correlation[second][:, lags]
-    mean = a * total[first] + b * total[second]
-    both = own[first]
-    if weights[1].any():
-        cross = np.array([np.cumsum(single[i] * single[j])[places] for i, j in zip(first, second)])
-        both = a**2 * own[first] + 2 * a * b * cross + b**2 * own[second]
-    energy[:, lags] = both - mean**2 / samples
-    return inner, energy
+    return np.asarray(irfft(np.asarray(rfft(white, size)) * np.conj(spectra), size, axis=1))[:, :lags]
+
+
+def _energies(single: Array, first: NDArray[np.intp], second: NDArray[np.intp], lags: int) -> Array:
+    """Return the sums of products v(k - d) w(k - d) beside their means for pairs of rows and every delay d."""
+    samples = single.shape[1]
+    early, late = single[:, : samples - lags], single[:, samples - lags :]
+    sums = early.sum(axis=1)[:, None] + np.cumsum(late, axis=1)
+    products = (early @ early.T)[first, second][:, None] + np.cumsum(late[first] * late[second], axis=1)
+    return np.asarray(products - sums[first] * sums[second] / samples)[:, ::-1]
 
 
 def _weights(p: Array, q: Array) -> Array:

@@ -15,8 +15,16 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.record import Data
-from optid.identify.informativity.bank import apart, scan
-from optid.identify.informativity.descent import ROUNDING, Drive, FittedTerm, Term, columns_of, refined, slowest_of
+from optid.identify.informativity.bank import Start, apart, scan
+from optid.identify.informativity.descent import (
+    ROUNDING,
+    Drive,
+    FittedTerm,
+    Term,
+    columns_of,
+    refined,
+    slowest_of,
+)
 from optid.identify.informativity.signals import Poles, RecordSignals, WhitenedRegression, delayed, respond
 from optid.models.roots import roots_of
 from optid.statistics.coloured import short_autoregression
@@ -25,7 +33,7 @@ LATEST = 0.25  # longest delay as a share of the longest experiment
 KEPT = 4  # delays of the scan that are refined
 NOISE = 4  # order of the noise model, at most
 TURNS, SETTLED = 5, 0.01  # scans with a better noise model; largest change of its coefficients that is none
-LARGEST = 4  # poles, at most
+LARGEST, MOVES = 4, 30  # poles, at most; steps from a structure to a neighbour, at most
 LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
 LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice the log likelihood ratio
 UNIT = 0.5  # share of the longest experiment beyond which a time constant is compared with an integrator
@@ -80,6 +88,7 @@ class Process:
         residuals: what they leave, beside level and decay, (T,) per experiment in the unit of the output.
         explained: share of the variance of the output that they explain.
         criterion: Bayesian information criterion.
+        points: the responses as they were found, one per input.
     """
 
     output: str
@@ -88,6 +97,7 @@ class Process:
     residuals: tuple[Array, ...] = field(repr=False)
     explained: float
     criterion: float
+    points: tuple[FittedTerm, ...] = field(repr=False)
 
 
 def processes(data: Data, least: int = 0, known: Sequence[Process] = ()) -> tuple[Process, ...]:
@@ -96,20 +106,24 @@ def processes(data: Data, least: int = 0, known: Sequence[Process] = ()) -> tupl
     Args:
         data: the record; of a long one the first 30,000 samples are read.
         least: smallest lag of an input; 1 where the input answers the output without delay, in a loop.
-        known: those of a smaller `least`, one per output; kept where their inputs act late enough.
+        known: those of a smaller `least`, one per output; the search goes on from responses that come late enough.
     """
-    signals = RecordSignals.of(data)
-    kept = [p if all(r.nk >= least for r in p.responses) else None for p in known] or [None] * len(data.outputs)
-    return tuple(p or _process(signals, o, name, least) for o, (name, p) in enumerate(zip(data.outputs, kept)))
+    signals, before = RecordSignals.of(data), known or [None] * len(data.outputs)
+    late = [p is not None and all(r.nk >= least for r in p.responses) for p in before]
+    return tuple(p if p is not None and kept else _process(signals, o, name, least, p)
+                 for o, (name, p, kept) in enumerate(zip(data.outputs, before, late)))
 
 
-def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
+def _process(signals: RecordSignals, o: int, name: str, least: int, known: Process | None) -> Process:
     regression = WhitenedRegression(signals.outputs(o), tuple(there[:, o] for there in signals.present), np.ones(1))
     longest = max(int(LATEST * signals.longest), min(least, signals.longest - 1))
     u = [signals.inputs(c) for c in range(len(signals.u_scale))]
     points: list[FittedTerm | None] = [None] * len(u)
+    if known is not None and len(u) > 1:
+        points = [p if p.term.lag >= least else None for p in known.points]
+        regression = regression.with_noise(known.noise)
     inputs = range(1) if len(u) == 1 else sorted(  # the one that explains most first
-        range(len(u)), key=lambda c: scan(regression, u[c], longest, 1)[0].energy)
+        range(len(u)), key=lambda c: next(scan(regression, u[c], longest, False))[0].energy)
     whole = not any(lost.any() for lost in signals.lost)
     first = apart(regression, signals.u, least, longest) if len(u) > 1 else ()
     for turn in range(TURNS):
@@ -118,62 +132,85 @@ def _process(signals: RecordSignals, o: int, name: str, least: int) -> Process:
             y = _without(regression.y, [p for i, p in enumerate(points) if p is not None and i != c])
             for i in (i for i, p in enumerate(points) if p is None and i != c):
                 y = tuple(rest - response for rest, response in zip(y, first[i]))
-            points[c] = _found(replace(regression, y=y), u[c], signals.levels(c), least, longest, points[c])
-        known = [p for p in points if p is not None]
+            points[c] = _found(replace(regression, y=y), u[c], signals.levels(c), least, longest, points[c],
+                               len(u) == 1)
+        found = [p for p in points if p is not None]
         for c in inputs:
-            rest = replace(regression, y=_without(regression.y, [p for i, p in enumerate(known) if i != c]))
-            u[c] = _completed(rest, known[c], u[c], [lost[:, c] for lost in signals.lost])
-        columns, theta, slowest = _joint(regression, known)
+            rest = replace(regression, y=_without(regression.y, [p for i, p in enumerate(found) if i != c]))
+            u[c] = _completed(rest, found[c], u[c], [lost[:, c] for lost in signals.lost])
+        columns, theta, slowest = _joint(regression, found)
         errors = regression.residuals(columns, theta, slowest)
         noise = short_autoregression(errors, min(NOISE, regression.count // 30))
         size = max(noise.size, regression.noise.size)
         change = np.pad(noise, (0, size - noise.size)) - np.pad(regression.noise, (0, size - regression.noise.size))
-        same = before == [p.term.key for p in known]
-        exact = all(p.energy <= EXACT * regression.count for p in known)
+        same = before == [p.term.key for p in found]
+        exact = all(p.energy <= EXACT * regression.count for p in found)
         if exact or np.max(np.abs(change)) < SETTLED and (same or (turn == 0 and whole)):
             break
         regression = regression.with_noise(noise)
     spread = float(np.nanvar(np.concatenate(errors)))
     energy = float(np.mean(np.concatenate([(y - y.mean()) ** 2 for y in regression.y])))
     scale = float(signals.y_scale[o])
-    found = [_response(signals, c, o, p, _interval(replace(regression, y=_without(
-        regression.y, [q for q in known if q is not p])), p, least, longest)) for c, p in enumerate(known)]
-    return Process(name, tuple(found), noise, tuple(scale * e for e in errors), 1 - spread / max(energy, 1e-300),
-                   sum(p.criterion for p in known))
+    responses = [_response(signals, c, o, p, _interval(replace(regression, y=_without(
+        regression.y, [q for q in found if q is not p])), p, least, longest)) for c, p in enumerate(found)]
+    return Process(name, tuple(responses), noise, tuple(scale * e for e in errors), 1 - spread / max(energy, 1e-300),
+                   sum(p.criterion for p in found), tuple(found))
 
 
 def _found(regression: WhitenedRegression, u: tuple[Array, ...], levels: int, least: int, longest: int,
-           before: FittedTerm | None) -> FittedTerm:
-    """Return the best response to one input, whose f is bent where that pays."""
+           before: FittedTerm | None, alone: bool) -> FittedTerm:
+    """Return the best response to one input, whose f is bent where that pays.
+
+    What several inputs leave of each other looks like a response that first goes the wrong way: none is tried then.
+    """
     straight = Drive(u)
     start = None if before is None else before.term
-    best = _searched(regression, straight, least, longest, start)
+    *scans, turned = scan(regression, u, longest)
+    best = plain = _searched(regression, straight, least, longest, start, scans)
+    if alone:
+        best = _turned(regression, straight, least, longest, plain, turned)
     if levels <= LEVELS:
         return best
     whole = np.concatenate(straight.values)
     nodes = np.unique(np.quantile(whole, np.linspace(0, 1, NODES)))
     if nodes.size < 4:
         return best
-    starts = [best.term] if before is None or before.drive.nodes is None else [before.term, best.term]
+    starts = [best.term, plain.term] if before is None or before.drive.nodes is None else [
+        before.term, best.term, plain.term]
     squares = Drive(tuple((u - whole.mean()) ** 2 for u in straight.values))
-    even = scan(regression, squares.values, longest, 1)
+    even = next(scan(regression, squares.values, longest, False))
     if even and even[0].energy < 0.9 * best.energy and even[0].lag >= least:  # f is nearly even
         starts[-1] = Term.of(even[0].poles, even[0].lag)
-    for term in dict.fromkeys(starts):  # that of a straight f may be far from the one found for a bent f
+    # that of a straight f may be far from the one found for a bent f
+    for term in {term.key: term for term in reversed(starts)}.values():
         for _ in range(2):
             bent = _bent(regression, straight, term, nodes)
             if bent is None:
                 break
-            found = _searched(regression, bent, least, longest, term, scanned=False)
+            found = _searched(regression, bent, least, longest, term)
             term = found.term
             if found.criterion < best.criterion:
                 best = found
     return best
 
 
+def _turned(regression: WhitenedRegression, drive: Drive, least: int, longest: int, plain: FittedTerm,
+            starts: Sequence[Start]) -> FittedTerm:
+    """Return the better of a response and one with a zero, which may go the wrong way at first: like one that is late.
+
+    It lies at one of the delays at which the scan is better than at both neighbours.
+    """
+    energy = {one.lag: one.energy for one in starts if one.lag >= least}
+    lowest = [one for one in starts if one.lag >= least and one.energy <= min(
+        energy.get(one.lag - 1, np.inf), energy.get(one.lag + 1, np.inf))]
+    found = [refined(regression, drive, Term.of(one.poles, one.lag, one.zeros), plain.criterion) for one in lowest[:2]]
+    best = min(found, key=lambda p: p.criterion, default=plain)
+    return _searched(regression, drive, least, longest, best.term) if best.criterion < plain.criterion else plain
+
+
 def _searched(regression: WhitenedRegression, drive: Drive, least: int, longest: int, start: Term | None,
-              scanned: bool = True) -> FittedTerm:
-    """Refine the best of the scan, and then neighbouring structures as long as the criterion falls."""
+              scans: Sequence[Sequence[Start]] = ()) -> FittedTerm:
+    """Refine the best of scans, and then neighbouring structures as long as the criterion falls."""
     tried: dict[tuple[int, ...], FittedTerm] = {}
 
     def fitted(term: Term) -> FittedTerm:
@@ -183,13 +220,15 @@ def _searched(regression: WhitenedRegression, drive: Drive, least: int, longest:
         return tried[term.key]
 
     terms = [] if start is None else [start]
-    for order in (1, 2) if scanned or start is None else ():
-        lags = [one for one in scan(regression, drive.values, longest, order) if one.lag >= least]
-        terms += [Term.of(one.poles, one.lag) for one in lags[: KEPT if start is None else 2]]
+    for starts in scans:
+        late = [one for one in starts if one.lag >= least]
+        terms += [Term.of(one.poles, one.lag) for one in late[: KEPT if start is None else 2]]
     best = min(map(fitted, terms), key=lambda p: p.criterion)
     exact = EXACT * regression.count
-    oscillating = list(_oscillating(regression, drive, best.term)) if scanned else []
-    while best.energy > exact:
+    oscillating = list(_oscillating(regression, drive, best.term)) if scans else []
+    for _ in range(MOVES):
+        if best.energy <= exact:
+            break
         near = [fitted(term) for term in (*oscillating, *_neighbours(best.term, least, longest, drive))]
         better = min(near, key=lambda p: p.criterion)
         if not better.criterion < best.criterion - 1e-6:
@@ -297,15 +336,17 @@ def _joint(regression: WhitenedRegression, points: Sequence[FittedTerm]) -> tupl
 
 def _interval(regression: WhitenedRegression, point: FittedTerm, least: int, longest: int) -> tuple[int, int]:
     """Return the delays that the likelihood does not exclude, poles and coefficients refitted at each."""
-    ends = []
-    for step in (-1, 1):
-        lag, term = point.term.lag, point.term
-        while least <= lag + step <= longest:
-            found = refined(regression, point.drive, replace(term, lag=lag + step))
-            floor = ROUNDING**2 * regression.count
-            if regression.count * np.log(max(found.energy, floor) / max(point.energy, floor)) > LIKELY:
-                break
-            lag, term = lag + step, found.term
+    ends, floor = [], ROUNDING**2 * regression.count
+    for sign in (-1, 1):
+        lag, term, step, grows = point.term.lag, point.term, 1, True
+        while step:  # twice as far as long as nothing excludes it: an input without effect has any delay
+            there = lag + sign * step
+            found = refined(regression, point.drive, replace(term, lag=there)) if least <= there <= longest else None
+            if found is None or regression.count * np.log(
+                    max(found.energy, floor) / max(point.energy, floor)) > LIKELY:
+                step, grows = step // 2, False
+            else:
+                lag, term, step = there, found.term, 2 * step if grows else step // 2
         ends.append(lag)
     return ends[0], ends[1]
 

@@ -52,8 +52,10 @@ class Informativity(Rendered):
 
     @property
     def lags(self) -> tuple[int, ...]:
-        """Lag of the first coefficient of every input, the earliest over the outputs."""
-        return tuple(min(p.responses[c].nk for p in self.processes) for c in range(len(self.inputs)))
+        """Lag of the first coefficient of every input, the earliest over the outputs on which it acts."""
+        inputs = range(len(self.inputs))
+        seen = [[p for p in self.processes if self.acts(c, p.output)] or self.processes for c in inputs]
+        return tuple(min(p.responses[c].nk for p in seen[c]) for c in inputs)
 
     @property
     def least(self) -> int:
@@ -67,8 +69,12 @@ class Informativity(Rendered):
 
     def without_effect(self, c: int) -> bool:
         """Whether input c has no visible effect on any output."""
-        own = [one for one in self.effects if one.input == self.inputs[c]]
-        return bool(own) and not any(one.visible for one in own)
+        return bool(self.effects) and not any(self.acts(c, name) for name in self.outputs)
+
+    def acts(self, c: int, output: str) -> bool:
+        """Whether input c has a visible effect on an output, as far as that was tested."""
+        tested = [one for one in self.effects if one.input == self.inputs[c] and one.output == output]
+        return all(one.visible for one in tested)
 
 
 def informativity(data: Data) -> Informativity:
@@ -177,7 +183,7 @@ def _findings(found: Informativity, data: Data, reason: str) -> list[str]:
     for process in found.processes:
         for c, name in enumerate(found.inputs):
             response = process.responses[c]
-            if found.without_effect(c):
+            if not found.acts(c, process.output):
                 continue
             dead = max(response.nk - 1, 0)
             low, high = (max(lag - 1, 0) for lag in response.lag_interval)

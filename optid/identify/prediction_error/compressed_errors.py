@@ -2,11 +2,11 @@
 
 Directions without effect on the errors of a state-space model, changes of the states and of the scale between mu and b,
 have weight in the factor and no part in the scatter: intervals hold for quantities that do not depend on them.
-Simulation errors are coloured where noise enters before the output; their long autoregression gives the sandwich form
-of the covariance (Ljung, System Identification, 1999, chapter 9).
+Errors are coloured where noise enters before the output, or a noise model is too simple; their long autoregression
+gives the sandwich form of the covariance (Ljung, System Identification, 1999, chapter 9).
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -16,19 +16,16 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.data.channels import Transform
-from optid.errors import StructureError
-from optid.identify.noise import regression_lags
 from optid.identify.prediction_error.descent import Criterion
+from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.program.compressed import Spread, degrees_of_freedom, white_spread
 from optid.program.program import Program
 from optid.program.units import energy_unit
-from optid.statistics.coloured import long_autoregression, response_of, scattered
-from optid.statistics.hankel import complete_runs
+from optid.statistics.coloured import scattered
 from optid.statistics.linearised import Linearised
 
-LEAST = 8  # order of the noise, at least, for which the autoregression has lags
 NO_EFFECT = 1e-9  # size of an effect on the errors, relative to the largest, that is rounding
 
 
@@ -104,9 +101,59 @@ class CompressedErrors:
         value = self.at.after(self.lifted(values) - self.reference)
         return 100.0 * (1.0 - np.sqrt(value / np.maximum(self.energy, 1e-300)))
 
+    @property
+    def scale(self) -> float:
+        """What one unit of the covariance of the errors is in units of the objective."""
+        return 1.0
+
+    def surplus(self) -> int:
+        """Return the number of directions of a tangent space that change no output."""
+        return 0
+
     def spread(self, z: Array, moves: Array) -> Spread:
-        """Return the scatter under white errors."""
-        return white_spread(self, z, moves)
+        """Return the scatter under the noise that the errors show at z; where it is white, the factor tells it."""
+        noise = self._noise(z, moves)
+        return self._sandwich(noise, moves) if noise.words else white_spread(self, z, moves)
+
+    def _noise(self, z: Array, moves: Array) -> ErrorNoise:
+        self._dof(moves)  # too few rows are refused first
+        rows = self.criterion.rows(self.reference)
+        return ErrorNoise([self._errors(rows(i), i, z) for i in range(self.criterion.unknowns.experiments)])
+
+    def _dof(self, moves: Array) -> float:
+        outputs = len(self.criterion.weight)
+        return degrees_of_freedom(self.statistics.rows / outputs, (moves.shape[1] - self.surplus()) / outputs)
+
+    def _sandwich(self, noise: ErrorNoise, moves: Array) -> Spread:
+        """Return the scatter under any noise.
+
+        The scores J(k)' e(k) of errors e = H(q) w, of sensitivities J, have the covariance sum_k G(k)' R G(k), with
+        G(k) = sum_i H_i' J(k+i) and R the covariance of w in the experiment of k. The information is the identity, so
+        that this is the covariance of the estimate.
+        """
+        unknowns, rows = self.criterion.unknowns, self.criterion.rows(self.reference)
+        meat = np.zeros((unknowns.size, unknowns.size))
+        for i, root in enumerate(noise.roots):
+            places = self._of(i)
+            meat[np.ix_(places, places)] += scattered(rows(i), noise.response, root)
+        covariance = moves.T @ meat @ moves
+        taken = 1 + float(np.trace(covariance)) / max(self.at.value, 1e-300)  # what the fit has taken out of the errors
+        back = np.linalg.inv(np.linalg.cholesky(self.criterion.weight).T)
+        return Spread(taken * covariance, taken * self.scale * back @ noise.covariance @ back.T, self._dof(moves),
+                      words=noise.words)
+
+    def _of(self, experiment: int) -> NDArray[np.intp]:
+        """Places in z of the columns of the rows of an experiment: its initial state, and what all share."""
+        unknowns = self.criterion.unknowns
+        states = unknowns.shared + experiment * unknowns.memory + np.arange(unknowns.memory)
+        return np.r_[states, np.arange(unknowns.shared)]
+
+    def _errors(self, rows: Iterable[tuple[Array, int]], experiment: int, z: Array) -> Array:
+        """Return the weighted errors (N, l) of an experiment at z by the rows at the iterate, NaN where one misses."""
+        step, found = np.append((z - self.reference)[self._of(experiment)], 1.0), []
+        for block, _ in rows:
+            found.append(np.where(block.any(axis=1), block @ step, np.nan))
+        return np.concatenate(found).reshape(-1, len(self.criterion.weight))
 
 
 @dataclass(eq=False)
@@ -157,37 +204,15 @@ class CompressedStates(CompressedErrors):
     def one_step_fit(self, values: object) -> None:
         """Return nothing: the errors are those of the criterion."""
 
-    def spread(self, z: Array, moves: Array) -> Spread:
-        """Return the scatter under the noise that the errors at the iterate show."""
-        criterion, x = self.criterion, self.reference
-        unknowns, outputs = criterion.unknowns, criterion.unknowns.l
-        known = moves.shape[1] - (0 if self.fixed else len(criterion.gauge_rows(x)) + len(self.free))
-        dof = degrees_of_freedom(self.statistics.rows / outputs, known / outputs)
-        errors = criterion.residuals(x)
-        complete = np.vstack([e[~np.isnan(e).any(axis=1)] for e in errors])
-        noise = complete.T @ complete / len(complete)
-        response, root = self._noise_filter(errors, noise)
-        meat = np.zeros((unknowns.size, unknowns.size))
-        for i in range(unknowns.experiments):
-            states = unknowns.shared + i * unknowns.memory + np.arange(unknowns.memory)
-            columns = np.r_[states, np.arange(unknowns.shared)]
-            meat[np.ix_(columns, columns)] += scattered(criterion.blocks(x)(i), response, root)
-        covariance = moves.T @ meat @ moves
-        taken = 1 + float(np.trace(covariance)) / self.at.value  # what the fit has taken out of the errors
-        return Spread(taken * covariance, taken * energy_unit(self.outward) * noise, dof)
+    @property
+    def scale(self) -> float:
+        """What one unit of the covariance of the errors is in units of the objective."""
+        return energy_unit(self.outward)
 
-    def _noise_filter(self, errors: list[Array], noise: Array) -> tuple[Array, Array]:
-        """Response of the weighted errors to white ones, and a triangular root of the covariance of these."""
-        weigh = np.linalg.cholesky(self.criterion.weight).T
-        outputs = len(noise)
-        white = np.eye(outputs)[None], np.linalg.cholesky(weigh @ noise @ weigh.T + 1e-300 * np.eye(outputs)).T
-        if self.criterion.unknowns.innovations:
-            return white
-        try:
-            lags = regression_lags([len(run) for e in errors for run in complete_runs(e, 1)],
-                                   max(self.criterion.unknowns.n, LEAST), outputs)
-        except StructureError:  # too few to tell a colour
-            return white
-        autoregression, root = long_autoregression([e @ weigh.T for e in errors], lags)
-        rows = sum(len(e) for e in errors)
-        return response_of(autoregression), root * np.sqrt(rows / max(rows - lags * outputs, 1))
+    def spread(self, z: Array, moves: Array) -> Spread:
+        """Return the scatter under the noise that the errors show at z: the factor holds directions of no effect."""
+        return self._sandwich(self._noise(z, moves), moves)
+
+    def surplus(self) -> int:
+        """Return the number of directions that change no output, which a programme does not fix by rows."""
+        return 0 if self.fixed else len(self.criterion.gauge_rows(self.reference)) + len(self.free)

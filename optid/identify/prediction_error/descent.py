@@ -5,7 +5,7 @@ The scaling is that of Moré (1978); the damping follows the ratio of the gain r
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -90,12 +90,23 @@ class Criterion(ABC):
         """Return the errors near x, compressed by a method of `optid.statistics.linearised`."""
 
     @abstractmethod
+    def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
+        """Return a generator of the weighted rows [x0 | shared | error] near x of experiment i, zero without an error.
+
+        They are (T l, q + 1), the outputs of a sample one after the other, each block with the number of its errors.
+        """
+
+    @abstractmethod
     def value(self, x: Array) -> float:
         """Return the sum of squared errors at x, without sensitivities; infinite where a run leaves its range."""
 
     @abstractmethod
     def admissible(self, x: Array) -> bool:
         """Whether the errors exist at x: its filters are stable."""
+
+    def confined(self, x: Array) -> Array:
+        """Return the nearest admissible point where that is one of parts that no constraint is about, else x."""
+        return x
 
     def scale(self, x: Array, b: str) -> float:
         """Return what a part b of x is divided by, and its mu multiplied with, to reach the gauge: its norm."""

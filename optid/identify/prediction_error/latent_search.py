@@ -7,12 +7,11 @@ with a part of their samples.
 
 import warnings
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from itertools import combinations, product
 from typing import Any
 
 import numpy as np
-from scipy.linalg import eigvals
 
 from optid.arrays import Array
 from optid.bases import BSpline, Linear
@@ -20,20 +19,16 @@ from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
 from optid.identify.arguments import outputs_present
 from optid.identify.prediction_error.descent import COMPARED, Descent, descend
+from optid.identify.prediction_error.latent_directions import MARGIN, directions
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.state_search import entered
 from optid.models import HammersteinSS
 from optid.statistics.state_unknowns import Latent, StatePoint, beyond_affine
 
-CANDIDATES = 32  # directions of z that are ranked, at least
 RANKED = 3_000  # samples on which directions are ranked and tried
 FEWEST = 100  # samples of an experiment that is cut
 STAGES = (8_000, 20_000)  # samples of the descents before the one on the whole record
-MARGIN = 1.15  # interval of a basis, as a multiple of the range of z at the start
 CELLS = 12  # largest number of cells of a spline in the search
-# states of a model up to which its factors are tried; modulus from which a zero is one at infinity; radius at which
-# responses are compared
-LARGEST, FAR, OFF = 8, 1e3, 1.05
 SAME = 0.999  # ratio of the gains of two directions above which they count as the same
 SHORT = 12
 HEATS = ((10, SHORT), (5, 30), (2, 60))  # numbers of descents, and their steps
@@ -99,11 +94,13 @@ def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rn
     x, steps = best.x, best.steps
     for number, latent in enumerate(channels, start=1):
         try:
-            part, end, expected = _added(part, x, _coarse(latent), rng, iterations)
+            wider, end, expected = _added(part, x, _coarse(latent), rng, iterations)
         except RankError as error:
             raise RankError(f"latent signal {number}: {error}") from error
         figures[f"expected gain of latent signal {number}"] = expected
-        x, steps = end.x, steps + end.steps
+        x, more = _confirmed(wider, end.x, part, x, errors.data)
+        part, steps = wider, steps + end.steps + more
+    end = descend(part, x, iterations=0)
     for number in [*range(len(channels))] * (tries - 1):
         part, end, more = _exchanged(part, end, number, rng, iterations)
         x, steps = end.x, steps + more
@@ -118,6 +115,30 @@ def _search(errors: StateErrors, best: Descent, channels: tuple[Latent, ...], rn
         end = descend(part, _finite(part, x), iterations=iterations, progress=pace, start=best.start)
         x, steps = end.x, steps + end.steps
     return part, replace(end, steps=steps), figures
+
+
+def _confirmed(wider: StateErrors, x: Array, errors: StateErrors, before: Array, data: Data) -> tuple[Array, int]:
+    """Return a point with one more function, of the few samples it was searched on, that is no worse on many more.
+
+    Where it is worse than the point before, the function begins there at zero, with its argument. Also return the
+    steps taken.
+    """
+    many = first_samples(data, STAGES[0])
+    more, fewer = replace(wider, data=many), replace(errors, data=many)
+    reference = descend(fewer, before, iterations=SHORT, tolerance=COMPARED, progress=PACE["search"])
+    steps = reference.steps
+    with suppress(RankError):
+        found = descend(more, _finite(more, x), iterations=SHORT, tolerance=COMPARED, progress=PACE["search"])
+        steps += found.steps
+        if found.value < reference.value:
+            return found.x, steps
+    start, point = fewer.unknowns.unpack(reference.x), more.unknowns.unpack(x)
+    row = np.concatenate([point.Cz[-1], point.Dz[-1], point.offset_z[-1:]])
+    n, outputs = fewer.unknowns.n, fewer.unknowns.l
+    zero = more.unknowns.pack(_with(start, row[None], point.cs[-1:], np.zeros((n, 1)), np.zeros((outputs, 1))))
+    zero = more.normalised(zero)
+    found = descend(more, zero, iterations=SHORT, tolerance=COMPARED, progress=PACE["search"])
+    return (found.x if found.value <= reference.value else zero), steps + found.steps
 
 
 def _expected(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator) -> float:
@@ -300,67 +321,12 @@ def _with(point: StatePoint, rows: Array, cs: tuple[Array, ...], Ez: Array, Fz: 
                    offset_z=np.concatenate([point.offset_z, rows[:, -1]]))
 
 
-def _directions(errors: StateErrors, point: StatePoint, latent: Latent, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield rows [Cz, Dz, constant] with z in [-1, 1]: states, inputs, outputs, factors of responses, random ones."""
-    n, m = errors.unknowns.n, errors.unknowns.expansion.m
-    states = np.vstack(errors.visited(point))
-    signals = np.hstack([states, np.vstack([e.u for e in errors.data.experiments])])
-    moving = np.concatenate([np.ones(n), np.full(m, float(latent.moved))])
-    spread = signals.std(axis=0)
-    weight = moving / np.where(spread > 0, spread, 1.0)
-    known = [*np.eye(n + m)[moving > 0], *np.hstack([point.C, np.zeros((len(point.C), m))]),
-             *_factors(point, moving, 2 * CANDIDATES, rng)]
-    for number in range(max(CANDIDATES, len(known))):
-        v = known[number] if number < len(known) else weight * rng.normal(size=n + m)
-        z = signals @ v
-        low, high = float(z.min()), float(z.max())
-        if high - low > 1e-9 * np.abs(signals).max() * np.abs(v).max():
-            factor = 2 / (MARGIN * (high - low))
-            yield np.concatenate([factor * v, [-factor * (low + high) / 2]])
-
-
-def _factors(point: StatePoint, moving: Array, most: int, rng: np.random.Generator) -> Iterator[Array]:
-    """Yield rows [Cz, Dz] of the factors of the transfer functions of a single input; of more than `most`, some.
-
-    A static function between two linear systems has one as its argument: some of the poles, and some of the zeros.
-    """
-    n, m = len(point.A), point.b.shape[1]
-    if m > 1 or n > LARGEST:
-        return
-    w = OFF * np.exp(1j * np.linspace(0.0, np.pi, 50 * (n + 1)))
-    response: Any = np.array([np.append(np.linalg.solve(one * np.eye(n) - point.A, point.b[:, 0]), 1.0) for one in w])
-    response *= moving
-    poles = _conjugates(np.linalg.eigvals(point.A))
-    for c, d in zip(point.C, point.d[:, 0]):
-        pencil = np.block([[point.A, point.b], [c[None], np.array([[d]])]])
-        zeros: Any = eigvals(pencil, np.diag(np.append(np.ones(n), 0.0)))
-        zeros = _conjugates(zeros[np.abs(zeros) < FAR])
-        excess = n - sum(map(len, zeros))
-        pairs = [(p, z) for p, z in product(_subsets(poles), _subsets(zeros))
-                 if len(p) and 0 <= len(p) - len(z) <= excess]
-        for i in rng.permutation(len(pairs))[:most] if len(pairs) > most else range(len(pairs)):
-            p, z = pairs[i]
-            wanted: Any = np.prod(w[:, None] - z, axis=1) / np.prod(w[:, None] - p, axis=1)
-            rows = np.vstack([response.real, response.imag])
-            yield np.linalg.lstsq(rows, np.concatenate([wanted.real, wanted.imag]))[0]
-
-
-def _conjugates(roots: Any) -> list[Any]:
-    """Group roots: real ones alone, complex ones with their conjugates."""
-    return [np.array([one, np.conj(one)]) if one.imag else np.array([one]) for one in roots if one.imag >= 0]
-
-
-def _subsets(groups: Sequence[Any]) -> list[Any]:
-    return [np.concatenate([np.zeros(0), *chosen]) for count in range(len(groups) + 1)
-            for chosen in combinations(groups, count)]
-
-
 def _ranked(errors: StateErrors, x: Array, latent: Latent, rng: np.random.Generator
             ) -> Iterator[tuple[float, Array, Array]]:
     """Yield (relative gain of a Gauss-Newton step, row of z, matrix [Ez; Fz] (n + l, r) of the step)."""
     point, n = errors.unknowns.unpack(x), errors.unknowns.n
     r, outputs = latent.size, errors.unknowns.l
-    for row in _directions(errors, point, latent, rng):
+    for row in directions(errors, point, latent, rng):
         single = [replace(latent, vectors=latent.vectors[:, [j]], row=row) for j in range(r)]
         trial = _widened(errors, tuple(single))
         start = _with(point, np.tile(row, (r, 1)), (np.ones(1),) * r, np.zeros((n, r)), np.zeros((outputs, r)))

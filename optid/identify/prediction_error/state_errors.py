@@ -75,18 +75,18 @@ class StateErrors(Criterion):
         """Return the errors near x; of infinite value where a run leaves the range allowed."""
         n, p, experiments = self.unknowns.memory, self.unknowns.shared, self.unknowns.experiments
         try:
-            return linearised(self.blocks(x), experiments, n, p, self.gauge_rows(x), method)
+            return linearised(self.rows(x), experiments, n, p, self.gauge_rows(x), method)
         except (FloatingPointError, DataError):
             nothing = (np.eye(n), np.zeros((n, p)), np.zeros(n))
             return Linearised(np.eye(p), np.zeros(p), (nothing,) * experiments, np.inf, 0, 1.0, "gram")
 
-    def blocks(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
+    def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
         """Return a generator of the weighted rows [x0 | shared | error] of experiment i, zero where y is missing."""
         unknowns, covariance = self.unknowns, np.linalg.inv(self.weight)
         point, model = self._placed(x)
         chunk = max(32, NUMBERS // ((unknowns.memory + unknowns.shared + 1) * unknowns.l))
 
-        def rows(index: int) -> Iterator[tuple[Array, int]]:
+        def weighted(index: int) -> Iterator[tuple[Array, int]]:
             for block in _runs(self._job(model, index), unknowns, point, index, chunk):
                 count = int(np.count_nonzero(~np.isnan(block[:, :, -1])))
                 block = _weighted(block, covariance)
@@ -94,7 +94,7 @@ class StateErrors(Criterion):
                     raise FloatingPointError
                 yield block.reshape(-1, block.shape[2]), count
 
-        return rows
+        return weighted
 
     def admissible(self, x: Array) -> bool:
         """Whether the matrix that carries the state is stable enough, and the constraints on poles hold."""

@@ -1,6 +1,6 @@
 """The sum of squared errors of a transfer-function model, and the record it is taken from, in its own units."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -25,6 +25,7 @@ from optid.statistics.regression import ROWS_PER_COLUMN, accumulate, collect
 from optid.statistics.sensitivities import TransferPredictor
 from optid.statistics.unknowns import TransferUnknowns
 
+CONFINED = 1 - 1e-6  # radius to which zeros of C are brought that a step puts outside
 STABLE = 1 - 1e-9  # radius inside which every pole of an iterate, or zero of C, lies
 INTEGRATES = 1e-6  # size of A(1) that is the accuracy of a solver, where a constraint makes it zero
 
@@ -52,6 +53,16 @@ class TransferErrors(TransferPredictor, Criterion):
         """Return the errors near x."""
         return self.compress(self.unknowns.unpack(x), self.gauge_rows(x), method)
 
+    def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
+        """Return a generator of the rows [x0 | shared | error] of experiment i, also where x0 is forgotten."""
+        point, width = self.unknowns.unpack(x), self.unknowns.memory + self.unknowns.shared + 1
+
+        def whole(index: int) -> Iterator[tuple[Array, int]]:
+            for block, count in self.blocks(point, index):
+                yield np.pad(block, ((0, 0), (width - block.shape[1], 0))), count
+
+        return whole
+
     def value(self, x: Array) -> float:
         """Return the sum of squared errors at x."""
         return float(sum(np.nansum(e**2) for e in self.innovations(x)))
@@ -71,6 +82,13 @@ class TransferErrors(TransferPredictor, Criterion):
         if self.integrates and abs(1 + a.sum()) <= INTEGRATES:
             a = roots.without_integrator(a)
         return not self.unknowns.apart or roots.radius(a) < STABLE
+
+    def confined(self, x: Array) -> Array:
+        """Return x with the zeros of C inside the unit circle, on which those of noise without a level lie."""
+        x, at = np.array(x), self.unknowns.slices["c"]
+        if np.all(np.isfinite(x)) and roots.radius(x[at]) >= STABLE:
+            x[at] = roots.contained(x[at], CONFINED)
+        return x
 
     def normalised(self, x: Array) -> Array:
         """Return the same model in the gauge; a pole that a constraint puts at 1 lies there to the last digit."""

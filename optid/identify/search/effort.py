@@ -21,8 +21,8 @@ EFFORTS = {"small": 15.0, "normal": 60.0, "large": 400.0}
 WARM = 0.25  # cost of a fit that goes on from another instead of searching for functions of latent signals
 LEAST = 0.01  # units of the shortest fit
 SAMPLES, EXPERIMENTS = 3000, 8  # of a record that costs twice as much as a short one
-RATES = {"arx": (5e-5, 1.5), "armax": (1e-3, 1.5), "bj": (3e-3, 1.5), "oe": (4.5e-3, 1.5), "sid": (1.3e-3, 1.0),
-         "ss": (4e-3, 1.2), "wiener": (3.5e-3, 1.2), "latent": (7e-3, 1.5)}
+RATES = {"arx": (7e-5, 1.5), "armax": (1.3e-3, 1.5), "bj": (4e-3, 1.5), "oe": (6e-3, 1.5), "sid": (1.7e-3, 1.0),
+         "ss": (5.3e-3, 1.2), "wiener": (4.7e-3, 1.2), "latent": (9.3e-3, 1.5)}
 """Units of a fit with one parameter to a short record, and the power of their number by which it becomes dearer."""
 
 

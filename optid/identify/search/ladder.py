@@ -29,7 +29,7 @@ PATIENCE = 2  # successive orders without improvement after which a rung ends
 LARGEST, MOST_LATENT = 10, 8  # largest number of states, and that beside functions of latent signals
 MOST_CHANNELS = 3  # latent signals
 SAME_ORDER = 0.003  # relative difference of errors within which linear models say the same of the order
-RISE = 0.95  # ratio of the errors on the record above which one more latent signal or state has not helped
+RISE = 0.95  # ratio of the errors on the record above which one more latent signal, or a richer class, has not helped
 LINE = "linear"  # the basis of one function
 SMOOTH, FLEXIBLE, ENOUGH = "polynomial:3", "bspline:8", 1000
 """First basis of latent functions on short records, that on records of so many samples."""
@@ -127,6 +127,12 @@ class Ladder:
     def promising(self, kind: str, *formulations: str) -> bool:
         """Whether a structure of a class, or of formulations of it, came through cross-validation."""
         return self.best(kind, *formulations) is not None
+
+    def follows(self, kind: str, *formulations: str) -> bool:
+        """Whether a structure of a class follows the record by much better than the choice does, or is the choice."""
+        chosen, leading = self.choice(), self.leading(kind, *formulations)
+        return chosen is None or chosen.candidate.kind == kind or (
+            leading is not None and 100 - leading.estimation <= RISE * (100 - chosen.estimation))
 
     def arguments(self, kind: str, *formulations: str) -> Mapping[str, Any]:
         """Return the arguments of the leading structure of a class, or of formulations of it; none without any."""
@@ -244,10 +250,7 @@ def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
     words = [bases(ladder.data, word) for word in ("polynomial:3", "triangular:6")]
     if not ladder.single:
-        states = partial(structure, INPUTS, "hammerstein_ss.exact")
-        yield [states(nx=k, basis=word) for k in dict.fromkeys([ladder.order(), 2]) for word in words]
-        if a := ladder.arguments(INPUTS):
-            yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
+        yield from _of_several_outputs(ladder, words)
         return
     if not ladder.open:
         a = ladder.arguments(LINEAR, "bj.exact") or {"na": 2, "nb": 2, "nk": list(ladder.delays[-1]), "nc": 0, "nd": 1}
@@ -257,9 +260,8 @@ def input_functions(ladder: Ladder) -> Rung:
     def model(n: int, nk: Sequence[int], basis: Any) -> Candidate:
         return structure(INPUTS, "hammerstein_oe.exact", na=n, nb=n, nk=list(nk), basis=basis)
 
-    if ladder.told.processes:
-        found = _orders(ladder.told.processes[0])
-        yield [structure(INPUTS, "hammerstein_oe.exact", **found, basis=word) for word in words]
+    for one in ladder.told.processes[:1]:
+        yield [structure(INPUTS, "hammerstein_oe.exact", **_orders(one), basis=word) for word in words]
     a = ladder.arguments(LINEAR, "oe.exact") or {"na": 2, "nk": ladder.delays[-1]}
     delays = list(dict.fromkeys([tuple(a["nk"]), *ladder.delays]))
     yield [model(k, nk, word) for k in dict.fromkeys([min(int(a["na"]), 3), 2]) for nk in delays for word in words]
@@ -274,6 +276,21 @@ def input_functions(ladder: Ladder) -> Rung:
     near = [[max(k + step, 0) for k in a["nk"]] for step in (-1, 1)]
     low = [structure(INPUTS, "hammerstein_oe.exact", **_orders(p), basis=a["basis"]) for p in ladder.told.processes]
     yield [*low, *(model(a["na"], nk, a["basis"]) for nk in near if nk != a["nk"])]  # a better basis needs fewer lags
+    if (a := ladder.arguments(INPUTS, "hammerstein_oe.exact")) and a["basis"] == bases(ladder.data, "triangular:10"):
+        yield [model(a["na"], a["nk"], bases(ladder.data, f"triangular:{count}")) for count in (7, 8)]  # a knee
+
+
+def _of_several_outputs(ladder: Ladder, words: Sequence[Any]) -> Rung:
+    """Subspace models tell functions and order, at a small part of the price of a descent, which follows."""
+    subspace, states = (partial(structure, INPUTS, name) for name in ("hammerstein_ss.sid", "hammerstein_ss.exact"))
+    order = ladder.order()
+    yield [subspace(nx=order, basis=word) for word in words]
+    a = ladder.arguments(INPUTS) or {"basis": words[0]}
+    yield from climbed([subspace(nx=k, basis=a["basis"])] for k in range(order + 1, LARGEST + 1))
+    a = ladder.arguments(INPUTS) or {"nx": order, **a}
+    yield [states(nx=k, basis=a["basis"]) for k in dict.fromkeys([a["nx"], order, 2])]
+    if a := ladder.arguments(INPUTS, "hammerstein_ss.exact"):
+        yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
 
 
 def feedback(ladder: Ladder) -> Rung:
@@ -300,7 +317,7 @@ def _inner(ladder: Ladder) -> list[Any]:
 def latent_signals(ladder: Ladder) -> Rung:
     """Static functions of the outputs of linear or Hammerstein systems, and of combinations of states and inputs.
 
-    Signals are added as long as the fit to the record rises, whatever cross-validation says of the first.
+    Signals are added while the fit to the record rises; other families of functions are tried where the first help.
     """
     def model(n: int, channels: int, latent_basis: str, direct: bool, basis: Any = "linear") -> Candidate:
         inner = {} if basis == "linear" else {"basis": basis}
@@ -318,8 +335,14 @@ def latent_signals(ladder: Ladder) -> Rung:
     yield from _output_functions(ladder)
     if not (a := ladder.arguments(LATENT, "lfr.exact")):
         return
-    yield [model(a["nx"], 1, word, direct) for word in ("polynomial:5", FLEXIBLE) for direct in (False, True)]
+    other = "polynomial:5" if first == FLEXIBLE else FLEXIBLE
+    if ladder.follows(LATENT, "lfr.exact"):
+        yield [model(a["nx"], 1, word, direct) for word in ("polynomial:5", FLEXIBLE) for direct in (False, True)]
+    else:
+        yield [model(a["nx"], 1, other, a["direct"])]
     yield from _larger(ladder, model)
+    if not ladder.follows(LATENT, "lfr.exact"):
+        return
     a = ladder.arguments(LATENT, "lfr.exact")
     nx, channels, word, direct = a["nx"], a["channels"], a["latent_basis"], a["direct"]
     yield [*(model(nx, channels, other, direct) for other in (SMOOTH, "polynomial:5", "bspline:4")),
@@ -349,7 +372,8 @@ def _output_functions(ladder: Ladder) -> Rung:
     if leading := ladder.leading(LATENT, *words):
         model = partial(structure, LATENT, leading.candidate.formulation)
         a = leading.candidate.arguments
-        yield [model(**{**a, "output_basis": word}) for word in (SMOOTH, "polynomial:5", "bspline:4", FLEXIBLE)]
+        if ladder.follows(LATENT, *words):
+            yield [model(**{**a, "output_basis": word}) for word in (SMOOTH, "polynomial:5", "bspline:4", FLEXIBLE)]
         if ladder.promising(LATENT, *words):
             a = ladder.arguments(LATENT, leading.candidate.formulation)
             yield from climbed([model(**{**a, "nx": n})] for n in range(a["nx"] + 1, MOST_LATENT + 1))

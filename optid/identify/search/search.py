@@ -43,9 +43,12 @@ from optid.registry import Rendered, named_constraint
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
 Runs = Callable[[Sequence[Candidate], Trial | None], list[Trial | None]]
-COMPARED = 8_000  # samples of a long record on which structures are compared
+# samples of a long record on which structures are compared, and up to which a record is not long: stretches cut out of
+# it lose their beginnings, and with them more than a shorter trial saves
+COMPARED, LONG = 5_000, 8_000
 FIRST = 0.15  # share of the effort that linear models have before the others begin
 MANY = 3.0  # effort for latent signals, of which there are most structures, over that of another class
+LEADING = 2.0  # the same for the class of the best model so far
 TURN = 0.05  # share of the effort that a class has at a time
 LARGEST_SHARE = 0.4  # of the effort that one trial may take, after the first
 
@@ -143,7 +146,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     if horizon is not None:
         check_integer(horizon, "horizon")
     rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
-    compared = stretches(data, COMPARED)
+    compared = data if data.n_samples <= LONG else stretches(data, COMPARED)
     cut = Blocks.of(compared, blocks)
     ladder, stopped = Ladder.of(cut, data.n_experiments > 1), ""
     unfinished: Sequence[str] = ()
@@ -240,7 +243,7 @@ def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: C
             return BUDGET, tuple(rungs)
         kind = early[0] if early else (
             LINEAR if LINEAR in rungs and spent[LINEAR] < FIRST * most
-            else min(rungs, key=lambda one: spent[one] / (MANY if one == LATENT else 1)))
+            else min(rungs, key=lambda one: spent[one] / _share(ladder, one)))
         try:
             if kind not in batches:
                 batches[kind] = _different(ladder, next(rungs[kind]))
@@ -257,6 +260,13 @@ def _climb(ladder: Ladder, kinds: Sequence[str], run: Runs, most: float, left: C
             early = [one for one in early if one != kind]
             del rungs[kind]
     return "", ()
+
+
+def _share(ladder: Ladder, kind: str) -> float:
+    """Return the effort that a class may have, over that of others."""
+    chosen = ladder.choice()
+    leads = chosen is not None and chosen.candidate.kind == kind
+    return (MANY if kind == LATENT else 1.0) * (LEADING if leads else 1.0)
 
 
 def _different(ladder: Ladder, batch: Sequence[Candidate]) -> list[Candidate]:

@@ -84,7 +84,7 @@ class Regression:
             found.append(white - basis @ (basis.T @ white))
         rows = np.vstack(found)
         rows[:, np.sum(rows**2, axis=0) <= DEPENDENT**2 * before] = 0.0  # what is left of a level is rounding
-        return rows.reshape(-1, *columns[0].shape[1:])
+        return rows.reshape(len(rows), *columns[0].shape[1:])
 
 
 def orthonormal(columns: Array) -> Array:
@@ -97,11 +97,11 @@ def orthonormal(columns: Array) -> Array:
     return basis[:, diagonal > DEPENDENT * diagonal[0]]
 
 
-def solve(columns: Array, target: Array) -> Array:
-    """Return the least-squares coefficients of columns of any length, however dependent they are."""
+def solve(columns: Array, target: Array, dependent: float = DEPENDENT) -> Array:
+    """Return the least-squares coefficients of columns of any length, however dependent they are, of each target."""
     sizes = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    found: Any = lstsq(columns / sizes, target, cond=DEPENDENT, lapack_driver="gelsy")
-    return np.asarray(found[0]) / sizes
+    found: Any = lstsq(columns / sizes, target, cond=dependent, lapack_driver="gelsy")
+    return (np.asarray(found[0]).T / sizes).T
 
 
 def score_test(error: Array, tangent: Array, columns: Array, spare: int, negligible: float) -> FTest | None:

@@ -24,7 +24,7 @@ from optid.identify.validation.structure_alternatives import RANK, alternatives
 from optid.identify.validation.structure_design import Design
 from optid.identify.validation.structure_hypothesis import Hypothesis, fit_hammerstein, given_model
 
-SIGNIFICANT = 5e-3
+SIGNIFICANT = 0.01
 # share of the residual variance within which functions and filters follow any Hammerstein system, and noise models any
 # noise, but for so many rows
 NEGLIGIBLE, ROWS = 0.003, 2.0
@@ -109,13 +109,16 @@ def structure_test(data: Data, simulated: Sequence[Array] | None = None, found: 
 
 def _test(hypothesis: Hypothesis) -> dict[str, FTest]:
     """Return the test of every alternative that the record tells apart from the hypothesis."""
-    table = alternatives(hypothesis)
-    if hypothesis.rounding:
+    table, regression = alternatives(hypothesis), hypothesis.regression
+    if hypothesis.rounding and regression.spare > hypothesis.tangent.shape[1]:  # fewer rows are met by anything
         return {next(iter(table)): FTest()}
-    regression, error, found = hypothesis.regression, hypothesis.error, {}
-    for name, columns in table.items():
-        test = score_test(error, hypothesis.tangent, regression.reduce(columns(hypothesis)), regression.spare,
-                          NEGLIGIBLE + ROWS / max(regression.spare, 1))
+    found = {}
+    for name, make in table.items():
+        columns = make(hypothesis)
+        judged = hypothesis.beside(columns)
+        spare = judged.regression.spare
+        test = score_test(judged.error, judged.tangent, judged.regression.reduce(columns), spare,
+                          NEGLIGIBLE + ROWS / max(spare, 1))
         if test is not None:
             found[name] = test
     if not found:

@@ -6,12 +6,13 @@ be the best one to the last digit: the directions in which it can still move, it
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.identify.informativity.signals import delayed
-from optid.identify.validation.score_tests import Regression, orthonormal, solve
+from optid.identify.validation.score_tests import DISTINCT, LEAST, Regression, orthonormal, solve
 from optid.identify.validation.structure_design import PULSES, Design
 from optid.models.recursions import lfilter
 from optid.statistics.coloured import short_autoregression
@@ -25,6 +26,7 @@ SHARES = (1.0, 0.3, 0.1)  # of a step that are tried
 RIDGE = 1e-7  # share of its length added to every column, for functions that the record does not tell apart
 LAGS, SLOW = 16, (0.8, 0.9, 0.95, 0.98, 0.99)  # single lags and poles that complete the filters of f
 ROOM = 20  # samples by input for every column of these
+NOISE_ROOM = 50  # rows for every column that is told from the noise when this is estimated
 CUT = 1e-4  # standard deviation of residuals, over that of the output, that filters of nearly right poles leave
 ROUNDING = 1e-12  # standard deviation of residuals, over the largest output, that is rounding
 
@@ -37,7 +39,7 @@ class Hypothesis:
         design: functions and filters.
         regression: whitens what is left.
         predicted: (N,) per experiment, with level and decay.
-        tangent: (R, n) orthonormal basis of the directions in which the hypothesis can move.
+        directions: (N, n) per experiment, in which the hypothesis can move.
         carriers: signals whose products are tested, (N, q) per experiment; none of a given model.
         ratios: second over first singular value of filters times functions, by input.
         rounding: whether nothing but rounding, and what the filters cut off, is left.
@@ -46,7 +48,7 @@ class Hypothesis:
     design: Design
     regression: Regression
     predicted: Sequence[Array]
-    tangent: Array
+    directions: Sequence[Array]
     carriers: list[Array]
     ratios: list[float]
     rounding: bool
@@ -55,6 +57,30 @@ class Hypothesis:
     def error(self) -> Array:
         """What is left of the output, whitened, (R,)."""
         return self.regression.reduce([y - p for y, p in zip(self.design.output, self.predicted)])
+
+    @cached_property
+    def tangent(self) -> Array:
+        """(R, n) orthonormal basis of the directions, whitened."""
+        return orthonormal(self.regression.reduce(self.directions))
+
+    def beside(self, columns: Sequence[Array]) -> "Hypothesis":
+        """Return the hypothesis with the noise that is left beside further columns, (N, k) per experiment.
+
+        What an alternative explains is no noise: a gain that drifts leaves slow errors, and whitened by these it would
+        not be seen. Of few rows it would explain the noise too.
+        """
+        moves, further = self.regression.reduce(self.directions), self.regression.reduce(columns)
+        sizes = np.maximum(np.linalg.norm(further, axis=0), 1e-300)
+        taken = solve(moves, further / sizes)
+        left = further / sizes - moves @ taken
+        distinct = np.linalg.norm(left, axis=0) > LEAST
+        if self.regression.spare < NOISE_ROOM * np.sum(distinct):
+            return self
+        found = solve(left[:, distinct], self.error, DISTINCT**0.5)
+        explained = [(c[:, distinct] / sizes[distinct] - d @ taken[:, distinct]) @ found
+                     for c, d in zip(columns, self.directions)]
+        regression, _ = _whiten(self.design, [p + more for p, more in zip(self.predicted, explained)])
+        return replace(self, regression=regression)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +99,7 @@ def given_model(design: Design, simulated: Sequence[Array]) -> Hypothesis:
     """Return the hypothesis that an output is simulated, (N,) per experiment, plus noise."""
     predicted = [(y - design.centre) / design.spread for y in simulated]
     regression, whole = _whiten(design, predicted)
-    return Hypothesis(design, regression, predicted, np.zeros((regression.reduce(predicted).shape[0], 0)), [],
+    return Hypothesis(design, regression, predicted, [np.zeros((len(y), 0)) for y in predicted], [],
                       [0.0] * len(design.banks), _is_rounding(design, whole))
 
 
@@ -86,8 +112,7 @@ def fit_hammerstein(design: Design, noise: Array) -> Hypothesis:
         point = _descend(design, regression, point)
         regression, whole = _whiten(design, [point.response(banks) for banks in zip(*design.banks)])
     values, lines = zip(*(np.linalg.svd(theta)[1:] for theta in free))
-    tangent = orthonormal(np.hstack([regression.reduce(columns) for columns in _tangent(design, point)]))
-    return Hypothesis(design, regression, whole, tangent, _carriers(design, regression, lines),
+    return Hypothesis(design, regression, whole, _directions(design, point), _carriers(design, regression, lines),
                       [float(v[1] / v[0]) if v.size > 1 and v[0] > 0 else 0.0 for v in values],
                       _is_rounding(design, whole))
 
@@ -147,8 +172,8 @@ def _is_rounding(design: Design, predicted: Sequence[Array]) -> bool:
     return float(left.std()) <= max(CUT, ROUNDING * max(1.0, abs(design.centre) / design.spread))
 
 
-def _tangent(design: Design, point: _Point) -> list[list[Array]]:
-    """Return what moves filters and functions, and every f at single lags and through slow poles."""
+def _directions(design: Design, point: _Point) -> list[Array]:
+    """Return what moves filters and functions, and every f at single lags and through slow poles, (N, n) each."""
     room = design.data.n_samples // (ROOM * len(design.banks))
     lags, slow = min(LAGS, room // 2), SLOW[max(len(SLOW) - room // 4, 0) :]
     found = []
@@ -157,7 +182,7 @@ def _tangent(design: Design, point: _Point) -> list[list[Array]]:
         wider = [[delayed(f, PULSES + lag) for lag in range(lags)] + [lfilter([1.0], [1.0, -p], f) for p in slow]
                  for f in (x[:, 0] @ mu for x in bank)]
         found += [[np.column_stack(columns) for columns in wider]] if lags else []
-    return found
+    return [np.hstack(parts) for parts in zip(*found)]
 
 
 def _carriers(design: Design, regression: Regression, lines: Sequence[Array]) -> list[Array]:

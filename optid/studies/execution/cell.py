@@ -18,7 +18,8 @@ import numpy as np
 from optid.errors import DataError, SolverMissing, SolverRefused
 from optid.identify.fitting import Fit, fit
 from optid.program.solution import Solution
-from optid.solving.solve import NOT_FINITE, solve
+from optid.solving.claims import NOT_FINITE
+from optid.solving.solve import solve
 from optid.studies.execution.machine import Peak, machine
 from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash, determining

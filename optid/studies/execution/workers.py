@@ -24,7 +24,7 @@ from typing import Any
 from optid.data.reduction import available_cores
 from optid.errors import StudyError
 from optid.processes import death
-from optid.solving.solve import GRACE
+from optid.solving.answers import GRACE
 from optid.studies.execution.cell import lost_row, prepare, run_cell, without_warm
 from optid.studies.execution.worker import RETIRED, last_words, run, start
 from optid.studies.grid import Cell

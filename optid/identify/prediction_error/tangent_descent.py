@@ -1,0 +1,317 @@
+"""From the optimum of a descent to a point that a back end confirms: programmes in the tangent of the iterate.
+
+Without constraints one programme at the optimum suffices. With constraints every step is a `Program`, which any back
+end for its class can solve: the linearised errors, the user's constraints in the tangent of the iterate, the curvature
+that earlier steps have shown, and, after a step that our own figures refuse, a quadratic damping term. Whatever the
+constraints, the last programme is that of the linearised errors alone, posed at the final iterate, and solved by the
+back end that was asked for: that it offers no better point is what "locally optimal" means here.
+"""
+
+from collections.abc import Generator, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.errors import RankError, StructureError
+from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet
+from optid.identify.prediction_error.curvature import Curvature
+from optid.identify.prediction_error.descent import STEPS, Descent
+from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit, violation
+from optid.program.program import Program
+from optid.program.solution import Bound, Solution, Status
+from optid.solving.solve import Evidence, Procedure
+from optid.statistics.linearised import Linearised
+
+# share of the sum of squares that a full step may still gain, as measured through a back end, whose accuracy limits it
+CONFIRMED = 1e-8
+# share that counts as nothing where programme after programme promises as little: a curved boundary is followed
+STALLED = 1e-6
+NOWHERE = 1e-9  # relative violation that is rounding; a step to more than that pays for it
+ROUNDING = 1e-14  # share of the energy of the record below which differences of sums of squares are rounding
+PATIENCE = 5  # undamped programmes in all that may promise no more than `STALLED` before it counts as nothing
+# a step onto the constraints is taken where the sum of squares is up to so many times what its linear model said, and
+# from this damping on, with which it is nearly the shortest one, in any case
+TRUSTED, NEAR = 10.0, 1e-2
+CONFLICT = 0.1  # share of the errors above the free optimum from which descents from other signs are worth their time
+MIRRORED = 30  # programmes of a descent from the other sign of f, after which it goes on only where it is better
+# moves of poles along a border; share of the errors that one must gain, and all of them for an end to be no optimum
+ROUNDS, ALONG, BETTER = 5, 1e-6, 1e-5
+PARTS = 10  # halvings of an undamped step that are tried where no damped one descends
+NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
+
+
+def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array) -> Procedure:
+    """Bring a descent to a point that a back end confirms, under the constraints of the programmes.
+
+    Args:
+        fit: its programmes.
+        found: the unconstrained optimum.
+        figures: what is known already; returned with the evidence.
+        x: where to start: the optimum, in the signs that the constraints ask for, or a point nearer to them.
+
+    Returns:
+        The evidence, or None where a programme has no point: its status says why.
+    """
+    here = _Iterate.of(fit, x)
+    if not np.isfinite(here.at.value):
+        raise RankError("no start has a run that stays within its range; use another order or another basis")
+    figures = {**figures, "Gauss-Newton steps": found.steps}
+    if here.program.user_constraints:
+        # how well the record tells the unknowns: a constraint that it contradicts may end where f is all but flat
+        figures["condition"] = found.at.condition
+        best = yield from _best_signed(here, fit.criterion.unit * found.value, figures)
+        return (yield from _settled(fit, best, figures))
+    solution = yield here.program
+    if not solution.has_point:
+        return None
+    verdict = here.judged(solution, CONFIRMED) if found.converged else (Status.LIMIT, found.reason)
+    return here.evidence(*verdict, {**figures, "programmes": 1})
+
+
+def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) -> Procedure:
+    """Go on where poles that move along the border of their region lower the errors.
+
+    Where two poles all but meet there, programmes have no answer any more; the errors as a function of these two, with
+    everything else fitted, then say that a point is the best one near it, if nothing else is constrained.
+    """
+    depth, tried = about_poles(fit.constraints), False
+    for _ in range(ROUNDS):
+        if end is None or depth is None or end.status not in (Status.LOCAL, Status.LIMIT, Status.INACCURATE):
+            break
+        alone = all("poles" in getattr(rule, "about", ()) for rule in fit.constraints)
+        before = fit.places.pack(end.values or {})
+        best = along_border(fit.criterion, depth, before, ALONG, alone)
+        if not alone:
+            best = yield from _beside_others(fit, before, (doubled(fit.criterion, depth, before), best), figures)
+            tried = True
+        if best is before and end.status is Status.LOCAL:
+            break
+        there, tried = _Iterate.of(fit, best), True
+        again = yield from _constrained(there, figures, MIRRORED)
+        if again is None or again.status is not Status.LOCAL or not again.objective < end.objective:
+            two = alone and meet(fit.criterion, best)
+            gains = fit.criterion.unit * there.at.value < end.objective * (1 - BETTER)
+            if end.status is Status.LOCAL and not gains and not two:
+                break
+            status = (Status.LOCAL, NO_BOUND.format(fit.criterion.errors)) if two else (
+                Status.LIMIT, "where poles meet on the border of their region the programmes have no answer, or creep")
+            end = there.evidence(*status, end.figures)
+            break
+        end = again
+    if end is not None and tried:  # prices are those of the last programme
+        yield _Iterate.of(fit, fit.places.pack(end.values or {})).program
+    return end
+
+
+def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], figures: Mapping[str, Any]
+                   ) -> Generator[Program, Solution, Array]:
+    """Return x, or what is better of moved poles with everything else fitted again under all constraints."""
+    best, least = x, fit.criterion.value(x) * (1 - BETTER)
+    others = tuple(rule for rule in fit.constraints if "poles" not in getattr(rule, "about", ()))  # those hold as it is
+    for point in moved:
+        if point is None or point is x:
+            continue
+        part = fit.criterion.unknowns.parts(point)
+        word = "A" if "A" in part else "a"
+        still = replace(fit, constraints=(*others, lambda view, at=part[word], word=word: {
+            "poles": view[word] == at}))
+        end = yield from _constrained(_Iterate.of(still, point), figures, MIRRORED)
+        there = None if end is None else _Iterate.of(fit, fit.places.pack(end.values or {}))
+        if there is not None and there.outside <= INSIDE and there.at.value < least:
+            best, least = there.x, there.at.value
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    fit: TangentFit
+    x: Array
+    at: Linearised
+    program: Program
+    outside: float  # largest violation, relative
+    amount: float  # sum of the absolute violations of the user's constraints
+
+    @classmethod
+    def of(cls, fit: TangentFit, x: Array) -> "_Iterate":
+        x = fit.criterion.normalised(x)
+        at = fit.criterion.linearise(x)
+        program = fit.pose(x, at, 0.0)
+        outside = violation(program) if program.user_constraints else 0.0
+        amount = sum(float(np.sum(np.abs(np.asarray(member.violation()))))
+                     for group in program.user_constraints.values() for member in group)
+        return cls(fit, x, at, program, outside, amount if outside > NOWHERE else 0.0)
+
+    def moved(self, x: Array) -> "_Iterate | None":
+        """Return the iterate at x, None where it is inadmissible, its run explodes or its gauge cannot be reached."""
+        criterion = self.fit.criterion
+        x = criterion.confined(x)
+        try:
+            return _Iterate.of(self.fit, x) if criterion.admissible(x) and np.isfinite(criterion.value(x)) else None
+        except StructureError:
+            return None
+
+    def merit(self, weight: float) -> float:
+        return self.at.value + weight * self.amount
+
+    def step(self, solution: Solution) -> Array:
+        return self.fit.places.pack(solution.values) - self.x
+
+    def gain(self, step: Array, at: Linearised | None = None) -> float:
+        """By how much a step lowers the sum of squares of the linear errors, or of others with the same gradient."""
+        at = self.at if at is None else at
+        return at.value - at.after(step)
+
+    def negligible(self, gain: float, share: float) -> bool:
+        return abs(gain) <= share * self.at.value + ROUNDING * self.fit.criterion.energy
+
+    def judged(self, solution: Solution, share: float) -> tuple[Status, str]:
+        """What an answer to the programme makes of the iterate: it must have been solved, and the iterate stay."""
+        if solution.status not in (Status.OPTIMAL, Status.LOCAL) and not _near(solution):
+            return solution.status, solution.reason
+        gain = self.gain(self.step(solution))
+        if self.negligible(gain, share):
+            return Status.LOCAL, NO_BOUND.format(self.fit.criterion.errors)
+        return Status.INACCURATE, (f"{solution.solver} moves the sum of squares of the last tangent programme by "
+                                   f"{abs(gain) / max(self.at.value, 1e-300):.0e} of its value")
+
+    def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
+        bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
+        values, value = self.fit.places.values(self.x), self.fit.criterion.unit * self.at.value
+        model, turns = self.fit.recover(values), self.fit.turns(self.x, self.at) if self.fit.constraints else np.ones(1)
+        model = model.turned(turns) if np.any(turns < 0) else model
+        return Evidence(model, value, bound, status, reason, figures, values=values)
+
+
+def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Procedure:
+    """Return the best end of descents from all signs of f and B, where the first ends far above the free optimum.
+
+    Constraints that the record contradicts have several local optima; near the free optimum there is one.
+    """
+    best = yield from _constrained(here, figures)
+    if best is not None and best.objective <= free * (1 + CONFLICT):
+        return best
+    for start in here.fit.mirrored(here.x):
+        least = np.inf if best is None else best.objective
+        end = yield from _constrained(_Iterate.of(here.fit, start), figures, MIRRORED)
+        if end is None or not end.objective < least * (1 + CONFLICT):
+            continue
+        there = _Iterate.of(here.fit, here.fit.places.pack(end.values or {}))
+        if end.status is not Status.LOCAL:
+            end = yield from _constrained(there, figures)
+        if end is not None and end.objective < least and there.outside <= INSIDE:
+            best = end
+    return best
+
+
+def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) -> Procedure:
+    """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
+    previous: _Iterate | None = None
+    damping, growth, weight, last, idle, more = 0.0, 4.0, 0.0, np.inf, 0, 0
+    answered, curvature = False, Curvature(here.x.size)
+    entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
+    for count in range(1, most + 1):
+        at = curvature.added(here.at) if curvature.used else here.at
+        plain = at is here.at and not damping
+        solution = yield here.program if plain else here.fit.pose(here.x, at, damping)
+        if not solution.has_point and at is not here.at:
+            curvature.used = False
+            continue
+        if not solution.has_point:
+            if most < STEPS or (solution.status is Status.INFEASIBLE and previous is None) or damping > 1e3:
+                if most < STEPS or here.outside > INSIDE or not answered:
+                    return None  # of a descent that may be in vain, the first programme without an answer is the last
+                said = f"{solution.solver} gave no answer to the last programme: {solution.claimed}"
+                return here.evidence(Status.LIMIT, said, {**figures, "programmes": count + more})
+            if solution.status is Status.INFEASIBLE and previous is not None:
+                here, previous = previous, None
+            damping = max(100.0 * damping, 1e-6)  # a nearer point, and a better conditioned programme
+            continue
+        answered, step = True, here.step(solution)
+        gain, new = here.gain(step, at), here.moved(here.x + step)
+        duals = [solution.duals[name] for name in here.program.user_constraints if name in solution.duals]
+        needed = max(0.0, *(2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals))
+        weight = max(needed, (weight + needed) / 2)  # multipliers far from the constraints may be huge
+        idle += plain and abs(gain) <= STALLED * here.at.value
+        share = CONFIRMED if abs(gain) < 0.5 * last and idle <= PATIENCE else STALLED
+        last = abs(gain) if plain else last
+        if plain and here.negligible(gain, share) and here.outside <= INSIDE:
+            best = here if new is None or new.outside > INSIDE or new.at.value > here.at.value else new
+            return best.evidence(*here.judged(solution, share), {**figures, "programmes": count + more})
+        expected = gain + weight * here.amount
+        fall = here.merit(weight) - new.merit(weight) if new is not None else -np.inf
+        entering = new is not None and not entered and (
+            damping > NEAR or new.at.value <= TRUSTED * here.at.after(step))
+        if new is not None and (entering or fall >= 1e-3 * expected or abs(fall) <= 1e-12 * here.merit(weight)):
+            if not damping and entered and fall > expected:
+                new = _longer(here, new, step, weight)
+            curvature.learn(here.at, new.at, new.x - here.x)
+            if at is not here.at and here.negligible(gain, CONFIRMED):
+                curvature.used = False  # only a programme of linear errors can confirm
+            previous, here, growth = here, new, 4.0
+            entered = entered or new.outside <= INSIDE
+            damping *= 0.1 if fall > 0.5 * expected else 1.0
+        elif at is not here.at:
+            curvature.used = False
+        elif plain and here.negligible(gain, BETTER) and here.outside <= INSIDE:  # little, and it does not come
+            return here.evidence(*here.judged(solution, BETTER), {**figures, "programmes": count + more})
+        else:
+            damping, growth = max(growth * damping, 1e-7), 2.0 * growth
+            if damping > 1e10:
+                shorter, more = (yield from _shortened(here, weight)), more + 1
+                if shorter is None:
+                    figures = {**figures, "programmes": count + more + 1}
+                    return (yield from _ended(here, "no step descends", last, figures))
+                previous, here, damping, growth = here, shorter, 0.0, 4.0
+                entered = entered or here.outside <= INSIDE
+                continue
+        if damping < 1e-10 or (fall >= 0 and gain <= STALLED * here.at.value):
+            damping = 0.0  # only an undamped programme can confirm
+    reason = f"{most} programmes did not suffice"
+    return (yield from _ended(here, reason, last, {**figures, "programmes": most + more + 1}))
+
+
+def _longer(here: _Iterate, new: _Iterate, step: Array, weight: float) -> _Iterate:
+    """Go on along a step that gained more than its programme promised, as on a boundary that is curved inwards."""
+    for factor in 2.0 ** np.arange(1, PARTS + 1):
+        further = here.moved(here.x + factor * step)
+        if further is None or further.merit(weight) >= new.merit(weight):
+            break
+        new = further
+    return new
+
+
+def _shortened(here: _Iterate, weight: float) -> Generator[Program, Solution, _Iterate | None]:
+    """Take a part of the undamped step: however damped, programmes end on a boundary that may be curved outwards.
+
+    A part of the way there is off it, where the point to start from is.
+    """
+    solution = yield here.program
+    if not solution.has_point:
+        return None
+    step = here.step(solution)
+    for part in 0.5 ** np.arange(1, PARTS + 1):
+        new, gain = here.moved(here.x + part * step), here.gain(part * step)
+        if new is not None and gain > 0 and here.merit(weight) - new.merit(weight) >= 1e-3 * gain:
+            return new
+    return None
+
+
+def _ended(here: _Iterate, reason: str, last: float, figures: Mapping[str, Any]) -> Procedure:
+    """Judge where the iteration stopped by one more undamped programme."""
+    solution = yield here.program
+    if solution.has_point and here.outside <= INSIDE and here.negligible(here.gain(here.step(solution)), STALLED):
+        return here.evidence(*here.judged(solution, STALLED), figures)
+    reason = f"{reason}; the last undamped one promised {last / here.at.value:.0e} of the value"
+    return here.evidence(Status.LIMIT, reason, figures)
+
+
+def _near(solution: Solution) -> bool:
+    """Whether an inaccurate solution is off by its complementarity alone, and by no more than counts as nothing.
+
+    Many nearly parallel rows share large multipliers: their products with the slacks then keep a rest.
+    """
+    found = solution.residuals
+    return found is not None and solution.status is Status.INACCURATE and (
+        max(found.violation, found.stationarity) <= INSIDE and found.complementarity <= BETTER)

@@ -1,0 +1,253 @@
+"""What a solver's answer is worth: its claim is held against multipliers, bounds and proofs of our own."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from optid.arrays import LARGEST
+from optid.backends.back_end import Answer, BackEnd, Settings
+from optid.backends.choice import find
+from optid.certificate.convex import TANGENT, certify_convex
+from optid.certificate.infeasibility import satisfiable
+from optid.certificate.multipliers import fitted_multipliers
+from optid.program.judging import judge, measure_violation
+from optid.program.program import Program, Values
+from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
+from optid.solving.answers import answer_of
+from optid.structures.least_squares import rank_one_of
+
+FALSE_CLAIM = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
+REFERENCE = "clarabel"  # the solver that is asked where neither multipliers nor a bound confirm a point
+OPEN = 1e-8  # relative gap that a proof leaves, above which a back end is asked to search further
+CONFLICT = "the constraints contradict each other"
+NOT_FINITE = "returned non-finite numbers"  # the reason of such a solution, after its solver
+
+
+def verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution, settings: Settings, prove: bool,
+             separate: bool) -> Solution:
+    """Return a solution with what an answer is worth, proved where that is asked for.
+
+    Args:
+        program: the programme.
+        back_end: the solver.
+        answer: its answer.
+        base: status, words and times of the answer.
+        settings: what was asked of the solver.
+        prove: whether to try to prove a local optimum to be a global one.
+        separate: whether further solves have a process of their own.
+    """
+    try:
+        values = {name: np.asarray(value, dtype=float) for name, value in answer.values.items()}
+    except (TypeError, ValueError) as error:
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} returned no numbers: {error}")
+    if not values:
+        status, reason = _without_point(program, answer, back_end, settings)
+        if status is Status.FAILED and _contradictory(program):
+            return _conflict(base, reason)
+        return replace(base, status=status, reason=reason)
+    if not all(np.all(np.isfinite(value)) for value in values.values()):
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}")
+    if missing := program.shapes.keys() - values.keys():
+        return replace(base, status=Status.FAILED,
+                       reason=f"{back_end.name} returned no value for {', '.join(sorted(missing))}")
+
+    clock = time.perf_counter()
+    try:
+        point = _judged(program, answer, base, settings.accuracy)
+    except ValueError as error:  # CVXPY takes no value of another shape, and none that overflowed
+        why = NOT_FINITE if _overflowed(program) else f"returned a point that cannot be judged: {error}"
+        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
+    judged = time.perf_counter()
+    assert point.residuals is not None
+    if not abs(point.objective) <= LARGEST:  # models refuse such numbers, since their squares overflow
+        return replace(point, status=Status.FAILED, reason=f"{back_end.name} {NOT_FINITE}", values={}, duals={})
+    status, reason = _status(answer, point.residuals, settings.accuracy, back_end.name)
+    if status not in (Status.LOCAL, Status.OPTIMAL) and _contradictory(program):
+        return _conflict(base, reason)
+    bound: Bound | None = None
+    unknown = bool(np.isnan(point.residuals.stationarity))  # only a bound can confirm the point
+    if status in (Status.LOCAL, Status.INACCURATE) and (prove or unknown):
+        point, bound = _proof(program, back_end, settings, point, separate)
+        assert point.residuals is not None
+        outside = point.residuals.violation > tolerance(settings.accuracy)
+        if bound is not None and bound.proved and outside:  # a point outside may well lie below the optimum
+            bound = replace(bound, proved=False, reason=f"no proof: the point violates {point.residuals.worst!r}")
+        if bound is not None and bound.proved and status is Status.LOCAL:
+            status = Status.OPTIMAL
+        elif bound is not None and status is Status.LOCAL and _refuted(program, point, bound, settings.accuracy):
+            status, reason = Status.INACCURATE, f"the certified bound is not reached: {bound.reason}"
+        if status is Status.LOCAL and unknown and not _confirmed(program, back_end, settings, point, separate):
+            status, reason = Status.INACCURATE, f"{back_end.name} claims success, but {REFERENCE} finds a better point"
+    done = time.perf_counter()
+    return replace(point, status=status, reason=reason or (bound.reason if bound and not bound.proved else ""),
+                   bound=bound, times=replace(base.times, judge=judged - clock, prove=done - judged))
+
+
+def _conflict(base: Solution, reason: str) -> Solution:
+    """Report that no point satisfies the constraints; the point of the solver is dropped."""
+    return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}")
+
+
+def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -> Solution:
+    """Return a solution at the answer's point, with what we measured there.
+
+    Where the solver's multipliers do not make it stationary, those count that come nearest to it.
+    """
+    duals = _usable(program, answer.duals)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
+        values, objective, residuals = judge(program, answer.values, duals)
+        claims = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE)
+        unsure = program.user_constraints or np.isnan(residuals.stationarity)
+        if claims and unsure and not _stationary(residuals, accuracy) and residuals.violation <= tolerance(accuracy):
+            own = fitted_multipliers(program)
+            again = residuals if own is None else judge(program, answer.values, own)[2]
+            if own is not None and not again.stationarity >= residuals.stationarity:
+                duals, residuals = own, again
+    return replace(base, values=values, duals=duals, objective=objective, residuals=residuals)
+
+
+def _reference(program: Program, back_end: BackEnd) -> BackEnd | None:
+    """Return another solver for a convex programme than the one that has solved it."""
+    other = find(REFERENCE)
+    return None if program.kind == "NLP" or back_end is other or other.refuses(program) else other
+
+
+def _confirmed(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool) -> bool:
+    """Whether another solver finds no better point of a convex programme with kinks, which has no multipliers of ours.
+
+    The claim of that solver itself stands, and any of a programme that it does not take.
+    """
+    other = _reference(program, back_end)
+    answer = None if other is None else answer_of(program, other, replace(settings, options={}), separate)
+    if answer is None or not answer.values:
+        return True
+    best = _judged(program, answer, point, settings.accuracy)
+    program.assign(point.values)
+    assert best.residuals is not None
+    outside = best.residuals.violation > tolerance(settings.accuracy)
+    return outside or relative_gap(point.objective, best.objective, program.scale) <= GRADIENT * tolerance(
+        settings.accuracy)
+
+
+def _usable(program: Program, duals: Values) -> Values:
+    """Return the multipliers that are finite and as many as their constraint has."""
+    if not duals or not program.is_stated:  # without a statement nothing is measured by them
+        return dict(duals)
+    sizes = {name: sum(dual.size for member in group for dual in member.dual_variables)
+             for name, group in program.constraints.items() if name in duals}
+    return {name: np.ravel(np.asarray(duals[name], dtype=float)) for name, size in sizes.items()
+            if np.size(duals[name]) == size and np.all(np.isfinite(duals[name]))}
+
+
+def _stationary(residuals: Residuals, accuracy: float) -> bool:
+    """Whether a point is stationary as far as was measured; not where that is not known."""
+    limit = tolerance(accuracy)
+    return residuals.stationarity <= GRADIENT * limit and residuals.complementarity <= limit
+
+
+def _overflowed(program: Program) -> bool:
+    """Whether quantities that follow from the assigned variables are not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        values = [np.asarray(expression.value) for expression in program.derived.values()]
+    return any(value.dtype == object or not np.all(np.isfinite(value)) for value in values)
+
+
+def _contradictory(program: Program) -> bool:
+    """Whether the constraints of a bilinear programme contradict each other: its descents cannot tell."""
+    return rank_one_of(program) is not None and bool(program.user_constraints) and not satisfiable(
+        program, list(program.user_constraints))
+
+
+def _without_point(program: Program, answer: Answer, back_end: BackEnd, settings: Settings) -> tuple[Status, str]:
+    """Judge a claim that comes without a point."""
+    name = back_end.name
+    if answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
+        return Status.FAILED, f"{name} claims success, but returned no point"
+    if answer.status is Status.INFEASIBLE and program.start:
+        program.assign(program.start)
+        if all(v.value is not None for v in program.variables.values()) and measure_violation(program)[0] < 1e-9:
+            return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
+    if answer.status is Status.INFEASIBLE and _refutable(program) and satisfiable(
+            program, list(program.user_constraints)):
+        return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
+    if answer.status is Status.UNBOUNDED:
+        if program.objective.expr.is_nonneg():
+            return Status.FAILED, f"{name} claims that there is no minimum, but the objective is never below zero"
+        other = _reference(program, back_end)
+        found = None if other is None else answer_of(program, other, replace(settings, options={}), False)
+        if found is not None and found.status is Status.OPTIMAL:
+            return Status.FAILED, f"{name} claims that there is no minimum, but {REFERENCE} finds one"
+    return answer.status, answer.word
+
+
+def _refutable(program: Program) -> bool:
+    """Whether a point that satisfies a convex outer approximation of the constraints satisfies them all."""
+    return all(member.is_dcp() for name, group in program.constraints.items() for member in group
+               if name in program.user_constraints or rank_one_of(program) is None)
+
+
+def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
+    """Turn a claim and our measurements into a status: success at a bad point is downgraded."""
+    limit = tolerance(accuracy)
+    claims = answer.status in (Status.OPTIMAL, Status.LOCAL)
+    outside = residuals.violation > limit
+    amount = f"constraint {residuals.worst!r} is violated by {residuals.violation:.1e} (relative)" if outside else ""
+    if answer.status is Status.INFEASIBLE and not outside:
+        return Status.FAILED, f"{name} claims infeasibility at a point that satisfies every constraint"
+    # steps along a valley may never meet the solver's own test, and end where ours are met
+    arrived = answer.status is Status.LIMIT and not outside and np.isfinite(residuals.stationarity) and (
+        _stationary(residuals, accuracy))
+    if answer.status not in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE) and not arrived:
+        return answer.status, f"{answer.word}; {amount}" if amount else answer.word
+    if outside:
+        if residuals.violation > FALSE_CLAIM:
+            return Status.FAILED, f"{name} claims success, but {amount}" if claims else f"{answer.word}; {amount}"
+        return Status.INACCURATE, amount
+    if not np.isnan(residuals.stationarity) and not _stationary(residuals, accuracy):
+        return Status.INACCURATE, (
+            f"{name + ' claims success' if claims else answer.word}, but the point is not stationary: "
+            f"residual {residuals.stationarity:.1e}, complementarity {residuals.complementarity:.1e}")
+    if not claims and not np.isfinite(residuals.stationarity):
+        return Status.INACCURATE, answer.word
+    return Status.LOCAL, ""
+
+
+def _refuted(program: Program, point: Solution, bound: Bound, accuracy: float) -> bool:
+    """Whether the dual bound of a convex programme leaves room for a better point, beyond the tolerance."""
+    if bound.proved or bound.method == TANGENT or not np.isfinite(bound.value) or program.kind == "NLP":
+        return False
+    return relative_gap(point.objective, bound.value, program.scale) > tolerance(accuracy)
+
+
+def _proof(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool
+           ) -> tuple[Solution, Bound | None]:
+    """Ask for a proof; what the attempt proposes as a better start, and a wider search, may lead to a better point."""
+    if program.certify is None:
+        if program.kind == "NLP":
+            return point, None
+        try:
+            return point, certify_convex(program, point.values, point.duals, point.objective)
+        except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+            return point, None
+    bound, start = program.certify(program, point.values, point.duals)
+    if start is not None and not bound.proved:
+        point, bound = _lowered(program, start, back_end, settings, point, bound, separate)
+    if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
+        wider = replace(settings, options={**back_end.thorough, **settings.options})
+        point, bound = _lowered(program, program.start, back_end, wider, point, bound, separate)
+    return point, bound
+
+
+def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: Solution, bound: Bound,
+             separate: bool) -> tuple[Solution, Bound]:
+    """Solve again from a start, and certify the point found there where it lies lower."""
+    answer = answer_of(replace(program, start=start), back_end, settings, separate)
+    if answer.values and program.certify is not None:
+        again = _judged(program, answer, point, settings.accuracy)
+        assert again.residuals is not None and point.residuals is not None
+        lower = again.objective < point.objective - 1e-10 * abs(point.objective)
+        if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
+            point, bound = again, program.certify(program, again.values, again.duals)[0]
+    program.assign(point.values)
+    return point, bound

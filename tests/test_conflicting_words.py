@@ -1,0 +1,74 @@
+"""Words that the record contradicts: errors stay large, where steps by linear errors alone converge slowly."""
+
+import numpy as np
+import pytest
+
+import optid
+from optid.errors import DataWarning
+from optid.identify.prediction_error.curvature import Curvature
+from optid.program.solution import Status
+from optid.statistics.linearised import linearised
+
+
+def record(seed):
+    """A plant of second order behind tanh, a cube or |u|."""
+    rng, y = np.random.default_rng(seed), np.zeros(200)
+    u, f = rng.uniform(-1, 1, 200), [np.tanh, lambda v: v**3, np.abs][seed % 3]
+    for k in range(2, 200):
+        y[k] = 1.3 * y[k - 1] - 0.6 * y[k - 2] + f(2 * u[k - 1]) + 0.3 * rng.standard_normal()
+    return optid.Data(u, y, 1.0)
+
+
+# least errors that descents from all pairs of signs found, continued until they stood
+@pytest.mark.parametrize(("seed", "word", "least"), [
+    (2, "monotone:increasing", 129.625719), (2, "stable:0.7", 41.803370),
+    *(pytest.param(*case, marks=pytest.mark.slow) for case in (
+        (0, "monotone:decreasing", 70.231437), (1, "range:low=-2,high=2", 44.311718), (5, "slope:low=0.2", 142.597085),
+        (8, "monotone:increasing", 134.292971), (11, "odd", 144.241427)))])
+def test_words_that_the_record_contradicts_are_fitted_to_their_optimum(seed, word, least):
+    fit = optid.fit(record(seed), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=[word])
+    assert fit.solution.status is Status.LOCAL
+    assert fit.solution.objective == pytest.approx(least, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_an_optimum_on_the_border_of_stability_is_no_local_optimum():
+    with pytest.warns(DataWarning, match="limit"):
+        fit = optid.fit(record(2), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=["range:-2,2"])
+    assert fit.solution.status is Status.LIMIT
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_secants_of_a_descent_save_steps_and_keep_the_gradient(seed):
+    """Squares of e = e0 + J x + curved parts: with what the steps tell of the curvature a descent is no longer."""
+    rng = np.random.default_rng(seed)
+    matrix, errors, bends = rng.normal(size=(20, 3)), 5 * rng.normal(size=20), rng.normal(size=(20, 3, 3))
+    bends += bends.transpose(0, 2, 1)
+
+    def at(x):
+        e = errors + matrix @ x + np.einsum("kij,i,j->k", bends, x, x) / 20
+        rows = np.column_stack([matrix + np.einsum("kij,j->ki", bends, x) / 10, e])
+        return linearised(lambda _: [(rows, 20)], 1, 0, 3, method="qr")
+
+    steps = [0, 0]
+    for use in (0, 1):
+        curvature, x = Curvature(3), np.zeros(3)
+        for _ in range(200):
+            here = at(x)
+            factor, pull = (curvature.added(here) if use else here).whole
+            step = -np.linalg.solve(factor, pull)
+            while at(x + step).value > here.value * (1 + 1e-12):
+                step = step / 2
+            if np.linalg.norm(step) <= 1e-9:
+                break
+            curvature.learn(here, at(x + step), step)
+            x, steps[use] = x + step, steps[use] + 1
+    assert np.linalg.norm(at(x).pulled) <= 1e-6 * np.linalg.norm(at(np.zeros(3)).pulled)
+    plain, other = at(x), Curvature(3)
+    gram = plain.whole[0].T @ plain.whole[0]
+    other.matrix = 0.4 * gram + 0.02 * np.trace(gram) * np.diag([1.0, 0.0, 2.0])
+    bent = other.added(plain)
+    near = 1e-9 * np.abs(gram).max()
+    assert bent.pulled == pytest.approx(plain.pulled, abs=near)
+    assert bent.whole[0].T @ bent.whole[0] == pytest.approx(gram + other.matrix, abs=near)
+    assert steps[1] <= steps[0]
