@@ -231,7 +231,7 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
         answered, step = True, here.step(solution)
         gain, new = here.gain(step, at), here.moved(here.x + step)
         duals = [solution.duals[name] for name in here.program.user_constraints if name in solution.duals]
-        needed = max(0.0, *(2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals))
+        needed = max((2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals), default=0.0)
         weight = max(needed, (weight + needed) / 2)  # multipliers far from the constraints may be huge
         idle += plain and abs(gain) <= STALLED * here.at.value
         share = CONFIRMED if abs(gain) < 0.5 * last and idle <= PATIENCE else STALLED
