@@ -208,7 +208,7 @@ class _Fit(TangentFit):
                           derived={"residual": residual}, scale=self.criterion.energy, compressed=compressed,
                           structure=None if damping else LinearStructure(compressed.problem,
                                                                                tuple(self.places.names)),
-                          unit=self.criterion.unit)
+                          unit=self.criterion.unit, step=True)
         return program.subject_to(*self.constraints)
 
     def recover(self, values: Values) -> HammersteinTF:

@@ -170,7 +170,8 @@ class StateSpaceFit(TangentFit):
                     spans={z: one.vectors for z, one in latent.items()})
         program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
                           {**values, "residual": errors}, self.recover, view, frozenset(structural),
-                          derived={"residual": residual}, compressed=compressed, scale=self.criterion.energy)
+                          derived={"residual": residual}, compressed=compressed, scale=self.criterion.energy,
+                          step=True)
         return program.subject_to(*self.constraints)
 
     def recover(self, values: Values) -> HammersteinSS:

@@ -53,7 +53,9 @@ def tolerances(name: str, settings: Settings) -> dict[str, Any]:
         "proxqp": {"eps_abs": eps, "eps_rel": 0.0, "max_iter": 20_000},
         "daqp": {"primal_tol": max(eps, 1e-12), "dual_tol": max(eps, 1e-12)},
         "qoco": {"abstol": eps, "reltol": eps, "max_iters": 500},
-        "highs": {"primal_feasibility_tolerance": max(eps, 1e-10), "dual_feasibility_tolerance": max(eps, 1e-10)},
+        # its active-set method for quadratic programmes may cycle without end
+        "highs": {"primal_feasibility_tolerance": max(eps, 1e-10), "dual_feasibility_tolerance": max(eps, 1e-10),
+                  "qp_iteration_limit": 10_000},
         # a gap of 1e-8 leaves multipliers that are good to 1e-5 only. Such a gap is out of reach of the factorisation
         # that CVXPY chooses, "chol", on half of all small quadratic programmes; "qr" is CVXOPT's own default for cones
         "cvxopt": {"abstol": 0.01 * eps, "reltol": 0.01 * eps, "feastol": max(eps, 1e-7), "max_iters": 200,

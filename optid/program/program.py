@@ -69,6 +69,7 @@ class Program:
         compressed: the compressed data the programme was built from, for prices, intervals and figures.
         unit: what one unit of the objective is in units of the record; solutions report their values in the latter.
         settled: whether the start is close to an optimum, from which a solver should not wander.
+        step: whether a procedure goes on from its answer and has evidence of its own: no bound is asked for.
         courses: variables besides the derived ones that the structural constraints determine from the others.
         limits: {name of a user constraint: what its members say, before their rows were divided by their size}.
     """
@@ -92,6 +93,7 @@ class Program:
     limits: Mapping[str, tuple[Limit, ...]] = field(default_factory=dict, repr=False)
     courses: frozenset[str] = frozenset()
     settled: bool = False
+    step: bool = False
 
     @classmethod
     def deferred(cls, name: str, statement: Callable[[], Mapping[str, Any]], *, start: Values,

@@ -67,7 +67,7 @@ def verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution,
         return _conflict(base, reason)
     bound: Bound | None = None
     unknown = bool(np.isnan(point.residuals.stationarity))  # only a bound can confirm the point
-    if status in (Status.LOCAL, Status.INACCURATE) and (prove or unknown):
+    if status in (Status.LOCAL, Status.INACCURATE) and (prove and not program.step or unknown):
         point, bound = _proof(program, back_end, settings, point, separate)
         assert point.residuals is not None
         outside = point.residuals.violation > tolerance(settings.accuracy)

@@ -30,6 +30,7 @@ COUPLED = 0.01  # entry beside the diagonal of two poles, at least, without whic
 ROUNDING = 1e-7  # by which moved poles may lie outside
 OUTSIDE = 1e-6  # the same of those that a programme placed
 MOVES = 20  # one after the other
+SLOW = 6  # time constants in the longest experiment of a pole that acts over much of it
 STEPS, PARTS = 20, 6  # of the fit of everything else; halvings of each
 FITTED = 1e-8  # share that a further step may promise where two poles meet
 SETTLED = 1e-9  # share of the errors that a step gains that is the last
@@ -185,6 +186,20 @@ def doubled(criterion: Criterion, depth: Callable[[Array], float], x: Array) -> 
         if LEAST < abs(two[0].imag) < NEARLY:
             mean = _on(float(np.mean(two).real), -(LEAST**2), lambda one: depth(one) >= -ROUNDING)
             return None if mean is None else _moved(criterion, x, two, others, mean, -(LEAST**2))
+    return None
+
+
+def slowed(criterion: Criterion, x: Array) -> Array | None:
+    """Return x with two neighbouring poles made real, one of them slow, and everything else fitted; None without two.
+
+    With a slow pole the static gain, which words about f refer to, may oppose the first response.
+    """
+    poles, slow = poles_of(criterion, x), float(np.exp(-SLOW / max(e.n_samples for e in criterion.data.experiments)))
+    for pair in _couples(poles):
+        two, others = poles[list(pair)], np.delete(poles, pair)
+        fast = float(np.mean(two).real) if two[0].imag else float(two[0].real)
+        if fast < slow:
+            return _fitted(criterion, _moved(criterion, x, two, others, (fast + slow) / 2, ((slow - fast) / 2) ** 2))[0]
     return None
 
 

@@ -34,7 +34,7 @@ AGREE = 1e-4  # relative difference of the sums of squares within which two star
 # share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
 # where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best
 EXPLAINED = 0.1
-BETTER = 2.0  # times the errors' energy that a local optimum may have of that at the border of stability, and win
+UNCONFIRMED = 2.0  # times the errors' energy that a local optimum may have of that at the border of stability, and win
 ROUNDING = 1e-9  # relative difference of two sums of squares that were added up in different ways
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as integrator (a pole at 1) or stable:0.999")
@@ -152,7 +152,7 @@ class Descent:
         At the border of stability there is no local optimum: an unstable model would be better still. A plant that
         integrates has its best model there, though, and what is left as local optima may be useless.
         """
-        return BETTER * self.value if self.border else self.value
+        return UNCONFIRMED * self.value if self.border else self.value
 
 
 def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterations: int = STEPS,

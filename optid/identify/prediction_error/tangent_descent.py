@@ -15,9 +15,9 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
-from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet
+from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, slowed
 from optid.identify.prediction_error.curvature import Curvature
-from optid.identify.prediction_error.descent import STEPS, Descent
+from optid.identify.prediction_error.descent import STEPS, UNCONFIRMED, Descent
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit, violation
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
@@ -101,7 +101,7 @@ def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) 
             break
         end = again
     if end is not None and tried:  # prices are those of the last programme
-        yield _Iterate.of(fit, fit.places.pack(end.values or {})).program
+        yield _end_of(fit, end).program
     return end
 
 
@@ -118,7 +118,7 @@ def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], fig
         still = replace(fit, constraints=(*others, lambda view, at=part[word], word=word: {
             "poles": view[word] == at}))
         end = yield from _constrained(_Iterate.of(still, point), figures, MIRRORED)
-        there = None if end is None else _Iterate.of(fit, fit.places.pack(end.values or {}))
+        there = None if end is None else _end_of(fit, end)
         if there is not None and there.outside <= INSIDE and there.at.value < least:
             best, least = there.x, there.at.value
     return best
@@ -187,22 +187,31 @@ class _Iterate:
 def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Procedure:
     """Return the best end of descents from all signs of f and B, where the first ends far above the free optimum.
 
-    Constraints that the record contradicts have several local optima; near the free optimum there is one.
+    Constraints that the record contradicts have several local optima; near the free optimum there is one. A slow pole
+    is another way to the characteristic that they ask for.
     """
     best = yield from _constrained(here, figures)
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
-    for start in here.fit.mirrored(here.x):
-        least = np.inf if best is None else best.objective
+    slow = None if about_poles(here.fit.constraints) else slowed(here.fit.criterion, here.x)
+    for start in (*here.fit.mirrored(here.x), *([] if slow is None else [here.fit.signed(slow)])):
         end = yield from _constrained(_Iterate.of(here.fit, start), figures, MIRRORED)
-        if end is None or not end.objective < least * (1 + CONFLICT):
+        if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
             continue
-        there = _Iterate.of(here.fit, here.fit.places.pack(end.values or {}))
         if end.status is not Status.LOCAL:
-            end = yield from _constrained(there, figures)
-        if end is not None and end.objective < least and there.outside <= INSIDE:
+            end = yield from _constrained(_end_of(here.fit, end), figures)
+        if end is not None and _rank(end) < _rank(best) and _end_of(here.fit, end).outside <= INSIDE:
             best = end
     return best
+
+
+def _end_of(fit: TangentFit, end: Evidence) -> _Iterate:
+    return _Iterate.of(fit, fit.places.pack(end.values or {}))
+
+
+def _rank(end: Evidence | None) -> float:
+    """Return the errors of an end; those of one that no programme confirms count more, as in `Descent.rank`."""
+    return np.inf if end is None else end.objective if end.status is Status.LOCAL else UNCONFIRMED * end.objective
 
 
 def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) -> Procedure:
