@@ -13,7 +13,7 @@ from scipy.linalg import schur
 
 from optid.arrays import Array
 from optid.errors import DataError
-from optid.identify.prediction_error.descent import Criterion
+from optid.identify.prediction_error.descent import Criterion, descend
 from optid.models.roots import roots_of
 from optid.statistics.linearised import linearised
 
@@ -71,7 +71,7 @@ def along_border(criterion: Criterion, depth: Callable[[Array], float], x: Array
             break
         best, least = None, np.inf
         if inside:
-            point, least = fitted(x)
+            point, least = _settled(criterion, x) if alone else fitted(x)
             best = point if allowed(poles) and least < criterion.value(x) * (1 - share) else None
             least *= 1 - share if allowed(poles) else 1 + share  # a rounding outside, the border is as good
         for pair in _couples(poles):
@@ -215,6 +215,14 @@ def _step(criterion: Criterion, x: Array, hold_c: bool) -> tuple[Array, float]:
     step[rest] = -np.linalg.lstsq(matrix[:, rest] / sizes, errors, rcond=1e-12)[0] / sizes
     left = matrix @ step + errors
     return step, float(errors @ errors - left @ left)
+
+
+def _settled(criterion: Criterion, x: Array) -> tuple[Array, float]:
+    """Fit everything but the poles again, as far as it goes: valleys may be curved."""
+    held = np.zeros(criterion.unknowns.shared, dtype=bool)
+    held[criterion.unknowns.slices["A" if "A" in criterion.unknowns.slices else "a"]] = True
+    found = descend(criterion, x, held=held, tolerance=FITTED, progress=SETTLED)
+    return found.x, found.value
 
 
 def _fitted(criterion: Criterion, x: Array) -> tuple[Array, float]:

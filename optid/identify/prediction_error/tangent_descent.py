@@ -37,7 +37,7 @@ TRUSTED, NEAR = 10.0, 1e-2
 CONFLICT = 0.1  # share of the errors above the free optimum from which descents from other signs are worth their time
 MIRRORED = 30  # programmes of a descent from the other sign of f, after which it goes on only where it is better
 # moves of poles along a border; share of the errors that one must gain, and all of them for an end to be no optimum
-ROUNDS, ALONG, BETTER = 5, 1e-6, 1e-5
+ROUNDS, ALONG, BETTER = 12, 1e-6, 1e-5
 PARTS = 10  # halvings of an undamped step that are tried where no damped one descends
 NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
@@ -100,6 +100,9 @@ def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) 
             end = there.evidence(*status, end.figures)
             break
         end = again
+    else:
+        if end is not None and end.status is Status.LOCAL and tried:
+            end = replace(end, status=Status.LIMIT, reason=f"the errors still fall along the border after {ROUNDS} moves")
     if end is not None and tried:  # prices are those of the last programme
         yield _end_of(fit, end).program
     return end
