@@ -102,7 +102,8 @@ def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) 
         end = again
     else:
         if end is not None and end.status is Status.LOCAL and tried:
-            end = replace(end, status=Status.LIMIT, reason=f"the errors still fall along the border after {ROUNDS} moves")
+            reason = f"the errors still fall along the border after {ROUNDS} moves"
+            end = replace(end, status=Status.LIMIT, reason=reason)
     if end is not None and tried:  # prices are those of the last programme
         yield _end_of(fit, end).program
     return end
