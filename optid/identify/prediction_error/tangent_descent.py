@@ -17,7 +17,7 @@ from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, slowed
 from optid.identify.prediction_error.curvature import Curvature
-from optid.identify.prediction_error.descent import STEPS, UNCONFIRMED, Descent
+from optid.identify.prediction_error.descent import STEPS, Descent
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit, violation
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
@@ -204,7 +204,8 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
             continue
         if end.status is not Status.LOCAL:
             end = yield from _constrained(_end_of(here.fit, end), figures)
-        if end is not None and _rank(end) < _rank(best) and _end_of(here.fit, end).outside <= INSIDE:
+        lower = end is not None and (best is None or end.objective < best.objective)
+        if end is not None and lower and _end_of(here.fit, end).outside <= INSIDE:
             best = end
     return best
 
@@ -213,16 +214,11 @@ def _end_of(fit: TangentFit, end: Evidence) -> _Iterate:
     return _Iterate.of(fit, fit.places.pack(end.values or {}))
 
 
-def _rank(end: Evidence | None) -> float:
-    """Return the errors of an end; those of one that no programme confirms count more, as in `Descent.rank`."""
-    return np.inf if end is None else end.objective if end.status is Status.LOCAL else UNCONFIRMED * end.objective
-
-
 def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) -> Procedure:
     """Solve tangent programmes until an undamped one gains nothing; an exact penalty judges the steps."""
     previous: _Iterate | None = None
     damping, growth, weight, last, idle, more = 0.0, 4.0, 0.0, np.inf, 0, 0
-    answered, curvature = False, Curvature(here.x.size)
+    answered, curvature, since = False, Curvature(here.x.size), here.at.value
     entered = here.outside <= INSIDE  # figures are compared from the first point that satisfies the constraints
     for count in range(1, most + 1):
         at = curvature.added(here.at) if curvature.used else here.at
@@ -246,6 +242,8 @@ def _constrained(here: _Iterate, figures: Mapping[str, Any], most: int = STEPS) 
         duals = [solution.duals[name] for name in here.program.user_constraints if name in solution.duals]
         needed = max((2.0 * float(np.max(np.abs(dual), initial=0.0)) for dual in duals), default=0.0)
         weight = max(needed, (weight + needed) / 2)  # multipliers far from the constraints may be huge
+        if here.at.value < since * (1 - BETTER):  # little is promised, and more is gained in between
+            idle, since = 0, here.at.value
         idle += plain and abs(gain) <= STALLED * here.at.value
         share = CONFIRMED if abs(gain) < 0.5 * last and idle <= PATIENCE else STALLED
         last = abs(gain) if plain else last
