@@ -291,8 +291,8 @@ def test_a_plant_that_integrates_is_fitted_at_the_border_of_stability(monkeypatc
         u[k] = 0.02 * (target[k] - place) - 0.25 * speed + 0.02 * rng.standard_normal()
         place, speed = place + speed + 0.5 * u[k], speed + u[k] + 0.001 * rng.standard_normal()
     reached = []
-    for better in (np.inf, descent.UNCONFIRMED):
-        monkeypatch.setattr(descent, "UNCONFIRMED", better)
+    for better in (np.inf, descent.BETTER):
+        monkeypatch.setattr(descent, "BETTER", better)
         with pytest.warns(DataWarning, match="stopped with status 'limit': .*(unit circle|did not suffice|descends)"):
             fit = optid.fit(optid.Data(u, y), "oe.exact", na=2, nb=2, nk=1, starts=3)
         assert fit.model.is_stable and fit.solution.status is Status.LIMIT

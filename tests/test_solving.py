@@ -397,3 +397,21 @@ def test_a_word_of_a_limit_is_judged_as_any_other():
     assert good.status is Status.OPTIMAL and early.status is Status.OPTIMAL and early.claim is Status.LIMIT
     away = {name: 0.9 * value for name, value in good.values.items()}
     assert solve(program, claiming(away, Status.LIMIT, good.duals)).status is Status.LIMIT
+
+
+def test_a_step_of_a_procedure_is_judged_without_a_bound():
+    program = case("qp_box").build()
+    whole, step = solve(program, "clarabel"), solve(replace(program, step=True), "clarabel")
+    assert whole.status is Status.OPTIMAL and whole.bound is not None
+    assert step.status is Status.LOCAL and step.bound is None
+    away = claiming({name: 0.9 * value for name, value in whole.values.items()})
+    assert solve(replace(program, step=True), away).status not in (Status.LOCAL, Status.OPTIMAL)
+
+
+@pytest.mark.parametrize(("name", "followed"), [("ipopt", False), ("uno", False), ("clarabel", True)])
+def test_a_general_nonlinear_solver_that_does_not_arrive_is_not_followed_by_another(name, followed, monkeypatch):
+    """It has taken thousands of steps, and so would the next one."""
+    spent = replace(claiming({"x": [0.0, 0.0]}, Status.LIMIT), name=name)
+    monkeypatch.setattr("optid.solving.solve.choose", lambda program: (spent, "chosen"))
+    found = solve(projection())
+    assert (found.failed == name and found.status is Status.OPTIMAL) if followed else found.status is Status.LIMIT

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from optid.backends.back_end import BackEnd, Settings
-from optid.backends.choice import choose, fallbacks, find
+from optid.backends.choice import AUTO, choose, fallbacks, find
 from optid.errors import SolverRefused
 from optid.processes import LONGEST
 from optid.program.program import Program
@@ -74,7 +74,8 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
     if not chosen or options:
         return solution
     outside = solution.residuals is not None and solution.residuals.violation > FALSE_CLAIM
-    ended = solution.status is Status.LIMIT and (outside or time_limit is None)
+    # of general nonlinear solvers that do not arrive another would spend its thousands of iterations as well
+    ended = solution.status is Status.LIMIT and (outside or time_limit is None) and back_end.name not in AUTO["NLP"]
     if solution.status is Status.FAILED or ended:
         for other in fallbacks(program, back_end.name):
             found = attempt(other, settings, f"{other.name}: in place of {back_end.name}")

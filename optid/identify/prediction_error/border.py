@@ -13,7 +13,7 @@ from scipy.linalg import schur
 
 from optid.arrays import Array
 from optid.errors import DataError
-from optid.identify.prediction_error.descent import Criterion, descend
+from optid.identify.prediction_error.descent import Criterion, beside_poles
 from optid.models.roots import roots_of
 from optid.statistics.linearised import linearised
 
@@ -71,7 +71,11 @@ def along_border(criterion: Criterion, depth: Callable[[Array], float], x: Array
             break
         best, least = None, np.inf
         if inside:
-            point, least = _settled(criterion, x) if alone else fitted(x)
+            if alone:  # as far as it goes: valleys may be curved
+                end = beside_poles(criterion, x, tolerance=FITTED, progress=SETTLED)
+                point, least = end.x, end.value
+            else:
+                point, least = fitted(x)
             best = point if allowed(poles) and least < criterion.value(x) * (1 - share) else None
             least *= 1 - share if allowed(poles) else 1 + share  # a rounding outside, the border is as good
         for pair in _couples(poles):
@@ -88,8 +92,8 @@ def along_border(criterion: Criterion, depth: Callable[[Array], float], x: Array
 
 def poles_of(criterion: Criterion, x: Array) -> Any:
     """Return the poles at x."""
-    part = criterion.unknowns.parts(x)
-    return np.linalg.eigvals(part["A"]) if "A" in part else roots_of(part["a"])
+    part = criterion.unknowns.parts(x)[criterion.dynamics]
+    return np.linalg.eigvals(part) if part.ndim == 2 else roots_of(part)
 
 
 def _on_border(poles: Array, allowed: Callable[[Array], bool]) -> bool:
@@ -205,8 +209,8 @@ def slowed(criterion: Criterion, x: Array) -> Array | None:
 
 def _step(criterion: Criterion, x: Array, hold_c: bool) -> tuple[Array, float]:
     """Return the step of Gauss and Newton that holds the poles, and what it promises to gain."""
-    at, unknowns = criterion.unknowns.slices, criterion.unknowns
-    held = np.concatenate([np.arange(x.size)[at[part]] for part in ("A", "a", *("C",) * hold_c) if part in at])
+    at, unknowns, parts = criterion.unknowns.slices, criterion.unknowns, (criterion.dynamics, *("C",) * hold_c)
+    held = np.concatenate([np.arange(x.size)[at[part]] for part in parts if part in at])
     rest, step = np.setdiff1d(np.arange(x.size), held), np.zeros(x.size)
     # without weight on what changes no output, which may be needed here
     matrix, errors = linearised(criterion.rows(x), unknowns.experiments, unknowns.memory, unknowns.shared,
@@ -215,14 +219,6 @@ def _step(criterion: Criterion, x: Array, hold_c: bool) -> tuple[Array, float]:
     step[rest] = -np.linalg.lstsq(matrix[:, rest] / sizes, errors, rcond=1e-12)[0] / sizes
     left = matrix @ step + errors
     return step, float(errors @ errors - left @ left)
-
-
-def _settled(criterion: Criterion, x: Array) -> tuple[Array, float]:
-    """Fit everything but the poles again, as far as it goes: valleys may be curved."""
-    held = np.zeros(criterion.unknowns.shared, dtype=bool)
-    held[criterion.unknowns.slices["A" if "A" in criterion.unknowns.slices else "a"]] = True
-    found = descend(criterion, x, held=held, tolerance=FITTED, progress=SETTLED)
-    return found.x, found.value
 
 
 def _fitted(criterion: Criterion, x: Array) -> tuple[Array, float]:

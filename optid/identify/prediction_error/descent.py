@@ -34,7 +34,7 @@ AGREE = 1e-4  # relative difference of the sums of squares within which two star
 # share of the energy of the record left unexplained at an agreed optimum up to which other optima are not looked for:
 # where noise is larger than that, starts of different methods have been seen to agree on an optimum that is not best
 EXPLAINED = 0.1
-UNCONFIRMED = 2.0  # times the errors' energy that a local optimum may have of that at the border of stability, and win
+BETTER = 2.0  # times the errors' energy that a local optimum may have of that at the border of stability, and win
 ROUNDING = 1e-9  # relative difference of two sums of squares that were added up in different ways
 BORDER = ("the errors still fall towards a pole, or a zero of C, on the unit circle; choose other orders, or a "
           "constraint such as integrator (a pole at 1) or stable:0.999")
@@ -55,6 +55,11 @@ class Criterion(ABC):
     def errors(self) -> str:
         """What they are called."""
         return "prediction errors" if self.unknowns.innovations else "simulation errors"
+
+    @property
+    def dynamics(self) -> str:
+        """Name of the part of x that has the poles: the matrix A, or the coefficients a of a polynomial."""
+        return "A" if "A" in self.unknowns.slices else "a"
 
     @cached_property
     def labels(self) -> list[str]:
@@ -152,7 +157,7 @@ class Descent:
         At the border of stability there is no local optimum: an unstable model would be better still. A plant that
         integrates has its best model there, though, and what is left as local optima may be useless.
         """
-        return UNCONFIRMED * self.value if self.border else self.value
+        return BETTER * self.value if self.border else self.value
 
 
 def descend(criterion: Criterion, x: Array, *, held: Array | None = None, iterations: int = STEPS,
@@ -240,11 +245,16 @@ def _gain(root: Array, at: Linearised) -> float:
 
 def with_poles(criterion: Criterion, x: Array, a: Array) -> Descent:
     """Return what belongs to a given stable A: the rest of the unknowns after a few steps with A held."""
-    unknowns, moved = criterion.unknowns, x.copy()
-    moved[unknowns.slices["a"]] = a
-    held = np.zeros(unknowns.shared, dtype=bool)
-    held[unknowns.slices["a"]] = True
-    return descend(criterion, moved, held=held, iterations=6, tolerance=1e-3)
+    moved = x.copy()
+    moved[criterion.unknowns.slices["a"]] = a
+    return beside_poles(criterion, moved, iterations=6, tolerance=1e-3)
+
+
+def beside_poles(criterion: Criterion, x: Array, **limits: Any) -> Descent:
+    """Descend with the poles of x held, up to limits of `descend`."""
+    held = np.zeros(criterion.unknowns.shared, dtype=bool)
+    held[criterion.unknowns.slices[criterion.dynamics]] = True
+    return descend(criterion, x, held=held, **limits)
 
 
 def best_of(criterion: Criterion, starts: Iterable[tuple[str, Array]], iterations: int = STEPS, *,

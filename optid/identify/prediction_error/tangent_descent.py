@@ -101,7 +101,7 @@ def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) 
             break
         end = again
     else:
-        if end is not None and end.status is Status.LOCAL and tried:
+        if end is not None:
             reason = f"the errors still fall along the border after {ROUNDS} moves"
             end = replace(end, status=Status.LIMIT, reason=reason)
     if end is not None and tried:  # prices are those of the last programme
@@ -117,10 +117,9 @@ def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], fig
     for point in moved:
         if point is None or point is x:
             continue
-        part = fit.criterion.unknowns.parts(point)
-        word = "A" if "A" in part else "a"
-        still = replace(fit, constraints=(*others, lambda view, at=part[word], word=word: {
-            "poles": view[word] == at}))
+        word = fit.criterion.dynamics
+        part = fit.criterion.unknowns.parts(point)[word]
+        still = replace(fit, constraints=(*others, lambda view, at=part, word=word: {"poles": view[word] == at}))
         end = yield from _constrained(_Iterate.of(still, point), figures, MIRRORED)
         there = None if end is None else _end_of(fit, end)
         if there is not None and there.outside <= INSIDE and there.at.value < least:
@@ -204,8 +203,9 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
             continue
         if end.status is not Status.LOCAL:
             end = yield from _constrained(_end_of(here.fit, end), figures)
-        lower = end is not None and (best is None or end.objective < best.objective)
-        if end is not None and lower and _end_of(here.fit, end).outside <= INSIDE:
+        if end is None or best is not None and not end.objective < best.objective:
+            continue
+        if _end_of(here.fit, end).outside <= INSIDE:
             best = end
     return best
 

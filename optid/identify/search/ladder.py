@@ -335,11 +335,10 @@ def latent_signals(ladder: Ladder) -> Rung:
     yield from _output_functions(ladder)
     if not (a := ladder.arguments(LATENT, "lfr.exact")):
         return
-    other = "polynomial:5" if first == FLEXIBLE else FLEXIBLE
     if ladder.follows(LATENT, "lfr.exact"):
         yield [model(a["nx"], 1, word, direct) for word in ("polynomial:5", FLEXIBLE) for direct in (False, True)]
     else:
-        yield [model(a["nx"], 1, other, a["direct"])]
+        yield [model(a["nx"], 1, "polynomial:5" if first == FLEXIBLE else FLEXIBLE, a["direct"])]
     yield from _larger(ladder, model)
     if not ladder.follows(LATENT, "lfr.exact"):
         return
