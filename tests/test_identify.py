@@ -5,6 +5,7 @@ import signal
 import warnings
 from dataclasses import replace
 from time import process_time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from optid.identify.informativity import Informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.search import identify
 from optid.identify.search import search as searching
+from optid.identify.search import trial as trying
 from optid.identify.search.cpu_limit import OutOfTime, cpu_limit
 from optid.identify.search.ladder import RUNGS, Ladder, bases
 from optid.identify.search.pool import Pool
@@ -248,6 +250,44 @@ def test_fits_without_a_block_go_on_from_the_whole_record(formulation, arguments
     errors = np.array([blocks.errors(model, b)[0] for b, model in enumerate(cold)])
     warm = found.energy[np.argsort(found.order)]
     assert np.sum(warm) < 1.05 * np.sum(errors)
+
+
+def stuck_on_the_whole(monkeypatch, module, data, good):
+    """Let fits of a module end in a poor optimum on the whole record and from there, in a good one elsewhere."""
+    calls = []
+
+    def scripted(given, formulation_name=None, *, initial=None, **arguments):
+        calls.append((given is data, initial))
+        from_poor = initial is not None and initial is not good.model
+        lost = from_poor or (initial is None and given is data)
+        scale = 9.0 if from_poor else 1.2  # without a block it is much worse there
+        model = replace(good.model, B=scale * good.model.B) if lost else good.model
+        return SimpleNamespace(model=model, solution=SimpleNamespace(
+            objective=2.0 if lost else 1.0, status=good.solution.status))
+
+    monkeypatch.setattr(module, "fit", scripted)
+    return calls
+
+
+def test_a_better_optimum_without_a_block_is_where_the_whole_fit_goes_on(monkeypatch):
+    """Functions of latent signals have many optima; what is chosen is fitted in the same way."""
+    data = plant(400)
+    good = optid.fit(data, "hammerstein_ss.sid", nx=1, basis="linear")
+    candidate, blocks = Candidate(LATENT, "lfr.exact", {"nx": 1, "channels": 1}), Blocks.of(data)
+    calls = stuck_on_the_whole(monkeypatch, trying, blocks.data, good)
+    found = tried(candidate, blocks, None, {}, (), None)
+    assert found.complete and found.restarted == 0
+    expected = [blocks.errors(good.model, b)[0] for b in range(4)]
+    np.testing.assert_allclose(found.energy[np.argsort(found.order)], expected, rtol=1e-12)
+    assert found.estimation == pytest.approx(blocks.fit(good.model))
+    # the whole record, a block warm and cold, the whole record from there, four blocks
+    assert [whole for whole, _ in calls] == [True, False, False, True, False, False, False, False]
+    assert all(initial is good.model for _, initial in calls[3:])
+
+    calls = stuck_on_the_whole(monkeypatch, searching, data, good)
+    settings = {"constraints": (), "solver": "auto"}
+    assert searching._refitted(found, data, blocks, None, settings).model is good.model
+    assert [whole for whole, _ in calls] == [True, False, True] and calls[2][1] is good.model
 
 
 @pytest.mark.parametrize("formulation, arguments, count", [

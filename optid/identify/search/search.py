@@ -33,6 +33,7 @@ from optid.identify.search.trial import (
     OUT_OF_TIME,
     Candidate,
     Trial,
+    continued,
     spared,
     tried,
 )
@@ -364,7 +365,13 @@ def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, se
     found = fit(data, candidate.formulation, **settings, **arguments)
     if 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation):
         return found
-    return fit(data, candidate.formulation, **settings, **{**spared(candidate), **arguments})
+
+    def as_tried(record: Data, **more: Any) -> Fit:
+        return fit(record, candidate.formulation, **settings, **{**spared(candidate), **arguments, **more})
+
+    if chosen.restarted is None:
+        return as_tried(data)
+    return continued(candidate, as_tried, data, as_tried(blocks.without(chosen.restarted)).model)
 
 
 def _told(ladder: Ladder, progress: Callable[[str], None], most: float, trial: Trial) -> None:

@@ -13,7 +13,7 @@ from optid.bases import feedback_bases, fitted_bases
 from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError
 from optid.identify.blocks import Blocks, pooled_fit
-from optid.identify.fitting import fit
+from optid.identify.fitting import Fit, fit
 from optid.identify.search.cpu_limit import OutOfTime, cpu_limit
 from optid.models.functions import free_parameters
 
@@ -83,6 +83,8 @@ class Trial:
         searches: of them those that began without a model.
         seconds: CPU time.
         status: of the solver on the whole record, or "refused".
+        restarted: block without which a better optimum was found, from which the fit to the whole record went on; None
+            where there was none.
         reason: why it was dropped, "" where it was tried on every block.
     """
 
@@ -96,6 +98,7 @@ class Trial:
     searches: int = 0
     seconds: float = 0.0
     status: str = "refused"
+    restarted: int | None = None
     reason: str = ""
 
     @property
@@ -158,7 +161,7 @@ def tried(candidate: Candidate, blocks: Blocks, rival: Trial | None, settings: M
         with cpu_limit(seconds), warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")  # the fit that is chosen tells them
             arguments = {**spared(candidate), **candidate.under(constraints), **_bases(candidate, blocks.data)}
-            for known in _steps(found, fitted, blocks, rival, horizon):
+            for known in _steps(found, fitted(blocks.data), fitted, blocks, rival, horizon):
                 found = known
                 if known.reason:
                     break
@@ -179,10 +182,13 @@ def _bases(candidate: Candidate, data: Data) -> dict[str, Any]:
     return found
 
 
-def _steps(known: Trial, fitted: Callable[..., Any], blocks: Blocks, rival: Trial | None, horizon: int | None
-           ) -> Iterator[Trial]:
-    """Yield what is known after the fit to the whole record, and after every block."""
-    whole = fitted(blocks.data)
+def _steps(known: Trial, whole: Fit, fitted: Callable[..., Fit], blocks: Blocks, rival: Trial | None,
+           horizon: int | None) -> Iterator[Trial]:
+    """Yield what is known after the fit to the whole record, and after every block.
+
+    Where a fit without a block finds a better optimum than that to the whole record had, this goes on from it, once,
+    and all blocks are left out of the new one.
+    """
     errors = [blocks.errors(whole.model, b, horizon) for b in range(len(blocks))]
     energies, measures = map(np.array, zip(*errors))
     known = replace(known, status=whole.solution.status.value, parameters=free_parameters(whole.model),
@@ -193,7 +199,13 @@ def _steps(known: Trial, fitted: Callable[..., Any], blocks: Blocks, rival: Tria
     known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
     for done, b in enumerate(order, start=1):
         try:
-            energy, measure = _left_out(known.candidate, fitted, blocks, b, horizon, whole.model, energies[b])
+            found, searched = _left_out(known.candidate, fitted, blocks, b, horizon, whole.model, energies[b])
+            if searched and known.restarted is None:
+                again = continued(known.candidate, fitted, blocks.data, found.model)
+                if again.solution.objective < (1 - EQUAL) * whole.solution.objective:
+                    yield from _steps(replace(known, restarted=b), again, fitted, blocks, rival, horizon)
+                    return
+            energy, measure = blocks.errors(found.model, b, horizon)
         except (RankError, DataError) as error:  # what is left of the record does not determine the structure
             refusal = error
             continue
@@ -226,28 +238,32 @@ def _no_better(candidate: Candidate, energies: Array, measures: Array, rival: Tr
     return ""
 
 
-def _left_out(candidate: Candidate, fitted: Callable[..., Any], blocks: Blocks, block: int, horizon: int | None,
-              whole: Any, reached: Array) -> tuple[Array, Array]:
-    """Return the errors on a block of the model of all others, which descends from that of the whole record.
+def continued(candidate: Candidate, fitted: Callable[..., Fit], data: Data, model: Any) -> Fit:
+    """Return the fit of a candidate that goes on from a model of the same structure."""
+    return fitted(data, initial=model, **CONTINUED.get(candidate.formulation, {}))
+
+
+def _left_out(candidate: Candidate, fitted: Callable[..., Fit], blocks: Blocks, block: int, horizon: int | None,
+              whole: Any, reached: Array) -> tuple[Fit, bool]:
+    """Return the fit to all other blocks, which descends from the model of the whole record.
 
     Functions of latent signals have many optima: where the block is much worse than in the fit to the whole record,
-    they are searched for in the others alone, too, and the model that is better on these counts.
+    they are searched for in the others alone, too, and the better fit to these counts. With it, whether it is that one.
     """
     data, latent = blocks.without(block), candidate.formulation in LATENT_FITS
     if candidate.formulation not in STATE_FITS:
-        return blocks.errors(fitted(data).model, block, horizon)
+        return fitted(data), False
     try:
-        found = fitted(data, initial=whole, **CONTINUED.get(candidate.formulation, {}))
+        found = continued(candidate, fitted, data, whole)
     except RankError:  # no run from it stays finite
         if not latent:
             raise
-        return blocks.errors(fitted(data).model, block, horizon)
-    errors = blocks.errors(found.model, block, horizon)
-    if latent and not np.sum(errors[0]) <= SUSPECT * np.sum(reached):
+        return fitted(data), True
+    if latent and not np.sum(blocks.errors(found.model, block, horizon)[0]) <= SUSPECT * np.sum(reached):
         again = fitted(data)
         if again.solution.objective < found.solution.objective:
-            return blocks.errors(again.model, block, horizon)
-    return errors
+            return again, True
+    return found, False
 
 
 def _on(trial: Trial, blocks: Sequence[int]) -> float:
