@@ -336,7 +336,8 @@ def latent_signals(ladder: Ladder) -> Rung:
     if not (a := ladder.arguments(LATENT, "lfr.exact")):
         return
     if ladder.follows(LATENT, "lfr.exact"):
-        yield [model(a["nx"], 1, word, direct) for word in ("polynomial:5", FLEXIBLE) for direct in (False, True)]
+        yield [model(k, 1, word, direct) for k in dict.fromkeys([2, int(a["nx"])])  # what suits may need fewer states
+               for word in ("polynomial:5", FLEXIBLE) for direct in (False, True)]
     else:
         yield [model(a["nx"], 1, "polynomial:5" if first == FLEXIBLE else FLEXIBLE, a["direct"])]
     yield from _larger(ladder, model)

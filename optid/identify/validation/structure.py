@@ -27,7 +27,7 @@ from optid.identify.validation.structure_hypothesis import Hypothesis, fit_hamme
 SIGNIFICANT = 0.01
 # share of the residual variance within which functions and filters follow any Hammerstein system, and noise models any
 # noise, but for so many rows
-NEGLIGIBLE, ROWS = 0.003, 2.0
+NEGLIGIBLE, ROWS = 0.001, 2.0
 SAMPLES = 30_000  # samples read, from the beginning of every experiment
 SHORTEST = 24  # samples of an experiment that is read
 
