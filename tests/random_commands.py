@@ -59,7 +59,7 @@ SLOW = {"--workers": ["1"], "--effort": ["1", "small", "0", "much", "nan"],
         "--arl0": ["100", "1000", "0", "-1", "nan", "x"], "--starts": ["1", "2"]}
 """Options that buy time: drawn, and given where they are not drawn, from values that end soon."""
 
-ALWAYS = {"identify": ["--budget", "1", "--workers", "1"], "fit": ["--formulation", "hammerstein_arx.exact"],
+ALWAYS = {"identify": ["--budget", "1", "--workers", "1"], "fit": ["--formulation", "arx"],
           "study run": ["--workers", "1"],
           "compare": ["--workers", "1", "--repetitions", "1", "--time-limit", "5", "--solvers", "clarabel"],
           "isolability": ["--draws", "30"], "monitor": ["--arl0", "300", "--window", "20"],

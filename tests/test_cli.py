@@ -493,12 +493,6 @@ def test_fit_without_orders_searches_for_them(csv, short_ladder):
     assert named.exit_code == 2 and "needs --na, --nb" in named.output
 
 
-def test_fit_of_a_formulation_that_is_named_searches_for_nothing(csv, monkeypatch):
-    monkeypatch.setattr("optid.identify.search.search.identify", None)
-    result = run("fit", csv, "--inputs", "u1", "u2", "--outputs", "y1", "--formulation", "hammerstein_arx.exact")
-    assert result.exit_code == 0, result.output
-
-
 @pytest.mark.parametrize("words, said", [
     (("--classes", "wiener"), "use one of linear"), (("--budget", -1), "above 0"), (("--workers", 0), "workers"),
     (("--horizon", 0), "horizon"), (("--solver", "nosuch"), "no solver"), (("--constraint", "nosuch"), "no constraint"),

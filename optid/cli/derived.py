@@ -29,8 +29,7 @@ class FittingCommand(Command):
         except LookupFailed as error:
             raise _refused(error) from None
         self.params += derived_options(name, {word for p in self.params for word in p.opts})
-        named = any(word.partition("=")[0] in ("--formulation", "-f") for word in args)
-        if "--help" in args and not named:
+        if "--help" in args and not any(word.partition("=")[0] in ("--formulation", "-f") for word in args):
             self.params += options_of_others({word for p in self.params for word in p.opts})
         try:
             rest = super().parse_args(ctx, args)
@@ -42,8 +41,7 @@ class FittingCommand(Command):
         ctx.params["formulation"] = name
         values = {p.name: ctx.params.pop(p.name) for p in self.params if getattr(p, "derived", False) and p.name}
         words = [f"{key}={_json(key, value)}" for key, value in values.items() if value not in (None, (), [])]
-        # a formulation that was named is fitted, with its own defaults: no structure is searched for
-        ctx.params["settings"] = [*words, *(ctx.params.get("settings") or ())] or ([] if named else None)
+        ctx.params["settings"] = [*words, *(ctx.params.get("settings") or ())] or None
         return rest
 
 
