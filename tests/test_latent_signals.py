@@ -140,6 +140,35 @@ def test_initial_state_and_rest():
         assert model.static_gain([0.2, -0.1])[:, c] == pytest.approx(slope, abs=1e-6)
 
 
+def resonant(seed):
+    """A random resonance of two to four states with one or two cubic functions of latent signals, and white inputs."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 5))
+    radius, angle, A = rng.uniform(0.8, 0.97), rng.uniform(0.2, 1.2), np.zeros((n, n))
+    A[:2, :2] = radius * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    A[range(2, n), range(2, n)] = [rng.uniform(-0.3, 0.9) for _ in range(2, n)]
+    turn = rng.normal(size=(n, n))
+    A, B, C, k = turn @ A @ np.linalg.inv(turn), rng.normal(size=(n, 1)), rng.normal(size=(1, n)), rng.integers(1, 3)
+    cubic = Polynomial(3, interval=(-3.0, 3.0))
+    functions = tuple(Nonlinearity(cubic, np.array([0, rng.normal() * 0.3, -abs(rng.normal()) * 0.6]))
+                      for _ in range(k))
+    Cz, Ez, u = rng.normal(size=(k, n)), rng.normal(size=(n, k)), rng.normal(size=400)
+    x = np.zeros((401, n))
+    for i in range(400):
+        x[i + 1] = A @ x[i] + B[:, 0] * u[i]
+    Cz /= (x @ Cz.T).std(axis=0)[:, None]
+    return HammersteinSS(A, B, C, latent=functions, Cz=Cz, Ez=0.15 * x.std(axis=0).mean() * Ez), u, rng
+
+
+@pytest.mark.parametrize("seed", [9, 51, 64, 105, *range(5)])
+def test_a_state_far_from_rest_is_found(seed):
+    """From rest, steps on the whole record end in other optima for some of these; errors at its beginning say so."""
+    model, u, rng = resonant(seed)
+    y = np.ravel(model.simulate(u))[100:]
+    data = optid.Data(u[100:], y + 0.01 * y.std() * rng.normal(size=y.shape))
+    assert np.std(np.ravel(model.simulate(data, x0="fit")) - y) < 0.02 * y.std()
+
+
 def test_shapes_are_refused_by_name():
     with pytest.raises(StructureError, match=r"Cz has shape \(2, 2\).*2 of latent signals"):
         latent(Cz=np.zeros((2, 2)))

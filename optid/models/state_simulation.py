@@ -4,6 +4,8 @@ P1 predicts with the innovation form, P2 feeds the measured outputs to g without
 Inputs are expanded stretch by stretch, so nothing of the size samples x functions is formed for the whole record.
 """
 
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +25,9 @@ STEPS = 50
 SETTLED = 1e-20  # a step with a smaller predicted share of the squared error is the last one
 DIGITS = 1e-15  # of the outputs; a step with a smaller predicted reduction than their square is the last one, too
 ROUNDING = 1e-14
+SHORTEST, LONGER = 8, 4  # samples of the shortest beginning of a run, and ratio of the lengths of the next ones
+SOME = 8  # states of a run that are tried as initial ones
+BAD = 4.0  # ratio of the mean squared errors of a beginning to that after it which is more than noise
 NOTHING = Direct.of()  # what unknowns besides the initial state change
 SIMULATORS = ("predict", "measured_feedback", "free")
 
@@ -94,22 +99,34 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
 
     The errors of each output count in units of its standard deviation. P1 and P2 are linear in the state (where an
     output is missing, its feedback is not), a free run with feedback is not: Gauss-Newton steps from x0 (zero by
-    default), halved until the error falls. Directions that the record does not determine are left as they are. A run
-    that leaves the range allowed from every start tried is refused (`DataError`).
+    default), halved until the error falls; where a beginning of the run is followed much worse than the rest, once more
+    from the state that is fitted to beginnings. Directions that the record does not determine are left as they are. A
+    run that leaves the range allowed from every start tried is refused (`DataError`).
     """
     n = job.model.nx
     x = np.zeros(n) if x0 is None else np.array(x0, dtype=float)
     if n == 0 or not np.isfinite(y).any():
         return x
     unit = signal_units(y)
-    affine = not job.model.latent and (
-        not job.model.feedback or (job.known is not None and not np.isnan(job.known).any()))
-    root, cost = _linearised(job, y, unit, x, whole=not affine)
+    if not job.model.latent and (
+            not job.model.feedback or (job.known is not None and not np.isnan(job.known).any())):
+        root, _ = _linearised(job, y, unit, x, whole=False)
+        return x + np.asarray(scaled_least_squares(root[:, :n], root[:, n]))
+    found, cost = _descended(job, y, unit, x)
+    if _begins_badly((y - run(job, found)) / unit):
+        with suppress(DataError):
+            other, lower = _descended(job, y, unit, _from_beginnings(job, y, unit, [x, *_some(visited(job, found))]))
+            return other if lower < cost else found
+    return found
+
+
+def _descended(job: Run, y: Array, unit: Array, x: Array) -> tuple[Array, float]:
+    """Take Gauss-Newton steps from an initial state (n,); return where they end, and the squared error there."""
+    n = x.size
+    root, cost = _linearised(job, y, unit, x)
     rounding = DIGITS**2 * float(np.nansum((y / unit) ** 2))
     for _ in range(STEPS):
         step = scaled_least_squares(root[:, :n], root[:, n])
-        if affine:
-            return x + step
         expected = float(np.sum((root[:, :n] @ step) ** 2))
         for halving in range(20):
             trial = x + step / 2**halving
@@ -120,11 +137,49 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
             if lower <= cost * (1 + ROUNDING):
                 break
         else:
-            return x
+            break
         x, root, cost = trial, near, lower
         if expected <= SETTLED * cost + rounding:
-            return x
-    return x
+            break
+    return x, cost
+
+
+def _begins_badly(error: Array) -> bool:
+    """Whether errors (N, l) are much larger over some beginning than after it: the state may be a poor optimum."""
+    square = np.nansum(error**2, axis=1)
+    return any(square[:length].mean() > BAD * square[length:].mean() for length in _beginnings(len(error)))
+
+
+def _beginnings(samples: int) -> Iterator[int]:
+    """Yield the lengths of beginnings of a run, each several times the one before."""
+    length = SHORTEST
+    while 2 * length <= samples:
+        yield length
+        length *= LONGER
+
+
+def _some(states: Array) -> Array:
+    """Return a few states (N, n) of a run."""
+    return states[:: max(len(states) // SOME, 1)][1:]
+
+
+def _from_beginnings(job: Run, y: Array, unit: Array, starts: Sequence[Array]) -> Array:
+    """Return the state (n,) that is fitted to a few samples, then to more: these leave fewer optima than a long run.
+
+    Of several starts the one counts that is best after the second length.
+    """
+    found = [(np.inf, x) for x in starts]
+    for length in _beginnings(len(y)):
+        part = job._replace(u=job.u[:length], y=job.y[:length], known=None if job.known is None else job.known[:length])
+        ended = []
+        for _, x in found:
+            with suppress(DataError):
+                state, cost = _descended(part, y[:length], unit, x)
+                ended.append((cost, state))
+        found = ended if length == SHORTEST else sorted(ended, key=lambda one: one[0])[:1]
+    if not found:
+        raise DataError(f"{job.label}no run from any start stays within the range allowed")
+    return found[0][1]
 
 
 def _linearised(job: Run, y: Array, unit: Array, x0: Array, whole: bool = True) -> tuple[Array, float]:
