@@ -84,10 +84,10 @@ def test_poles_that_meet_on_the_border_are_followed_to_a_double_pole(word):
 def test_no_local_search_within_a_region_finds_a_better_point(name, word):
     if name == "oe.exact" and word[:5] in ("strip", "secto"):
         pytest.skip("a region of matrices")
-    found = [checked(name, word, seed) for seed in range(6)]
+    found = [checked(name, word, seed) for seed in range(4)]
     better = [(seed, gain) for seed, (status, gain, _) in enumerate(found) if status is Status.LOCAL and gain > 1e-5]
     assert better == []
-    assert sum(status is Status.LOCAL for status, _, _ in found) == 6
+    assert sum(status is Status.LOCAL for status, _, _ in found) == 4
 
 
 @pytest.mark.parametrize("outside", [0.0, 5e-7])

@@ -150,18 +150,17 @@ def test_the_level_holds_in_coloured_noise(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n, power", [(400, 0.7), (2000, 0.95)])
-def test_systems_of_every_kind_are_told_apart(n, power):
+def test_systems_of_every_kind_are_told_apart():
     def rejects(kind, seed):
         try:
-            return not structure_test(benchmark.record(kind, seed, n)).passed
+            return not structure_test(benchmark.record(kind, seed, 2000)).passed
         except RankError:  # the dynamics of several inputs were not found: not tested
             return False
 
-    rejected = {kind: sum(rejects(kind, seed) for seed in range(20))
+    rejected = {kind: sum(rejects(kind, seed) for seed in range(10))
                 for kind in (*benchmark.HAMMERSTEIN, *benchmark.OTHERS)}
-    assert sum(rejected[kind] for kind in benchmark.HAMMERSTEIN) <= 4
-    assert all(rejected[kind] >= 20 * power - 2 for kind in benchmark.OTHERS), rejected
+    assert sum(rejected[kind] for kind in benchmark.HAMMERSTEIN) <= 2
+    assert all(rejected[kind] >= 8 for kind in benchmark.OTHERS), rejected
 
 
 def test_a_second_path_is_found_by_rank():

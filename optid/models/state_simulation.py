@@ -27,6 +27,7 @@ DIGITS = 1e-15  # of the outputs; a step with a smaller predicted reduction than
 ROUNDING = 1e-14
 SHORTEST, LONGER = 8, 4  # samples of the shortest beginning of a run, and ratio of the lengths of the next ones
 SOME = 8  # states of a run that are tried as initial ones
+ENOUGH = 1e-4  # as SETTLED, for beginnings
 BAD = 4.0  # ratio of the mean squared errors of a beginning to that after it which is more than noise
 NOTHING = Direct.of()  # what unknowns besides the initial state change
 SIMULATORS = ("predict", "measured_feedback", "free")
@@ -120,7 +121,7 @@ def fitted_state(job: Run, y: Array, x0: Array | None = None) -> Array:
     return found
 
 
-def _descended(job: Run, y: Array, unit: Array, x: Array) -> tuple[Array, float]:
+def _descended(job: Run, y: Array, unit: Array, x: Array, settled: float = SETTLED) -> tuple[Array, float]:
     """Take Gauss-Newton steps from an initial state (n,); return where they end, and the squared error there."""
     n = x.size
     root, cost = _linearised(job, y, unit, x)
@@ -139,7 +140,7 @@ def _descended(job: Run, y: Array, unit: Array, x: Array) -> tuple[Array, float]
         else:
             break
         x, root, cost = trial, near, lower
-        if expected <= SETTLED * cost + rounding:
+        if expected <= settled * cost + rounding:
             break
     return x, cost
 
@@ -174,7 +175,7 @@ def _from_beginnings(job: Run, y: Array, unit: Array, starts: Sequence[Array]) -
         ended = []
         for _, x in found:
             with suppress(DataError):
-                state, cost = _descended(part, y[:length], unit, x)
+                state, cost = _descended(part, y[:length], unit, x, ENOUGH)
                 ended.append((cost, state))
         found = ended if length == SHORTEST else sorted(ended, key=lambda one: one[0])[:1]
     if not found:

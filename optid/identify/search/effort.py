@@ -22,7 +22,7 @@ WARM = 0.25  # cost of a fit that goes on from another instead of searching for 
 LEAST = 0.01  # units of the shortest fit
 SAMPLES, EXPERIMENTS = 3000, 8  # of a record that costs twice as much as a short one
 RATES = {"arx": (7e-5, 1.5), "armax": (1.3e-3, 1.5), "bj": (4e-3, 1.5), "oe": (6e-3, 1.5), "sid": (1.7e-3, 1.0),
-         "ss": (5.3e-3, 1.2), "wiener": (4.7e-3, 1.2), "latent": (9.3e-3, 1.5)}
+         "ss": (5.3e-3, 1.2), "wiener": (4.7e-3, 1.2), "latent": (1.9e-2, 1.5)}
 """Units of a fit with one parameter to a short record, and the power of their number by which it becomes dearer."""
 
 
