@@ -95,7 +95,7 @@ def test_damaged_streams(tmp_path, monkeypatch, kind):
 
 @pytest.mark.sampled(1)
 @pytest.mark.parametrize("kind", ["mat", "mat-packed", "mat-7.3"])
-@pytest.mark.parametrize("count", [3, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [3, pytest.param(40, marks=pytest.mark.slow)])
 def test_damaged_mat_files(tmp_path, kind, count):
     path = good_file(kind, tmp_path)
     assert outcome(path, lambda: read_record(path)) == "read"
