@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scripts
 
 import optid
 from optid.errors import DataError
@@ -117,6 +118,13 @@ def test_an_integrator_is_told_and_its_slope():
     response = told.processes[0].responses[0]
     assert response.integrates and response.b.sum() == pytest.approx(0.02, rel=0.02)
     assert any("integrates input 'u'" in finding for finding in told.findings)
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_an_integrator_is_found_where_the_slowest_pole_takes_half_the_record(seed):
+    """Pulses both ways: a pole of 630 of 1,350 samples is nearly as good (seed 3), and not what the plant has."""
+    found = processes(scripts.benchmark("search_plants").record("integrator", seed).train)[0].responses[0]
+    assert found.integrates and found.poles.size <= 3
 
 
 @pytest.mark.parametrize("seed", range(3))

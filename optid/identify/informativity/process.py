@@ -36,7 +36,7 @@ TURNS, SETTLED = 5, 0.01  # scans with a better noise model; largest change of i
 LARGEST, MOVES = 4, 30  # poles, at most; steps from a structure to a neighbour, at most
 LEVELS, NODES = 5, 7  # values of an input up to which f is a straight line; nodes of a bent one
 LIKELY = 3.84  # 95 % quantile of chi-square with one degree of freedom: twice the log likelihood ratio
-UNIT = 0.5  # share of the longest experiment beyond which a time constant is compared with an integrator
+UNIT = 0.3  # share of the longest experiment beyond which a time constant is compared with an integrator
 FILLED = 20  # missing samples of an input up to which they are estimated
 EXACT = 1e-16  # mean square of errors, over the variance of the output, at which a response is exact
 
