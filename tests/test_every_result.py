@@ -35,8 +35,8 @@ def test_a_random_fit_can_be_used_in_every_way(seed, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("half", [0, 1])
 def test_many_random_fits_can_be_used_in_every_way(half, tmp_path):
-    found = [troubles(seed, tmp_path) for seed in range(150 * half, 150 * half + 12)]
-    assert sum(one is not None for one in found) >= 8  # the others are refused with a reason
+    found = [troubles(seed, tmp_path) for seed in range(150 * half, 150 * half + 8)]
+    assert sum(one is not None for one in found) >= 5  # the others are refused with a reason
     assert [sentence for one in found for sentence in one or ()] == []
 
 

@@ -403,7 +403,7 @@ KINDS = {
 
 @pytest.mark.sampled(6)
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("count", [4, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_damaged_files_are_read_or_refused_by_name(save, kind, count):
     path, found = save(**KINDS[kind]), []
     for bad in bytes_of(path.read_bytes(), count, seed=4):

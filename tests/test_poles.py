@@ -149,8 +149,8 @@ def tightened(kind, poles):
 
 @pytest.mark.sampled(2)
 @pytest.mark.parametrize("kind, seed", [
-    (kind, seed) for seed in range(9) for kind in ("stable", "disc", "strip", "sector", "damped", "stable of A",
-                                                   "disc of A") if kind != "damped" or seed < 6])
+    (kind, seed) for seed in range(5) for kind in ("stable", "disc", "strip", "sector", "damped", "stable of A",
+                                                   "disc of A") if kind != "damped" or seed < 3])
 def test_the_price_of_a_region_is_what_moving_its_bound_gains(kind, seed):
     if (kind, seed) == ("disc", 4):
         pytest.xfail("all poles come to the border, the last programme has no answer and thus no multipliers")

@@ -157,10 +157,10 @@ def test_systems_of_every_kind_are_told_apart():
         except RankError:  # the dynamics of several inputs were not found: not tested
             return False
 
-    rejected = {kind: sum(rejects(kind, seed) for seed in range(10))
+    rejected = {kind: sum(rejects(kind, seed) for seed in range(6))
                 for kind in (*benchmark.HAMMERSTEIN, *benchmark.OTHERS)}
-    assert sum(rejected[kind] for kind in benchmark.HAMMERSTEIN) <= 2
-    assert all(rejected[kind] >= 8 for kind in benchmark.OTHERS), rejected
+    assert sum(rejected[kind] for kind in benchmark.HAMMERSTEIN) <= 1
+    assert all(rejected[kind] >= 5 for kind in benchmark.OTHERS), rejected
 
 
 def test_a_second_path_is_found_by_rank():
