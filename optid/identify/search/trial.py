@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -201,7 +202,9 @@ def _steps(known: Trial, whole: Fit, fitted: Callable[..., Fit], blocks: Blocks,
         try:
             found, searched = _left_out(known.candidate, fitted, blocks, b, horizon, whole.model, energies[b])
             if searched and known.restarted is None:
-                again = continued(known.candidate, fitted, blocks.data, found.model)
+                again = whole
+                with suppress(OptidError):
+                    again = continued(known.candidate, fitted, blocks.data, found.model)
                 if again.solution.objective < (1 - EQUAL) * whole.solution.objective:
                     yield from _steps(replace(known, restarted=b), again, fitted, blocks, rival, horizon)
                     return
