@@ -10,6 +10,8 @@ import optid
 from optid.errors import DataError
 from optid.examples import example
 from optid.identify.informativity import informativity, processes
+from optid.identify.informativity.descent import Drive, Term
+from optid.identify.informativity.process import _searched
 from optid.identify.informativity.signals import RecordSignals, WhitenedRegression, respond
 from optid.models.recursions import lfilter
 
@@ -135,6 +137,16 @@ def test_a_plant_that_first_goes_the_wrong_way_has_its_own_dead_time(seed):
     assert abs(response.nk - 6) <= 1 and response.gain == pytest.approx(1.5, rel=0.05)
     np.testing.assert_allclose(np.sort(response.poles.real), [0.88, 0.96], atol=0.02)
     assert np.sign(response.b[0]) != np.sign(response.gain)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pair_that_decays_within_a_sample_is_left_out_again(seed):
+    u = staircase(np.random.default_rng(seed), 800)
+    y = driven(u, poles=(0.93, 0.7), seed=seed)
+    regression = WhitenedRegression((y,), (np.full(800, True),), np.ones(1))
+    start = Term.of([0.93, 0.7, 0.004 + 0.002j, 0.004 - 0.002j], 8)
+    found = _searched(regression, Drive((u,)), 0, 200, start)
+    assert not found.term.pairs and found.term.order <= 2
 
 
 def test_a_pair_without_effect_has_no_dead_time():

@@ -255,6 +255,8 @@ def _neighbours(term: Term, least: int, longest: int, drive: Drive) -> Iterator[
         fewer = tuple(sorted(term.taus)[1:])
         yield replace(term, taus=fewer)
         yield replace(term, taus=fewer, lag=min(term.lag + 1, longest))
+    if term.pairs and term.order > 2:
+        yield replace(term, pairs=tuple(sorted(term.pairs)[1:]))
     slow = max(term.taus, default=-np.inf)
     if not term.integrates and slow > np.log(UNIT * max(len(u) for u in drive.values)):
         yield replace(term, taus=tuple(t for t in term.taus if t != slow), integrates=True)
