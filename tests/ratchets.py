@@ -2,7 +2,7 @@
 
     python tests/ratchets.py [--details COUNT] [--lower]
 
-Prints every count beside the recorded one (`ratchets.json`), which `test_ratchets.py` compares; lines are printed alone.
+Prints every count beside the recorded one (`ratchets.json`), which `test_ratchets.py` compares; lines are printed.
 --details lists what one count is made of; --lower records the counts that have fallen.
 
 The engine names in a formulation are the names of `optid` that its file imports, directly or through another file of
