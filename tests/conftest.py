@@ -22,7 +22,7 @@ settings.load_profile("optid")
 CORE = """bases certificate cli data fitting infeasibility models prices rank_one readers readme registry regressors
 report solving study_database validation""".split()
 NUMERICAL = """backends certificate fault_pairs fault_profile fault_scan fault_signature fitting formulations
-gauss_newton group_sparse hammerstein_ss hankel_bound infeasibility lifting noise_models nuclear_norm
+gauss_newton golden_fits group_sparse hammerstein_ss hankel_bound infeasibility lifting noise_models nuclear_norm
 nuclear_subspace output_error prices rank_one readme shift shooting solving state_space_exact subspace
 uncertainty""".split()
 
