@@ -30,7 +30,7 @@ RECORD = Path(__file__).with_name("golden_fits.json")
 SAMPLES = (40, 90, 140, 190, 240)  # of the free run that are recorded
 ROUNDING = 1e-12
 FIGURE = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.]*\d)")
-CHANCE = re.compile(r"Total|steps|[Gg]ap|p = |Iterations|Condition|instant")  # lines of time, rounding and probabilities
+CHANCE = re.compile(r"Total|steps|[Gg]ap|p = |Iterations|Condition|instant")  # of time, rounding and chance
 
 
 @dataclass(frozen=True)
