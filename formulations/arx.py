@@ -13,9 +13,13 @@ from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.models import HammersteinTF
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
+from optid.solving.steps import steps
 from optid.structures.least_squares import LinearStructure
 
+LEAST_SQUARES = steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 
+
+@LEAST_SQUARES
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
         constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none",
         offset: bool | str = True) -> Program | Procedure:
@@ -44,6 +48,7 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
                           na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge, prior=prior, offset=offset)
 
 
+@LEAST_SQUARES
 def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence[int] = 0, prior: str = "dc",
         constraints: Sequence[Any] = (), offset: bool | str = True) -> Program | Procedure:
     """Minimise ``‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.

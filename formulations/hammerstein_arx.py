@@ -28,11 +28,13 @@ from optid.program.expressions import flat
 from optid.program.judging import measure_violation
 from optid.program.program import Program, Values
 from optid.solving.solve import Procedure
+from optid.solving.steps import steps
 from optid.structures.bilinear import starts
 from optid.structures.least_squares import LinearStructure, RankOneStructure
 from optid.structures.lifted_regression import leading_pairs
 
 
+@steps(lambda given: {"hammerstein_arx.exact": "NLP rank-one"})
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
           curvature: float = 0.0, prior: str = "none", gauge: str = "norm", offset: bool | str = True
@@ -130,6 +132,7 @@ def _signed_start(program: Program, pairs: Sequence[tuple[str, str]]) -> Mapping
     return start
 
 
+@steps(lambda given: {"hammerstein_arx.nuclear": "SDP"})
 def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
             nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
             ridge: float = 0.0, curvature: float = 0.0, prior: str = "none", gauge: str = "norm",
@@ -160,6 +163,7 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
                           offset=offset)
 
 
+@steps(lambda given: {"hammerstein_arx.overparametrised": "QP" if given["constraints"] else "QP linear"})
 def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
                      basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
                      constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, curvature: float = 0.0,

@@ -22,11 +22,13 @@ from optid.bases import Bases, FeedbackBases
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.subspace.plan import in_record_units, planned
+from optid.identify.subspace.steps import subspace_steps
 from optid.solving.solve import Procedure
 
 NOISES = ("white", "coloured")
 
 
+@subspace_steps()
 def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
         noise: str = "white", weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,
         observer: str = "auto", split: str = "exact", stability: str = "auto",
@@ -68,6 +70,7 @@ def sid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, ba
     return in_record_units(identified(plan), plan)
 
 
+@subspace_steps()
 def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
           feedback_basis: FeedbackBases = None, instruments: str = "past", form: str = "projection",
           tolerance: float = 0.05, weighting: str = "moesp", offset: bool = True,
@@ -103,6 +106,7 @@ def sivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, 
     return in_record_units(identified(plan), plan)
 
 
+@subspace_steps()
 def asivid(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "polynomial:3",
            feedback_basis: FeedbackBases = None, noise: str = "coloured", iterations: int = 2, form: str = "projection",
            weighting: str = "moesp", offset: bool = True, feedthrough: bool | Sequence[bool] = True,

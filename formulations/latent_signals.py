@@ -28,11 +28,13 @@ from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.latent_search import add_channels, add_output_functions
+from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.solving.solve import Procedure
 from optid.statistics.state_unknowns import Latent, beyond_affine
 
 
+@subspace_steps(tangent="lfr.exact")
 def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "polynomial:3",
         latent: str = "states+inputs", direct: bool = False, basis: Bases = "linear", criterion: str = "simulation",
         block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
@@ -78,6 +80,7 @@ def latent_channels(channels: int, latent_basis: Any, latent: str, direct: bool,
                    tries=check_integer(tries, "tries", 0))
 
 
+@subspace_steps(tangent="wiener_ss.exact")
 def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
               block_rows: int | Sequence[int] | None = None, weighting: str = "auto", feedthrough: bool = True,
               stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
@@ -96,6 +99,7 @@ def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
                 weighting=weighting, stability=stability, initial=initial, constraints=constraints)
 
 
+@subspace_steps(tangent="hammerstein_wiener_ss.exact")
 def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3",
                           output_basis: Any = "polynomial:3", block_rows: int | Sequence[int] | None = None,
                           weighting: str = "auto", stability: str = "stable",

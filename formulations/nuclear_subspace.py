@@ -15,7 +15,7 @@ The dual bound of every programme is computed in closed form from a feasible dua
 off the matrix; everything else is done by the steps of the other subspace methods.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -30,7 +30,8 @@ from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.subspace.low_rank import Structured, choose_weight, structure
 from optid.identify.subspace.plan import Plan, in_record_units, planned
-from optid.program.program import Program, Values
+from optid.identify.subspace.steps import subspace_steps
+from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.units import energy_unit
 from optid.program.view import View
@@ -42,6 +43,7 @@ FORMS = ("predictor", "projection", "instruments")
 WEIGHTS = tuple(float(w) for w in np.logspace(-1, 4, 11))
 
 
+@subspace_steps({"low rank": "SDP nuclear"})
 def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None, basis: Bases = "linear",
             feedback_basis: FeedbackBases = None, form: str = "predictor",
             weight: float | str | Sequence[float] = "auto", noise: float | None = None, hold_out: float = 0.3,
@@ -118,6 +120,9 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
                "missing outputs estimated": int(np.sum(~structured.problem.known))}
     found = replace(structured.observability(solution.values, parts, nx), figures=figures)
     evidence = yield from identified(plan, found)
+    if evidence.model is None:
+        return evidence
+    evidence = replace(evidence, main="low rank", objective=solution.objective, bound=solution.bound or evidence.bound)
     if solution.status in (Status.INACCURATE, Status.LIMIT) and evidence.status in (Status.LOCAL, Status.OPTIMAL):
         evidence = replace(evidence, status=solution.status, reason=f"nuclear-norm programme: {solution.reason}")
     return evidence
@@ -150,7 +155,7 @@ def nuclear_programme(structured: Structured, penalty: float) -> Program:
     view = View({"yhat": yhat, "output": cp.multiply(yhat, np.tile(structured.scale, (len(problem.y), 1)))
                  + np.tile(structured.centre, (len(problem.y), 1))}, units=structured.windows.plan.units)
     return Program(
-        "subspace.nuclear", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
+        "low rank", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
         {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,
         structural=frozenset(constraints), parameters={"weight": weight},
         derived={"X": matrix, "residual": misfit}, structure=NuclearNormStructure(problem),
@@ -166,7 +171,8 @@ def _explained(problem: NuclearProblem, predictor: Predictor, theta: cp.Variable
     return cp.reshape(flat[where.reshape(rows * l, j).ravel(order="F")], (rows * l, j), order="F")
 
 
-def certify(problem: NuclearProblem, program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
+def certify(problem: NuclearProblem, program: Program, values: Mapping[str, np.ndarray],
+            duals: Mapping[str, np.ndarray]) -> tuple[Bound, None]:
     """Return the dual bound, recomputed from a feasible dual point near the multipliers, or near the subgradient."""
     if program.user_constraints:
         return Bound.none("the dual bound is that of the programme without constraints"), None

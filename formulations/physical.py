@@ -30,6 +30,7 @@ from optid.program.program import Program, Values
 from optid.program.solution import Bound, Status
 from optid.program.view import View
 from optid.solving.solve import Procedure
+from optid.solving.steps import steps
 
 Array = np.ndarray
 
@@ -39,6 +40,7 @@ LEAST = 1e-2  # parameters start from no less than this share of their usual siz
 NO_BOUND = "the equations are not convex: no lower bound is known"
 
 
+@steps(lambda given: {"physical": "NLP"})
 def physical(data: Data, *, equations: Equations | str, starts: int = 6, seed: int = 0, constraints: Sequence[Any] = ()
              ) -> Procedure:
     """Fit the parameters of state equations by least squares of the simulation errors.

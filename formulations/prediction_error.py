@@ -23,7 +23,7 @@ less certain after a gap (a Kalman filter's gain would grow there): A, B and f a
 present allow, C gets a small bias when gaps are many, a few hundredths with a third of the outputs missing at random.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,10 +44,11 @@ from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.expressions import tangent_product
-from optid.program.program import Program, Values
+from optid.program.program import Program
 from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Procedure
+from optid.solving.steps import steps
 from optid.statistics.linearised import Linearised
 from optid.structures.least_squares import LinearStructure
 
@@ -55,6 +56,7 @@ Array = np.ndarray
 Orders = int | Sequence[int]
 
 
+@steps(lambda given: {"hammerstein_bj.exact": "QP" if given["constraints"] else "QP linear"})
 def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: Bases = "polynomial:3", nk: Orders = 0,
                    constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 4,
                    seed: int = 0) -> Procedure:
@@ -89,6 +91,7 @@ def hammerstein_bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, basis: 
                       constraints, gauge, offset, starts, seed)
 
 
+@steps(lambda given: {"bj.exact": "QP" if given["constraints"] else "QP linear"})
 def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, constraints: Sequence[Any] = (),
        offset: bool | str = True, starts: int = 4, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear Box-Jenkins model.
@@ -100,6 +103,7 @@ def bj(data: Data, *, na: int, nb: Orders, nc: int, nd: int, nk: Orders = 0, con
                       starts, seed)
 
 
+@steps(lambda given: {"hammerstein_oe.exact": "QP" if given["constraints"] else "QP linear"})
 def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
                    constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 6,
                    seed: int = 0) -> Procedure:
@@ -112,6 +116,7 @@ def hammerstein_oe(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomia
     return _procedure("hammerstein_oe.exact", data, na, nb, nk, basis, 0, 0, constraints, gauge, offset, starts, seed)
 
 
+@steps(lambda given: {"oe.exact": "QP" if given["constraints"] else "QP linear"})
 def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence[Any] = (), offset: bool | str = True,
        starts: int = 6, seed: int = 0) -> Procedure:
     """Minimise the simulation error of a linear model.
@@ -122,6 +127,7 @@ def oe(data: Data, *, na: int, nb: Orders, nk: Orders = 0, constraints: Sequence
     return _procedure("oe.exact", data, na, nb, nk, "linear", 0, 0, constraints, None, offset, starts, seed)
 
 
+@steps(lambda given: {"hammerstein_armax.exact": "QP" if given["constraints"] else "QP linear"})
 def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases = "polynomial:3", nk: Orders = 0,
                       constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool | str = True, starts: int = 3,
                       seed: int = 0) -> Procedure:
@@ -135,6 +141,7 @@ def hammerstein_armax(data: Data, *, na: int, nb: Orders, nc: int, basis: Bases 
                       seed)
 
 
+@steps(lambda given: {"armax.exact": "QP" if given["constraints"] else "QP linear"})
 def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constraints: Sequence[Any] = (),
           offset: bool | str = True, starts: int = 3, seed: int = 0) -> Procedure:
     """Minimise the innovations of a linear ARMAX model; the record is not cut where inputs are missing.
@@ -211,12 +218,12 @@ class _Fit(TangentFit):
                           unit=self.criterion.unit, step=True)
         return program.subject_to(*self.constraints)
 
-    def recover(self, values: Values) -> HammersteinTF:
+    def recover(self, values: Mapping[str, Array]) -> HammersteinTF:
         """Return the model of the values of the variables, in the units of the record."""
         return transfer_model(self.criterion, values)
 
 
-def transfer_model(criterion: TransferErrors, values: Values, signed: bool = True) -> HammersteinTF:
+def transfer_model(criterion: TransferErrors, values: Mapping[str, Array], signed: bool = True) -> HammersteinTF:
     """Return the model of named values in the units of the record: the plant, and C/D where there is a noise filter.
 
     The signs of f and B are those of the values; without `signed` f rises where the output rises.

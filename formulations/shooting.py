@@ -42,6 +42,7 @@ from optid.program.program import Program
 from optid.program.solution import Bound
 from optid.program.units import outer_bases
 from optid.program.view import View
+from optid.solving.steps import steps
 
 Array = np.ndarray
 
@@ -50,6 +51,7 @@ LIMIT = 20_000  # samples up to which the programme is built: beyond, factorisat
 NO_BOUND = "simulation errors are not convex in the poles: no lower bound is known"
 
 
+@steps(lambda given: {"hammerstein_oe.shooting": "NLP"})
 def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
           constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Program:
     """Minimise the simulation errors with the simulated outputs as variables.

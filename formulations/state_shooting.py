@@ -43,6 +43,7 @@ from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.state_errors import WILD, StateErrors, weight_root
 from optid.identify.prediction_error.tangent_descent import NO_BOUND
 from optid.identify.subspace.plan import Plan
+from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import spectral_radius
 from optid.program.program import Program
@@ -59,6 +60,7 @@ LIMIT = 5_000  # samples up to which the programme is built
 SAME_RUN = 1e-6
 
 
+@subspace_steps({"ss.shooting": "NLP"})
 def ss(data: Data, *, nx: int | str, block_rows: int | Sequence[int] | None = None, weighting: str = "auto",
        offset: bool = True, feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
        initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100, constraints: Sequence[Any] = ()
@@ -72,6 +74,7 @@ def ss(data: Data, *, nx: int | str, block_rows: int | Sequence[int] | None = No
                 stability=stability, initial=initial, iterations=iterations, constraints=constraints)
 
 
+@subspace_steps({"hammerstein_ss.shooting": "NLP"})
 def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
                    block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,
                    feedthrough: bool | Sequence[bool] = True, stability: str = "stable",
@@ -96,6 +99,7 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
                 iterations=iterations, constraints=constraints)
 
 
+@subspace_steps({"lfr.shooting": "NLP"})
 def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "polynomial:3",
         latent: str = "states+inputs", direct: bool = False, basis: Bases = "linear",
         block_rows: int | Sequence[int] | None = None, weighting: str = "auto", offset: bool = True,

@@ -48,10 +48,11 @@ from optid.identify.prediction_error.state_search import complete, entered, quie
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import modal_weight
 from optid.program.expressions import tangent_product
-from optid.program.program import Program, Values
+from optid.program.program import Program
 from optid.program.solution import Status
 from optid.program.units import energy_unit, in_units, inverse, outer_bases
 from optid.program.view import View
@@ -65,6 +66,7 @@ WORDS = {"criterion": tuple(SIMULATORS), "stability": ("stable", "free"),
          "weighting": ("auto", "scale", "variance", "determinant")}
 
 
+@subspace_steps(tangent="hammerstein_ss.exact")
 def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", feedback_basis: Any = None,
                    criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
                    weighting: str = "auto", offset: bool | str = True, feedthrough: bool | Sequence[bool] = True,
@@ -110,6 +112,7 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
         stability=stability, initial=initial, iterations=iterations, constraints=constraints)
 
 
+@subspace_steps(tangent="ss.exact")
 def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: int | Sequence[int] | None = None,
        weighting: str = "auto", offset: bool | str = True, feedthrough: bool | Sequence[bool] = True,
        stability: str = "stable", initial: HammersteinSS | Sequence[HammersteinSS] = (), iterations: int = 100,
@@ -174,7 +177,7 @@ class StateSpaceFit(TangentFit):
                           step=True)
         return program.subject_to(*self.constraints)
 
-    def recover(self, values: Values) -> HammersteinSS:
+    def recover(self, values: Mapping[str, Array]) -> HammersteinSS:
         """Return the model of the values of the variables, in the units of the programme."""
         unknowns = self.criterion.unknowns
         found = self.criterion.at(unknowns.unpack(self.places.pack(values)))

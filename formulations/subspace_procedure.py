@@ -133,7 +133,7 @@ def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
 
     relative = np.any(form.weights != 1)  # to the sizes of the outputs, which have the same unit as the residuals
     return Program.deferred(
-        plan.name, statement, start=realisation.start(), recover=partial(realisation.model, plan.data),
+        "split", statement, start=realisation.start(), recover=partial(realisation.model, plan.data),
         structural=structural, scale=problem.scale, unit=1.0 if relative else energy_unit(units),
         structure=structure, certify=certify).subject_to(*plan.about("coefficients"))
 

@@ -163,7 +163,7 @@ def test_the_model_of_a_flipped_sign_keeps_its_units():
     ({"nbb": 2}, StructureError, "takes no argument 'nbb'. Did you mean 'nb'"),
     ({"constraints": ["monoton"]}, LookupFailed, "Did you mean 'monotone'"),
     ({"solver": "clarabell"}, LookupFailed, "Did you mean 'clarabel'"),
-    ({"solver": "clarabel"}, StructureError, "not convex in constraint 'residual'.*Use an NLP back end"),
+    ({"solver": "clarabel"}, StructureError, "is not convex and is taken by alternating.*gauss_newton, ipopt"),
 ])
 def test_requests_that_cannot_be_met(change, error, words):
     refuses(error, words, optid.fit, record(), **(STRUCTURE | change))

@@ -117,7 +117,7 @@ def region_rule(name: str, regions: Sequence[Region], text: str) -> Rule:
         shown = f"{worst.real:.6g}" if abs(worst.imag) < 1e-12 else f"{worst.real:.6g} {worst.imag:+.6g}i"
         return f"constraint {name!r}: the pole {shown} lies outside {text}"
 
-    return Rule(name, lambda view: lmi(view, regions, name), verify, frozenset({"poles"}), depth=depth)
+    return Rule(name, lambda view: lmi(view, regions, name), verify, frozenset({"poles"}), depth=depth, matrix=True)
 
 
 def lmi(view: View, regions: Sequence[Region], name: str) -> list[Any]:
@@ -292,7 +292,7 @@ def stable(radius: float = 1.0, real: Sequence[float] | float | None = None) -> 
     def depth(poles: np.ndarray) -> float:
         return radius - float(np.max(np.abs(poles), initial=0.0))
 
-    return Rule(name, build, verify, frozenset({"poles"}), stand_in, depth if points is None else None)
+    return Rule(name, build, verify, frozenset({"poles"}), stand_in, depth if points is None else None, matrix=True)
 
 
 def asks_for_integrator(constraints: Sequence[Any]) -> bool:

@@ -172,7 +172,7 @@ def positive_real(margin: float = 0.0) -> Rule:
         lowered = np.diag(np.repeat([0.0, 2.0], [n, l])).ravel()
         return [Limit(lmi - REAL * np.linalg.norm(c) * np.eye(n + l) >> 0, lowered)]
 
-    return Rule("positive_real" + (f":{margin:g}" if margin else ""), build)
+    return Rule("positive_real" + (f":{margin:g}" if margin else ""), build, matrix=True)
 
 
 def markov_rows(view: View, channel: str | None, output: str | None, count: int) -> np.ndarray:

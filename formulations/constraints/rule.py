@@ -28,6 +28,7 @@ class Rule:
         stand_in: {argument: value} of a formulation -> by what it replaces a condition that is not convex, such as "its
             tangent": a proof would be one for that; "" where it is the condition itself.
         depth: complex numbers -> by how much poles there obey it, negative where they do not; None for other rules.
+        matrix: whether it is a matrix inequality in a state-space model.
         call: module, name and arguments of the function that returned it, from which a pickled rule is built again.
     """
 
@@ -37,6 +38,7 @@ class Rule:
     about: frozenset[str] = frozenset({"coefficients"})
     stand_in: Callable[[Mapping[str, Any]], str] | None = None
     depth: Callable[[np.ndarray], float] | None = None
+    matrix: bool = False
     call: tuple[str, str, tuple[Any, ...], Mapping[str, Any]] | None = field(default=None, repr=False, compare=False)
 
     def __reduce__(self) -> Any:

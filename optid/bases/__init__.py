@@ -9,7 +9,7 @@ from optid.arrays import shown
 from optid.bases.basis import Basis
 from optid.bases.expansions import Linear, Polynomial, Trigonometric, UserFunctions
 from optid.bases.splines import BSpline, PiecewiseConstant, Triangular
-from optid.errors import DataError, LookupFailed, StructureError, nearest
+from optid.errors import DataError, LookupFailed, OptidError, StructureError, nearest
 from optid.lazy import public_names
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from optid.data.streams import Stream
 
 __all__ = ["BSpline", "Bases", "Basis", "FeedbackBases", "Linear", "PiecewiseConstant", "Polynomial", "Triangular",
-           "Trigonometric", "UserFunctions", "feedback_bases", "fitted_bases", "from_dict", "parse"]
+           "Trigonometric", "UserFunctions", "feedback_bases", "fitted_bases", "from_dict", "has_products", "parse"]
 
 Bases = Basis | str | Sequence[Basis | str]  # one basis, or its name as for `parse`, for all inputs, or one per input
 
@@ -106,6 +106,16 @@ def from_dict(description: dict[str, Any], functions: dict[str, Any] | None = No
         return _CLASSES[name](**arguments)
     except TypeError as error:
         raise StructureError(f"Basis {name!r} cannot be built from {sorted(arguments)}: {error}.") from error
+
+
+def has_products(basis: Any) -> bool:
+    """Whether a basis, or one of several, has more than one function; a word that cannot be read counts as such."""
+    several = basis if isinstance(basis, list | tuple) else (basis,)
+    try:
+        sizes = [(parse(one) if isinstance(one, str) else one).size for one in several if one not in (None, "none")]
+    except (OptidError, AttributeError):
+        return True
+    return max(sizes, default=0) > 1
 
 
 def fitted_bases(data: "Data | Stream", basis: Bases) -> tuple[Basis, ...]:

@@ -9,7 +9,7 @@ import typer
 
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import Work, check_names, reading_for, working
+from optid.cli.results import Work, check_names, reading_for, solver_choice, working
 from optid.cli.terminal import STOPPED
 from optid.errors import DataError
 from optid.lazy import import_cvxpy
@@ -61,7 +61,7 @@ def fit(data: Paths = None, example: str | None = None, *, how: dict[str, Any], 
         record, held_out = words.held_out(record, split, test, how)
         work.step(f"fitting {formulation}")
         found = (fit_model if holdout is None else partial(fit_by_holdout, penalty=holdout))(
-            record, formulation, solver=solver, accuracy=accuracy, time_limit=time_limit, prove=prove,
+            record, formulation, solver=solver_choice(solver), accuracy=accuracy, time_limit=time_limit, prove=prove,
             solver_options=words.pairs(option, "--option"), **arguments,
         )
         _save(work, found, held_out, saved, None if stream or scheduler else data, how)

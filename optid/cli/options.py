@@ -65,7 +65,7 @@ The model:
     disturbance (NAME): Unknown disturbance that is not a fault: an input, an output or a --process direction.
     state_jump (--state-jump/--no-state-jump): Include a jump of the state as a fault.
 The solver:
-    solver (-s NAME): Solver; optid solvers lists them.
+    solver (-s NAME): Solver, or STEP=NAME,... for steps of the formulation; optid solvers lists them.
 The result:
     report (-o FILE): Write a self-contained HTML report.
     saved (--model -m FILE): Write the model (JSON).

@@ -20,10 +20,19 @@ def check_names(constraints: Iterable[str] | None, solver: str = "auto", formula
     for word in constraints or ():
         if word != "none":
             entry_point(CONSTRAINTS, word.partition(":")[0])
-    if solver != "auto":
-        from optid.backends.choice import find
+    named = solver_choice(solver)
+    for word in [named] if isinstance(named, str) else named.values():
+        if word != "auto":
+            from optid.backends.choice import find
 
-        find(solver)
+            find(word)
+
+
+def solver_choice(text: str) -> str | dict[str, str]:
+    """Read a solver, or "STEP=SOLVER,..." for steps of a formulation."""
+    if "=" not in text:
+        return text
+    return {step.strip(): word.strip() for step, _, word in (part.partition("=") for part in text.split(","))}
 
 
 def reading_for(model: Any, how: Mapping[str, Any]) -> dict[str, Any]:

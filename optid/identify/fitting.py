@@ -37,6 +37,7 @@ from optid.program.solution import Bound, Solution, Status
 from optid.progress import log
 from optid.registry import Rendered, annotations, check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
+from optid.solving.steps import Solvers, choose_solvers
 
 
 @dataclass(frozen=True, repr=False)
@@ -266,8 +267,10 @@ class Fit(Rendered):
         if name != "outcome" or "arguments" not in vars(self):  # a fit from a pickle has no outcome yet
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         settings = dict(self.settings)
-        problem = formulation(self.formulation)[1](self.data, **self.arguments)
-        vars(self)["outcome"] = run(problem, settings.pop("solver", "auto"), **settings)
+        pose = formulation(self.formulation)[1]
+        solvers = choose_solvers(self.formulation, pose, {**defaults(pose), **self.arguments},
+                                 settings.pop("solver", "auto"))
+        vars(self)["outcome"] = run(pose(self.data, **self.arguments), solvers, **settings)
         return self.outcome
 
 
@@ -299,7 +302,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     Args:
         data: the record; a `Stream` for files larger than memory.
         formulation_name: name of a registered formulation, or the callable itself.
-        solver: name of the back end, or "auto".
+        solver: name of the back end, for the steps that take it; {step: name}, the other steps "auto"; or "auto".
         accuracy: requested relative accuracy.
         time_limit: seconds for each programme; the solver then runs in a separate process.
         isolate: run the solver in a separate process, so that a crash is an outcome.
@@ -325,8 +328,10 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     if built:
         arguments["constraints"] = built
     check_arguments(name, pose, arguments)
+    whole = {**defaults(pose), **arguments}
+    solvers = choose_solvers(name, pose, whole, solver)
     try:
-        findings = _examined(data, {**defaults(pose), **arguments})
+        findings = _examined(data, whole)
         problem = pose(data, **arguments)
     except OptidError:
         raise
@@ -336,8 +341,9 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     check_values(arguments, annotations(pose))
     settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate,
                 "prove": prove and not _stand_in(arguments),
-                **(solver_options or {})}
-    return _finished(data, name, arguments, findings, problem, solver, settings, raises, started)
+                "options": dict(solver_options or {})}
+    return _finished(data, name, arguments, findings, problem, solvers, {**settings, "solver": solver}, raises,
+                     started)
 
 
 def resolve(fit: Fit, parameters: Mapping[str, float], *, solver: Any = "auto", accuracy: float = 1e-8,
@@ -354,15 +360,15 @@ def resolve(fit: Fit, parameters: Mapping[str, float], *, solver: Any = "auto", 
                                  f"{nearest(name, program.parameters)}")
         program.parameters[name].value = np.asarray(value, dtype=float)
     program.assign(fit.solution.values)
-    return _finished(fit.data, fit.formulation, {**fit.arguments, **parameters}, [], program, solver,
-                     {"accuracy": accuracy}, raises, started)
+    return _finished(fit.data, fit.formulation, {**fit.arguments, **parameters}, [], program, Solvers(solver),
+                     {"accuracy": accuracy, "solver": solver}, raises, started)
 
 
 def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], findings: list[str],
-              problem: Program | Procedure, solver: Any, settings: Mapping[str, Any], raises: bool,
+              problem: Program | Procedure, solvers: Solvers, settings: Mapping[str, Any], raises: bool,
               started: float) -> Fit:
     built_at = time.perf_counter()
-    outcome = run(problem, solver, **settings)
+    outcome = run(problem, solvers, **{word: value for word, value in settings.items() if word != "solver"})
     times = outcome.solution.times
     times = replace(times, build=times.build + built_at - started)
     outcome = replace(outcome, solution=replace(outcome.solution, times=times))
@@ -379,7 +385,7 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     log.debug("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
               time.perf_counter() - started)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
-               time.perf_counter() - started, {**settings, "solver": solver})
+               time.perf_counter() - started, settings)
 
 
 def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:

@@ -170,7 +170,7 @@ def _optimum(fit: "Fit") -> list[Any]:
              if name in ("Objective", "Bound", "Relative gap")]
     right += [(name, value) for name, value in summary.solver_facts(fit) if name in ("Solver", "Iterations", "Total")]
     return [Banner(tone, f"Solution: {word}", sentence, tuple(cards)), Columns(summary.record_facts(fit), right),
-            *([Notes(fit.findings)] if fit.findings else [])]
+            *filter(None, [summary.steps_table(fit)]), *([Notes(fit.findings)] if fit.findings else [])]
 
 
 def _fit_charts(fit: "Fit", curves: Curves) -> list[Any]:

@@ -14,7 +14,7 @@ from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
 from optid.models.functions import has_feedback, runs_free, static_functions
 from optid.models.kalman import NoiseCovariances
 from optid.models.roots import in_words
-from optid.program.solution import Status
+from optid.program.solution import Solution, Status
 from optid.show.sections import Facts
 from optid.show.wording import Table, gap_text, number, percent, seconds
 from optid.structures.least_squares import rank_one_of
@@ -209,6 +209,19 @@ def solver_facts(fit: "Fit") -> Facts:
         facts.append(("Programmes solved", str(len(fit.steps))))
     times = (s.times.build, s.times.solve, s.times.judge, s.times.prove, fit.seconds)
     return facts + list(zip(("Building", "Solving", "Verifying", "Proving", "Total"), map(seconds, times)))
+
+
+def steps_table(fit: "Fit") -> Table | None:
+    """Every step of a procedure: its programmes, their solvers, status and objective of the last; None for one step."""
+    by_name: dict[str, list[Solution]] = {}
+    for name, solution in fit.steps:
+        by_name.setdefault(name, []).append(solution)
+    if len(by_name) == 1:
+        return None
+    rows = [(name, str(len(several)), ", ".join(dict.fromkeys(s.solver for s in several)), str(several[-1].status),
+             number(several[-1].objective)) for name, several in by_name.items()]
+    return Table("Steps", ("step", "programmes", "solver", "last status", "objective"), rows,
+                 f"The objective of the fit is that of the step '{fit.program.name}'.")
 
 
 def call(fit: "Fit") -> str:

@@ -13,6 +13,7 @@ from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status, Times
 from optid.solving.answers import answer_of
 from optid.solving.claims import FALSE_CLAIM, verdict
+from optid.solving.steps import Solvers
 
 Procedure = Generator[Program, Solution, Any]
 
@@ -118,6 +119,8 @@ class Evidence:
     extend: Callable[[], tuple[Any, dict[str, Any]]] | None = None
     # of the variables of the last programme at the model, where the model is not that of its solution
     values: Mapping[str, Any] | None = None
+    # the step whose programme the objective is that of, "" for the last one
+    main: str = ""
 
     def extended(self) -> tuple[Any, dict[str, Any]]:
         """Return the completed model and further figures."""
@@ -134,8 +137,8 @@ class Outcome:
     """What a formulation ended with."""
 
     model: Any  # the model, or None where no programme had a point
-    solution: Solution  # the last solution
-    program: Program  # the last programme
+    solution: Solution  # that of the step whose objective is that of the fit: of its last programme
+    program: Program  # that programme
     steps: tuple[tuple[str, Solution], ...]  # every (name, solution) on the way; one entry for a plain programme
     # those of the evidence, and which solvers stood in for others
     figures: Mapping[str, Any] = field(default_factory=dict)
@@ -147,25 +150,43 @@ class Outcome:
     evidence: Evidence | None = None
 
 
-def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> Outcome:
+def run(problem: Program | Procedure, solver: Any = "auto", *, options: Mapping[str, Any] | None = None,
+        **settings: Any) -> Outcome:
     """Solve a programme, or drive a procedure that yields programmes and returns the model, with settings of `solve`.
 
     The time that a procedure itself takes, between its programmes, counts as building.
+
+    Args:
+        problem: the programme, or the procedure.
+        solver: as for `solve`, or `Solvers`: of a procedure, steps that do not take the one word run as "auto".
+        options: native options, for the programmes that a named solver solves.
+        settings: others of `solve`.
+
+    Raises:
+        SolverRefused: no programme takes the solver; other errors as of `solve`.
     """
     constrained: dict[str, tuple[Program, Solution]] = {}
     steps: list[tuple[str, Solution]] = []
+    solvers, last = solver if isinstance(solver, Solvers) else Solvers(solver), {}
+
+    def solve_step(program: Program) -> Solution:
+        asked = solvers.of(program)
+        stands_in = asked == "auto" and (solvers.word != "auto" or solvers.named)
+        solution = solve(program, asked, **settings, **({} if stands_in else options or {}))
+        steps.append((program.name, solution))
+        constrained.update(dict.fromkeys(program.user_constraints, (program, solution)))
+        last[program.name] = program, solution
+        return solution
+
     if isinstance(problem, Program):
-        solution = solve(problem, solver, **settings)
+        solution = solve_step(problem)
         model = problem.recover(solution.values) if solution.has_point else None
-        constrained = dict.fromkeys(problem.user_constraints, (problem, solution))
-        return Outcome(model, solution, problem, ((problem.name, solution),), constrained=constrained)
+        return Outcome(model, solution, problem, tuple(steps), constrained=constrained)
     clock = time.perf_counter()
     program = next(problem)
     building = time.perf_counter() - clock
     while True:
-        solution = solve(program, solver, **settings)
-        steps.append((program.name, solution))
-        constrained |= dict.fromkeys(program.user_constraints, (program, solution))
+        solution = solve_step(program)
         clock = time.perf_counter()
         try:
             program = problem.send(solution)
@@ -173,6 +194,8 @@ def run(problem: Program | Procedure, solver: Any = "auto", **settings: Any) -> 
         except StopIteration as stop:
             found = stop.value
             building += time.perf_counter() - clock
+            if isinstance(found, Evidence) and found.main:
+                program, solution = last[found.main]
             solution = replace(solution, times=replace(solution.times, build=building))
             if not isinstance(found, Evidence):
                 return Outcome(found, solution, program, tuple(steps), _substitutions(steps), constrained)

@@ -18,8 +18,10 @@ import numpy as np
 from optid.errors import DataError, SolverMissing, SolverRefused
 from optid.identify.fitting import Fit, fit
 from optid.program.solution import Solution
+from optid.registry import defaults, formulation
 from optid.solving.claims import NOT_FINITE
 from optid.solving.solve import solve
+from optid.solving.steps import choose_solvers
 from optid.studies.execution.machine import Peak, machine
 from optid.studies.execution.worker import keep
 from optid.studies.grid import Cell, content_hash, determining
@@ -104,8 +106,8 @@ def prepare() -> None:
 
     data = dead_zone(n=100).data
     tried: dict[str, dict[str, Any]] = {"hammerstein_arx.exact": {"basis": "triangular:4"}, "arx": {}}
-    for formulation, options in tried.items():
-        model = fit(data, formulation, na=1, nb=1, prove=False, **options).model
+    for name, options in tried.items():
+        model = fit(data, name, na=1, nb=1, prove=False, **options).model
         one_step(model, data)
         simulated(model, data)
 
@@ -139,6 +141,7 @@ def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit
     held = 0 if record.holdout is None else record.holdout.n_samples
     row: dict[str, Any] = {"n_samples": data.n_samples + held, "n_estimation": data.n_samples, "n_inputs": data.m,
                            "n_outputs": data.l}
+    _check_main_step(cell)
     fitted = fit(data, cell.formulation_name, solver=cell.solver_name, accuracy=cell.accuracy, time_limit=limit,
                  isolate=False, constraints=cell.constraints, solver_options=dict(cell.solver_options), raises=False,
                  **cell.options)
@@ -150,6 +153,15 @@ def _cold(cell: Cell, record: Record, limit: float) -> tuple[dict[str, Any], Fit
     row |= _finiteness(fitted, row)
     plain = fitted.outcome.evidence is None and len(fitted.steps) == 1 and fitted.solution.has_point
     return row, fitted if cell.warm and plain and row["outcome"] == DONE else None
+
+
+def _check_main_step(cell: Cell) -> None:
+    """Refuse a solver that would solve other steps of a formulation than the one whose objective is compared."""
+    name, pose = formulation(cell.formulation_name)
+    arguments = {**defaults(pose), **cell.options, "constraints": cell.constraints}
+    solvers = choose_solvers(name, pose, arguments, cell.solver_name)
+    if solvers.skips_main:
+        raise SolverRefused(f"{cell.solver_name} does not take {solvers.main!r}, the main step of {name!r}")
 
 
 def _loaded(cell: Cell) -> Record:
