@@ -3,18 +3,19 @@
 from collections.abc import Sequence
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from optid.bases import Linear
+from optid.core.problem import Problem
+from optid.core.terms import Squares, Values
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.identify.equation_error import EquationError, pose_with_loss
+from optid.identify.express import as_program
 from optid.models import HammersteinTF
-from optid.program.program import Program, Values
+from optid.program.program import Program
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
-from optid.structures.least_squares import LinearStructure
 
 LEAST_SQUARES = steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 
@@ -44,7 +45,7 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         StructureError: impossible orders or nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    return pose_with_loss(loss, data, lambda problem: _programme(problem).subject_to(*constraints), convex=True,
+    return pose_with_loss(loss, data, lambda record: as_program(_problem(record, constraints)), convex=True,
                           na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge, prior=prior, offset=offset)
 
 
@@ -58,20 +59,14 @@ def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence
     return arx(data, na=0, nb=nb, nk=nk, prior=prior, constraints=constraints, offset=offset)
 
 
-def _programme(problem: EquationError) -> Program:
-    linear = problem.linear_variables()  # a, offset
-    b = {key: cp.Variable(problem.b_shape(c), name=key) for c, key in enumerate(problem.keys("b"))}
-    residual = problem.residual(linear, b.values())
-    r = cp.Variable(residual.size, name="residual")
+def _problem(record: EquationError, constraints: Sequence[Any]) -> Problem:
+    names = record.keys("b")
+    start = {**record.linear_zeros(), **{name: np.zeros(record.b_shape(c)) for c, name in enumerate(names)}}
 
-    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder)
-    constraints = {"residual": (r == residual,)}
+    objective = Squares.of(record.problem, tuple(start))  # ‖R [a; offset; b] - s‖²
 
-    def recover(values: Values) -> HammersteinTF:
-        return problem.model(values, [np.ones(1)] * len(b), [values[key] for key in b], gauge="none", flip=False)
+    def model(x: Values) -> HammersteinTF:
+        return record.model(x, [np.ones(1)] * len(names), [x[name] for name in names], gauge="none", flip=False)
 
-    return Program(
-        "arx", objective, constraints, {**linear, **b, "residual": r}, {}, recover,
-        problem.view({**linear, **b}), structural=frozenset(constraints), derived={"residual": residual},
-        structure=LinearStructure(problem.problem, (*linear, *b)), scale=problem.problem.scale,
-        unit=problem.unit, compressed=problem)
+    return Problem("arx", start, (objective,), model=model, facts=record.facts(), builders=tuple(constraints),
+                   **record.common())

@@ -17,20 +17,22 @@ import numpy as np
 
 from optid.arrays import check_weight, one_of
 from optid.bases.basis import Basis
-from optid.certificate.lifting import certify_nuclear, certify_rank_one
+from optid.certificate.lifting import certify_nuclear
+from optid.core.leaves import Product
+from optid.core.problem import Problem
+from optid.core.terms import Squares, Values
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.gauges import FIXED, in_gauge, scale_fixed, signs_are_fixed
+from optid.identify.express import as_program
+from optid.identify.gauges import FIXED, in_gauge, signs_are_fixed
 from optid.models import HammersteinTF
-from optid.program.expressions import flat
 from optid.program.judging import measure_violation
-from optid.program.program import Program, Values
+from optid.program.program import Program
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 from optid.structures.bilinear import starts
-from optid.structures.least_squares import LinearStructure, RankOneStructure
 from optid.structures.lifted_regression import leading_pairs
 
 
@@ -69,51 +71,40 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
                           offset=offset)
 
 
-def _programme(problem: EquationError, builders: Sequence[Any], gauge: str) -> Program:
-    if gauge == "gain" and problem.layout.l > 1:
-        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
-    pairs, inputs = tuple(zip(problem.keys("mu"), problem.keys("b"))), range(problem.layout.m)
-
-    def statement() -> dict[str, Any]:
-        linear = problem.linear_variables()  # a, offset
-        mu = [cp.Variable(problem.layout.bases[c].size, name=pairs[c][0]) for c in inputs]
-        b = [cp.Variable(problem.b_shape(c), name=pairs[c][1]) for c in inputs]
-        theta = {problem.keys("Theta")[c]: cp.outer(mu[c], flat(b[c])) for c in inputs}
-        residual = problem.residual(linear, theta.values())
-        r = cp.Variable(residual.size, name="residual")
-
-        objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder)
-        constraints = {"residual": (r == residual,),
-                       "gauge": tuple(scale_fixed(gauge, one, linear.get("a")) for one in b)}
-
-        factors = {one.name(): one for pair in zip(mu, b) for one in pair}
-        return {"objective": objective, "constraints": constraints, "derived": {"residual": residual},
-                "variables": {**linear, **factors, "residual": r},
-                "view": problem.view({**linear, **factors, **theta}, gauge)}
-
-    def recover(values: Values, signed: bool = False) -> HammersteinTF:
-        return problem.model(values, [values[m] for m, _ in pairs], [values[one] for _, one in pairs], gauge=gauge,
-                             flip=gauge == "norm" and not signed)
-
-    linear = ("a", "offset") if problem.layout.na else ("offset",)
-    program = Program.deferred(
-        "hammerstein_arx.exact", statement, start=_start(problem, pairs, gauge), recover=recover,
-        structural=frozenset({"residual", "gauge"}),
-        structure=RankOneStructure(problem.problem, linear, pairs, gauge), certify=certify_rank_one,
-        scale=problem.problem.scale, unit=problem.unit, compressed=problem).subject_to(*builders)
+def _programme(record: EquationError, builders: Sequence[Any], gauge: str) -> Program:
+    program = as_program(_problem(record, builders, gauge))
+    pairs = tuple(zip(record.keys("mu"), record.keys("b")))
     if gauge == "norm" and signs_are_fixed(program, pairs):
-        return replace(program, recover=partial(recover, signed=True), start=_signed_start(program, pairs))
+        return replace(program, recover=partial(program.recover, signed=True), start=_signed_start(program, pairs))
     return program
 
 
-def _start(problem: EquationError, pairs: Sequence[tuple[str, str]], gauge: str) -> dict[str, np.ndarray]:
+def _problem(record: EquationError, builders: Sequence[Any], gauge: str) -> Problem:
+    if gauge == "gain" and record.layout.l > 1:
+        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
+    products = tuple(Product(mu, b, gauge) for mu, b in zip(record.keys("mu"), record.keys("b")))
+    linear = tuple(record.linear_zeros())  # a, offset
+
+    z = (*linear, *(one.name for one in products))
+    objective = Squares.of(record.problem, z)  # ‖R [a; offset; vec mu bᵀ] - s‖²
+
+    def model(x: Values, signed: bool = False) -> HammersteinTF:
+        return record.model(x, [x[one.mu] for one in products], [x[one.b] for one in products], gauge=gauge,
+                            flip=gauge == "norm" and not signed)
+
+    return Problem("hammerstein_arx.exact", _start(record, products), (objective,), products, model,
+                   record.facts(gauge), builders=tuple(builders), **record.common())
+
+
+def _start(record: EquationError, products: Sequence[Product]) -> dict[str, np.ndarray]:
     """Return the best rank-one start without the constraints, in the gauge."""
-    core = problem.problem.core
+    core = record.problem.core
     point = core.point(*starts(core, count=1)[0])
-    start = problem.linear_part(point.w)
-    for c, (names, channel) in enumerate(zip(pairs, problem.layout.inputs)):
-        b = point.bs[c].reshape(problem.b_shape(c), order="F")
-        start.update(zip(names, in_gauge(gauge, point.mus[c], b, problem.past(start), channel)))
+    part = record.linear_part(point.w)
+    start = {name: part[name] for name in record.linear_zeros()}
+    for c, (one, channel) in enumerate(zip(products, record.layout.inputs)):
+        b = point.bs[c].reshape(record.b_shape(c), order="F")
+        start.update(zip((one.mu, one.b), in_gauge(one.gauge, point.mus[c], b, record.past(start), channel)))
     return start
 
 
@@ -158,7 +149,7 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
     """
     one_of("gauge", gauge, FIXED)
     check_weight(weight, "weight (of the nuclear norm)")
-    return pose_with_loss(loss, data, partial(_relaxed, builders=constraints, gauge=gauge, weight=float(weight)),
+    return pose_with_loss(loss, data, partial(_penalised, builders=constraints, gauge=gauge, weight=float(weight)),
                           convex=True, na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior,
                           offset=offset)
 
@@ -182,13 +173,23 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
     one_of("gauge", gauge, FIXED)
     if svd not in ("whitened", "plain"):
         raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
-    return pose_with_loss(loss, data, partial(_relaxed, builders=constraints, gauge=gauge, svd=svd), convex=True,
+    return pose_with_loss(loss, data, lambda record: as_program(_relaxed(record, constraints, gauge, svd)), convex=True,
                           na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior,
                           offset=offset)
 
 
-def _relaxed(problem: EquationError, builders: Sequence[Any], gauge: str, weight: float | None = None,
-             svd: str = "whitened") -> Program:
+def _relaxed(record: EquationError, builders: Sequence[Any], gauge: str, svd: str) -> Problem:
+    thetas = {name: np.zeros(shape) for name, shape in zip(record.keys("Theta"), record.problem.blocks)}
+    start = {**record.linear_zeros(), **thetas}
+
+    objective = Squares.of(record.problem, tuple(start))  # ‖R [a; offset; vec Theta] - s‖²
+
+    return Problem("hammerstein_arx.overparametrised", start, (objective,), (),
+                   partial(_rank_one_model, record, gauge, svd), record.facts(), builders=tuple(builders),
+                   **record.common())
+
+
+def _penalised(problem: EquationError, builders: Sequence[Any], gauge: str, weight: float) -> Program:
     linear = problem.linear_variables()  # a, offset
     theta = {key: cp.Variable(shape, name=key) for key, shape in zip(problem.keys("Theta"), problem.problem.blocks)}
     tau = cp.Parameter(nonneg=True, name="weight", value=weight)
@@ -196,21 +197,16 @@ def _relaxed(problem: EquationError, builders: Sequence[Any], gauge: str, weight
     residual = problem.residual(linear, theta.values())
     r = cp.Variable(residual.size, name="residual")
 
-    squares = cp.sum_squares(r) + problem.problem.remainder
     norms = sum(height * cp.normNuc(one) for height, one in zip(heights, theta.values()))
-    objective = cp.Minimize(squares if weight is None else squares + 2 / problem.unit * tau * norms)
+    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder + 2 / problem.unit * tau * norms)
     constraints = {"residual": (r == residual,)}
 
-    form: dict[str, Any] = {"structure": LinearStructure(problem.problem, (*linear, *theta))}
-    if weight is not None:
-        form = {"parameters": {"weight": tau},
-                "certify": partial(certify_nuclear, problem.problem, heights / problem.unit)}
-    name = "overparametrised" if weight is None else "nuclear"
     return Program(
-        f"hammerstein_arx.{name}", objective, constraints, {**linear, **theta, "residual": r}, {},
-        partial(_rank_one_model, problem, gauge, svd), problem.view({**linear, **theta}),
+        "hammerstein_arx.nuclear", objective, constraints, {**linear, **theta, "residual": r}, {},
+        partial(_rank_one_model, problem, gauge, "whitened"), problem.view({**linear, **theta}),
         structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale,
-        unit=problem.unit, compressed=problem, **form).subject_to(*builders)
+        unit=problem.unit, compressed=problem, parameters={"weight": tau},
+        certify=partial(certify_nuclear, problem.problem, heights / problem.unit)).subject_to(*builders)
 
 
 def _rank_one_model(problem: EquationError, gauge: str, svd: str, values: Values) -> HammersteinTF:

@@ -105,8 +105,8 @@ def unreadable_formulations(house: House) -> list[str]:
     """
     found = []
     for module, functions in house.registered.items():
-        called = {ast.unparse(node.func).rpartition(".")[2] for node in house.nodes[module]
-                  if isinstance(node, ast.Call)}
+        called = {part for node in house.nodes[module] if isinstance(node, ast.Call)
+                  for part in ast.unparse(node.func).split(".")}
         terms = {local for local, name in house.imports[module].items() if name.startswith("optid.core.terms.")}
         if not ("Minimize" in called or "Problem" in called and terms & called):
             found += [f"{module}:{function}" for function in functions]

@@ -29,7 +29,7 @@ from optid.examples import example
 from optid.models import HammersteinSS
 from optid.workbench import views
 from optid.workbench.bench import Bench, Source
-from optid.workbench.request import Constraint, Request, suggested
+from optid.workbench.request import ChosenConstraint, Request, suggested
 from optid.workbench.server import PAGES, Server, serve
 
 ARGUMENTS = {"na": 2, "nb": 1, "nk": 0, "basis": "triangular:10"}
@@ -234,7 +234,7 @@ def test_a_corridor_a_disc_and_a_band_hold():
     assert np.max(np.abs(free.model.poles - 0.3)) > 0.2
     single = optid.fit(record, constraints=[disc(0.2, 0.3)], **{**ARGUMENTS, "na": 1})
     assert abs(single.model.poles[0] - 0.2) <= 0.3
-    band = Constraint("step_band", {"high": 3.3, "first": 0, "last": 30}, "band")
+    band = ChosenConstraint("step_band", {"high": 3.3, "first": 0, "last": 30}, "band")
     request = Request(("current",), ("thrust",), (0, 600), "hammerstein_arx.exact", ARGUMENTS, (band,))
     banded = request.fit(record)
     assert not banded.solution.proof and "tangent" in banded.solution.reason and "not proved" in str(banded)

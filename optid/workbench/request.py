@@ -17,7 +17,7 @@ PASSES = 3
 
 
 @dataclass(frozen=True)
-class Constraint:
+class ChosenConstraint:
     """A named constraint: the word of its function, its arguments, and the name under which its price is shown."""
 
     word: str
@@ -41,14 +41,14 @@ class Request:
     window: tuple[int, int]  # first sample and the one after the last
     formulation: str  # its name
     arguments: Mapping[str, Any]  # of the formulation
-    constraints: tuple[Constraint, ...] = ()  # set by hand
+    constraints: tuple[ChosenConstraint, ...] = ()  # set by hand
     draft: bool = False  # whether it is part of a drag: one pass for bands of the step response is then enough
 
     @classmethod
     def parse(cls, state: Any, draft: bool = False) -> "Request":
         """Read a state as the page sends it, a `draft` during a drag; anything else is a `DataError`."""
         try:
-            constraints = tuple(Constraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
+            constraints = tuple(ChosenConstraint(str(c["word"]), dict(c["arguments"]), str(c["name"]))
                                 for c in state["constraints"])
             first, last = map(int, state["window"])
             for key in [*state["arguments"], *(key for c in constraints for key in c.arguments)]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from optid.data.readers import Format
 from optid.registry import CONSTRAINTS, entry_point
-from optid.workbench.request import BAND, PASSES, Constraint, Request
+from optid.workbench.request import BAND, PASSES, ChosenConstraint, Request
 
 
 def script(request: Request, source: str, whole: bool = False) -> str:
@@ -52,6 +52,6 @@ def reading(files: list[str], how: Mapping[str, Any]) -> str:
     return f"optid.read({files if len(files) > 1 else files[0]!r}{options})"
 
 
-def _call(c: Constraint, more: str = "") -> str:
+def _call(c: ChosenConstraint, more: str = "") -> str:
     arguments = ", ".join(f"{key}={value!r}" for key, value in c.arguments.items())
     return f"{entry_point(CONSTRAINTS, c.word).attr}({arguments}{more}).named({c.name!r})"

@@ -76,12 +76,26 @@ class EquationError:
         z = cp.hstack([flat(part) for part in (*linear.values(), *thetas)])
         return self.problem.root @ z - self.problem.target
 
+    def facts(self, gauge: str = "") -> dict[str, Any]:
+        """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
+        full, inputs = solve_triangular(self.problem.root, self.problem.target), self.layout.inputs
+        return {"channels": inputs, "bases": dict(zip(inputs, self.bases)), "gauge": gauge, "units": self.units,
+                "reference": self.linear_part(full[: self.problem.linear]),
+                "delays": dict(zip(inputs, self.layout.nk))}
+
     def view(self, expressions: Mapping[str, cp.Expression], gauge: str = "") -> View:
         """Return the expressions that constraints may use."""
-        full, inputs = solve_triangular(self.problem.root, self.problem.target), self.layout.inputs
-        return View(expressions, channels=inputs, bases=dict(zip(inputs, self.bases)), gauge=gauge,
-                    reference=self.linear_part(full[: self.problem.linear]), units=self.units,
-                    delays=dict(zip(inputs, self.layout.nk)))
+        return View(expressions, **self.facts(gauge))
+
+    def common(self) -> dict[str, Any]:
+        """Return what every `optid.core.problem.Problem` of the record has: scale, unit, energy, the record itself."""
+        return {"scale": self.problem.scale, "unit": self.unit, "energy": self.unit * float(np.sum(self.energy)),
+                "compressed": self}
+
+    def linear_zeros(self) -> dict[str, np.ndarray]:
+        """Return zeros in the shapes of ``a`` ((na,) or (l, na l) = [A_1 .. A_na]) and ``offset`` (l,), in order."""
+        part = self.linear_part(np.zeros(self.problem.linear))
+        return {name: part[name] for name in ("a", "offset") if name in part}
 
     def linear_part(self, w: np.ndarray) -> dict[str, np.ndarray]:
         """Split the linear part of z into values of ``a`` and ``offset``."""

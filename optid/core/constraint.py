@@ -1,0 +1,184 @@
+"""Constraints of the user, read once into rows on the leaves of a problem.
+
+A builder gets the leaves as CVXPY variables, in the units of the record, and returns CVXPY constraints. Affine ones
+become ``g = rows y - right`` with g = 0, g <= 0 or, square, -g positive semidefinite; y are all leaves one after
+another. What is not affine in the leaves stays a CVXPY constraint and is measured there. A builder that looked at
+values of an iterate is *moving*: it is read again at every iterate.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from cvxpy.constraints.constraint import Constraint as Member
+from cvxpy.constraints.psd import PSD
+
+from optid.arrays import Array
+from optid.core.leaves import LeafSpace
+from optid.core.terms import Values
+from optid.errors import StructureError
+from optid.program.expressions import affine_parts, flat_value, jacobians, side_by_side
+from optid.program.limits import EQUALITIES, Limit, rows_of
+from optid.program.program import named
+from optid.program.view import View
+
+NEGLIGIBLE = 64 * float(np.finfo(float).eps)  # share of its constant beneath which a row has no size of its own
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """One CVXPY constraint of a named group.
+
+    Attributes:
+        name: of the group.
+        limit: the constraint as the user wrote it, its bound, and what its rows were divided by.
+        cone: "zero", "below", "psd", or "other" where CVXPY alone measures it.
+        rows: (m, leaves), divided by their sizes; zeros where the cone is "other".
+        right: (m,).
+        moving: whether its builder looked at values of an iterate.
+        builder: position of its builder.
+    """
+
+    name: str
+    limit: Limit
+    cone: str
+    rows: Array
+    right: Array
+    moving: bool
+    builder: int
+
+    def __len__(self) -> int:
+        return len(self.right)
+
+    @property
+    def sizes(self) -> Array:
+        """What the rows were divided by (m,)."""
+        return np.broadcast_to(self.limit.sizes, (len(self),))
+
+    def residual(self, space: LeafSpace, y: Values) -> Array:
+        """Return g (m,) at values of the leaves: vec(-M) of a matrix M that must be definite."""
+        if self.cone != "other":
+            return self.rows @ space.vector(y) - self.right
+        space.assign(y)
+        expression = getattr(self.limit.member, "expr", None)
+        return np.atleast_1d(self.limit.member.violation()).ravel() if expression is None else flat_value(expression)
+
+    def slope(self, space: LeafSpace, y: Values) -> Array:
+        """Return the derivative (m, leaves) of g at values of the leaves."""
+        if self.cone != "other":
+            return self.rows
+        space.assign(y)
+        parts = jacobians(self.limit.member.expr) or {}  # type: ignore[attr-defined]
+        return np.asarray(side_by_side(parts, space.variables.values(), self.limit.member.size))
+
+    def violation(self, space: LeafSpace, y: Values) -> float:
+        """Return the sum of the violations of its rows, or the largest one of a matrix."""
+        g = self.residual(space, y)
+        if self.cone == "zero":
+            return float(np.sum(np.abs(g)))
+        if self.cone == "psd":
+            return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
+        return float(np.sum(np.maximum(g, 0.0)))
+
+
+def symmetric_part(vector: Array) -> Array:
+    """Return the symmetric part of a square matrix that is flat."""
+    n = round(vector.size**0.5)
+    matrix = vector.reshape(n, n, order="F")
+    return (matrix + matrix.T) / 2
+
+
+class Reference(dict[str, Array]):
+    """The point about which a constraint is built; `asked` says whether a value of it was read."""
+
+    asked = False
+
+    def __getitem__(self, key: str) -> Array:
+        self.asked = True
+        return super().__getitem__(key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return a value."""
+        self.asked = True
+        return super().get(key, default)
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintReader:
+    """Reads builders in the words of one problem.
+
+    Attributes:
+        problem: its name, for messages.
+        space: its leaves.
+        facts: keyword arguments of the `View`.
+        convex: whether a constraint that is not convex is refused.
+    """
+
+    problem: str
+    space: LeafSpace
+    facts: Mapping[str, Any]
+    convex: bool
+
+    def read(self, builders: Sequence[Any], about: Values, further: Mapping[str, Any], only: set[int] | None = None
+             ) -> list[Constraint]:
+        """Read builders about a point, all or some by their positions.
+
+        Args:
+            builders: callables of the `View`, or what they would return.
+            about: the reference, where the facts have none.
+            further: expressions besides the leaves.
+            only: positions.
+
+        Raises:
+            StructureError: an unknown variable, a name used twice, a constraint that is not convex but has to be.
+        """
+        reference = Reference(self.facts.get("reference", about))
+        view = View({**self.space.variables, **further}, **{**self.facts, "reference": reference})
+        found: list[Constraint] = []
+        for number, builder in enumerate(builders):
+            if only is not None and number not in only:
+                continue
+            reference.asked = False
+            default = getattr(builder, "name", None) or f"constraint {number + 1}"
+            built = named(builder(view) if callable(builder) else builder, default)
+            moving = reference.asked and "reference" not in self.facts
+            for name, limits in built.items():
+                if any(one.name == name and one.builder != number for one in found):
+                    raise StructureError(f"there are two constraints named {name!r}; give each its own name")
+                found += [self._rows(view, name, limit, moving, number)
+                          for limit in limits if limit.member.size]  # a straight line has no curvature
+        return found
+
+    def _rows(self, view: View, name: str, limit: Limit, moving: bool, number: int) -> Constraint:
+        """Return one member as rows on the leaves, where it is affine in them."""
+        member, leaves = limit.member, {variable.id: leaf for leaf, variable in self.space.variables.items()}
+        foreign = sorted({v.name() for v in member.variables() if v.id not in leaves and not view.owns(v)})
+        if foreign:
+            raise StructureError(f"constraint {name!r} uses {', '.join(foreign)}, which is not a variable of "
+                                 f"{self.problem!r} ({', '.join(self.space.variables)})")
+        if self.convex and not member.is_dcp():
+            raise StructureError(
+                f"constraint {name!r} is not convex, and {self.problem!r} is a convex formulation: {member}. State it "
+                "in the named variables of the relaxation or use an exact formulation.")
+        expression, cone = _in_cone(member)
+        parts = None if expression is None else affine_parts(expression)
+        if parts is None or any(variable.id not in leaves for variable in parts[0]):
+            return Constraint(name, limit, "other", np.zeros((member.size, self.space.size)), np.zeros(member.size),
+                              moving, number)
+        rows, right = np.zeros((parts[1].size, self.space.size)), -parts[1]
+        for variable, part in parts[0].items():
+            rows[:, self.space.places[leaves[variable.id]]] = part.toarray() if hasattr(part, "toarray") else part
+        sizes = np.abs(rows) @ self.space.entry_sizes
+        if cone == "psd":
+            sizes = np.full(len(right), float(np.max(sizes, initial=0.0)) or 1.0)
+        else:  # no solver sees the units in which a row was written
+            sizes = np.where(sizes > NEGLIGIBLE * np.abs(right), sizes, 1.0)
+        return Constraint(name, replace(limit, sizes=sizes), cone, rows / sizes[:, None], right / sizes, moving, number)
+
+
+def _in_cone(member: Member) -> tuple[Any, str]:
+    """Return what a member holds in a cone, and the cone; None for a cone that is not read."""
+    if isinstance(member, PSD):
+        return -member.args[0], "psd"
+    return rows_of(member), "zero" if isinstance(member, EQUALITIES) else "below"

@@ -1,0 +1,146 @@
+"""Quantities that unknowns determine, and that terms and constraints speak about besides the unknowns themselves.
+
+Every leaf is a CVXPY variable of its own in the words of the user, so that a constraint about ``Theta = mu bᵀ`` is
+affine; its values and slopes in the unknowns follow by the chain rule.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import cvxpy as cp
+import numpy as np
+
+from optid.arrays import Array
+from optid.core.terms import Values, flat
+
+
+@dataclass(frozen=True)
+class Product:
+    """``Theta = mu bᵀ``, with the gauge that fixes the scale between its factors.
+
+    Attributes:
+        mu, b: names of the unknowns; b may be a matrix, whose columns follow one another.
+        gauge: "norm" (‖b‖ = 1), "gain" (sum of b = 1 + sum of a) or "b0" (first coefficient one).
+    """
+
+    mu: str
+    b: str
+    gauge: str = "norm"
+
+    @property
+    def name(self) -> str:
+        """Name of the product: ``Theta`` of ``mu``, ``Theta[valve]`` of ``mu[valve]``."""
+        return "Theta" + self.mu.removeprefix("mu")
+
+    def value(self, x: Values) -> Array:
+        """Return the product (P, size of b)."""
+        return np.outer(x[self.mu], flat(x[self.b]))
+
+    def slope(self, x: Values) -> dict[str, Array]:
+        """Return the derivative of the flat product by every factor."""
+        mu, b = flat(x[self.mu]), flat(x[self.b])
+        return {self.mu: np.kron(b[:, None], np.eye(mu.size)), self.b: np.kron(np.eye(b.size), mu[:, None])}
+
+    def chain(self, pull: Array, x: Values) -> dict[str, Array]:
+        """Return ``slopeᵀ pull`` without forming the slope."""
+        b = flat(x[self.b])
+        matrix = pull.reshape(b.size, -1)
+        return {self.mu: b @ matrix, self.b: matrix @ flat(x[self.mu])}
+
+    def level(self, x: Values) -> tuple[float, dict[str, Array]]:
+        """Return what the gauge holds at zero, and its slope by the unknowns."""
+        b = flat(x[self.b])
+        if self.gauge == "norm":
+            return float(b @ b) - 1.0, {self.b: 2 * b}
+        if self.gauge == "b0":
+            return float(b[0]) - 1.0, {self.b: np.eye(b.size)[0]}
+        a = flat(x.get("a", np.zeros(0)))
+        return float(b.sum() - a.sum()) - 1.0, {self.b: np.ones(b.size), **({"a": -np.ones(a.size)} if a.size else {})}
+
+    def in_gauge(self, x: Values) -> dict[str, Array]:
+        """Return the point with the same product in the gauge; as it is where that is not possible."""
+        b = flat(x[self.b])
+        size = {"norm": float(np.linalg.norm(b)), "b0": float(b[0])}.get(
+            self.gauge, float(b.sum()) / (1.0 + float(np.sum(x.get("a", 0.0)))))
+        if not np.isfinite(size) or size == 0:
+            return dict(x)
+        return {**x, self.mu: x[self.mu] * size, self.b: x[self.b] / size}
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """Any other quantity of the unknowns.
+
+    Attributes:
+        name: its name.
+        value: values of the unknowns -> array.
+        slope: values of the unknowns -> {unknown: derivative of the flat value by the flat unknown}.
+    """
+
+    name: str
+    value: Callable[[Values], Array]
+    slope: Callable[[Values], Mapping[str, Array]]
+
+    def chain(self, pull: Array, x: Values) -> dict[str, Array]:
+        """Return ``slopeᵀ pull``."""
+        return {name: part.T @ pull for name, part in self.slope(x).items()}
+
+
+Leaf = Product | Quantity
+
+
+@dataclass(frozen=True, eq=False)
+class LeafSpace:
+    """All leaves of a problem one after another.
+
+    Attributes:
+        start: their values at the start.
+        symmetric: those that are symmetric matrices.
+    """
+
+    start: Values
+    symmetric: frozenset[str] = frozenset()
+
+    @cached_property
+    def places(self) -> dict[str, slice]:
+        """Where every leaf is in their vector."""
+        return slices_of(self.start)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of entries."""
+        return sum(np.size(value) for value in self.start.values())
+
+    @cached_property
+    def usual_sizes(self) -> dict[str, float]:
+        """The largest entry of every leaf at the start, without those that vanish there."""
+        sizes = {name: float(np.max(np.abs(value), initial=0.0)) for name, value in self.start.items()}
+        return {name: size for name, size in sizes.items() if size > 0}
+
+    @cached_property
+    def entry_sizes(self) -> Array:
+        """The usual size of every entry; one where a leaf vanishes at the start."""
+        return np.concatenate([np.full(np.size(value), self.usual_sizes.get(name, 1.0))
+                               for name, value in self.start.items()])
+
+    @cached_property
+    def variables(self) -> dict[str, cp.Variable]:
+        """One CVXPY variable a leaf, made when a constraint or a conic solver asks."""
+        return {name: cp.Variable(np.shape(value), name=name, symmetric=name in self.symmetric)
+                for name, value in self.start.items()}
+
+    def assign(self, y: Values) -> None:
+        """Write values into the variables, also a point just outside what a variable allows."""
+        for name, variable in self.variables.items():
+            variable.save_value(np.asarray(y[name], dtype=float))
+
+    def vector(self, y: Values) -> Array:
+        """Return values one after another."""
+        return np.concatenate([flat(y[name]) for name in self.start])
+
+
+def slices_of(values: Values) -> dict[str, slice]:
+    """Return where every value is among all, one after another."""
+    edges = np.cumsum([0, *(np.size(value) for value in values.values())]).tolist()
+    return {name: slice(a, b) for name, a, b in zip(values, edges, edges[1:])}

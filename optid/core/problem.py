@@ -1,0 +1,187 @@
+"""A problem: unknowns with a start, terms of the objective, leaves and constraints; values and slopes without CVXPY."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from optid.arrays import Array
+from optid.core.constraint import Constraint, ConstraintReader
+from optid.core.leaves import Leaf, LeafSpace, Product, slices_of
+from optid.core.terms import Errors, Squares, Term, Values, flat
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Minimise the sum of terms over the unknowns, under the constraints of builders.
+
+    Attributes:
+        name: of the formulation, or of its step.
+        start: value of every unknown: its shape, its usual size, and where to begin; never zero in a product.
+        terms: of the objective.
+        leaves: what else terms and constraints speak about.
+        model: values of the unknowns -> model.
+        facts: keyword arguments of the `View` that builders get: channels, bases, outputs, units, reference, ....
+        further: (variables of the leaves, values of the unknowns) -> more expressions for it, such as Q = A P.
+        builders: of the constraints.
+        scale: objective of the zero model, the yardstick of gaps.
+        unit: what one unit of the objective is in units of the record.
+        energy: of the outputs about their mean in units of the record, to which prices are relative.
+        compressed: the compressed record, for intervals and figures.
+        structural: names of constraints that belong to the formulation, and have no price.
+        symmetric: unknowns that are symmetric matrices.
+    """
+
+    name: str
+    start: Values
+    terms: tuple[Term, ...]
+    leaves: tuple[Leaf, ...] = ()
+    model: Callable[[Values], Any] = dict
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    further: Callable[[Mapping[str, cp.Variable], Values], Mapping[str, cp.Expression]] | None = None
+    builders: tuple[Any, ...] = ()
+    scale: float = 1.0
+    unit: float = 1.0
+    energy: float = float("nan")
+    compressed: Any = field(default=None, repr=False)
+    structural: frozenset[str] = frozenset()
+    symmetric: frozenset[str] = frozenset()
+
+    def subject_to(self, *builders: Any) -> "Problem":
+        """Return the problem with further constraints, which are read when they are first needed."""
+        return replace(self, builders=(*self.builders, *builders))
+
+    def without(self, *names: str) -> "Problem":
+        """Return the problem without the builders of named constraints."""
+        dropped = {one.builder for one in self.constraints() if one.name in names}
+        return replace(self, builders=tuple(b for k, b in enumerate(self.builders) if k not in dropped))
+
+    # -- what it is made of
+
+    @cached_property
+    def products(self) -> tuple[Product, ...]:
+        """The products among the leaves."""
+        return tuple(leaf for leaf in self.leaves if isinstance(leaf, Product))
+
+    @cached_property
+    def bilinear_terms(self) -> tuple[Squares, ...]:
+        """The squares in which a product stands."""
+        names = {product.name for product in self.products}
+        return tuple(term for term in self.terms if isinstance(term, Squares) and names & set(term.z))
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether all terms are convex in the unknowns."""
+        return not self.bilinear_terms and not any(isinstance(term, Errors) for term in self.terms)
+
+    # -- layout
+
+    @cached_property
+    def slices(self) -> dict[str, slice]:
+        """Where every unknown is in the vector of all."""
+        return slices_of(self.start)
+
+    @cached_property
+    def space(self) -> LeafSpace:
+        """The leaves, the unknowns first."""
+        return LeafSpace(self.leaf_values(self.start), self.symmetric)
+
+    @cached_property
+    def size(self) -> int:
+        """Number of scalar unknowns."""
+        return sum(np.size(value) for value in self.start.values())
+
+    def pack(self, x: Values) -> Array:
+        """Return the values of the unknowns as one vector."""
+        return np.concatenate([flat(x[name]) for name in self.start]).astype(float)
+
+    def unpack(self, vector: Array) -> dict[str, Array]:
+        """Return the unknowns of a vector in their shapes."""
+        return {name: vector[place].reshape(np.shape(self.start[name]), order="F")
+                for name, place in self.slices.items()}
+
+    def leaf_values(self, x: Values) -> dict[str, Array]:
+        """Return the values of all leaves at a point."""
+        return {**{name: x[name] for name in self.start}, **{leaf.name: leaf.value(x) for leaf in self.leaves}}
+
+    def in_gauge(self, x: Values) -> dict[str, Array]:
+        """Return the point with every product in its gauge."""
+        found = dict(x)
+        for product in self.products:
+            found = product.in_gauge(found)
+        return found
+
+    # -- values and slopes
+
+    def value(self, x: Values) -> float:
+        """Return the objective, in the units of the problem."""
+        y = self.leaf_values(x)
+        return float(sum(term.value(y) for term in self.terms))
+
+    def pull(self, x: Values) -> tuple[float, Array, Array]:
+        """Return the objective, the gradient of its smooth terms, and the magnitudes that it is a sum of."""
+        y, sizes = self.leaf_values(x), {name: np.abs(value) for name, value in x.items()}
+        value, gradient, magnitudes = 0.0, np.zeros(self.size), np.zeros(self.size)
+        for term in self.terms:
+            if hasattr(term, "pull"):
+                one = term.pull(y)  # type: ignore[union-attr]
+                value += one.value
+                gradient += self.chain(one.gradient, x)
+                magnitudes += self.chain(one.magnitudes, sizes)
+            else:
+                value += term.value(y)
+        return value, gradient, magnitudes
+
+    def chain(self, pulls: Mapping[str, Array], x: Values) -> Array:
+        """Return the gradient by the unknowns of a quantity with these gradients by leaves."""
+        found = np.zeros(self.size)
+        for name, pull in pulls.items():
+            if name in self.slices:
+                found[self.slices[name]] += pull
+        for leaf in self.leaves:
+            if leaf.name in pulls:
+                for name, part in leaf.chain(pulls[leaf.name], x).items():
+                    found[self.slices[name]] += part
+        return found
+
+    def slope(self, x: Values) -> Array:
+        """Return the derivative (leaves, unknowns) of all leaves."""
+        found = np.zeros((self.space.size, self.size))
+        for name, place in self.slices.items():
+            found[self.space.places[name], place] = np.eye(place.stop - place.start)
+        for leaf in self.leaves:
+            for name, part in leaf.slope(x).items():
+                found[self.space.places[leaf.name], self.slices[name]] = part
+        return found
+
+    # -- constraints
+
+    def _read(self, x: Values, only: set[int] | None = None) -> list[Constraint]:
+        further = {} if self.further is None else self.further(self.space.variables, x)
+        reader = ConstraintReader(self.name, self.space, self.facts, self.is_convex)
+        return reader.read(self.builders, x, further, only)
+
+    @cached_property
+    def _at_start(self) -> tuple[Constraint, ...]:
+        return tuple(self._read(self.start)) if self.builders else ()
+
+    def constraints(self, x: Values | None = None) -> tuple[Constraint, ...]:
+        """Return the constraints: as read at the start, or with those that move read at a point."""
+        moving = {one.builder for one in self._at_start if one.moving}
+        if x is None or not moving:
+            return self._at_start
+        kept = (one for one in self._at_start if one.builder not in moving)
+        return tuple(sorted([*kept, *self._read(x, moving)], key=lambda one: one.builder))
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """Names of the constraints of the user."""
+        return tuple(name for name in dict.fromkeys(one.name for one in self._at_start) if name not in self.structural)
+
+    def violation(self, x: Values, constraints: tuple[Constraint, ...] | None = None) -> float:
+        """Return the sum of the violations at a point, of rows divided by their sizes."""
+        held, y = self.constraints(x) if constraints is None else constraints, self.leaf_values(x)
+        return sum(one.violation(self.space, y) for one in held)

@@ -1,0 +1,225 @@
+"""Terms of an objective, as data. A term implements what it can, and solvers match on that.
+
+Terms speak about named quantities, *leaves*: the unknowns of a problem, or what they determine (`optid.core.leaves`).
+Values of leaves are arrays by name; a flat one runs column by column.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import cvxpy as cp
+import numpy as np
+
+from optid.arrays import Array
+from optid.structures.rank_one import RankOne
+
+Values = Mapping[str, Array]
+TINY = float(np.finfo(float).tiny)
+RANK = 1e-7  # singular value, relative to the largest, beneath which a matrix has lost rank
+EMPTY = 1e-9  # length of a row, relative to the longest, beneath which it is zero
+
+
+def flat(value: Any) -> Array:
+    """Return an array in one dimension, column by column."""
+    return np.ravel(value, order="F")
+
+
+class Pull(NamedTuple):
+    """Value of a smooth term, its gradient by every leaf (flat), and the magnitudes that the gradient is a sum of."""
+
+    value: float
+    gradient: dict[str, Array]
+    magnitudes: dict[str, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Squares:
+    """``‖root z - target‖² + remainder``, z the leaves one after another.
+
+    Attributes:
+        root: (k, n).
+        target: (k,).
+        remainder: what no leaf changes.
+        z: names of the leaves.
+        lifted: the same numbers with their rank-one blocks, factorised once, where there are some.
+    """
+
+    root: Array
+    target: Array
+    remainder: float
+    z: tuple[str, ...]
+    lifted: RankOne | None = field(default=None, repr=False)
+
+    @classmethod
+    def of(cls, lifted: RankOne, z: tuple[str, ...]) -> "Squares":
+        """Return the squares of a compressed record."""
+        return cls(lifted.root, lifted.target, lifted.remainder, z, lifted)
+
+    def residual(self, y: Values) -> Array:
+        """Return ``root z - target`` (k,)."""
+        return self.root @ stack(y, self.z) - self.target
+
+    def value(self, y: Values) -> float:
+        """Return the value at values of the leaves."""
+        r = self.residual(y)
+        return float(r @ r) + self.remainder
+
+    def pull(self, y: Values) -> Pull:
+        """Return value and gradient."""
+        r = self.residual(y)
+        return Pull(float(r @ r) + self.remainder, split(2 * r @ self.root, y, self.z),
+                    split(2 * np.abs(r) @ np.abs(self.root), y, self.z))
+
+    def tangent(self, y: Values) -> "Squares":
+        """Return the term itself: it is least squares already."""
+        return self
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the term in CVXPY expressions of the leaves."""
+        return cp.sum_squares(self.root @ stacked_expression(v, self.z) - self.target) + self.remainder
+
+
+@dataclass(frozen=True, eq=False)
+class Length:
+    """``‖root z - target‖``, the length itself: the square of a tiny one would vanish in a solver's tolerance."""
+
+    root: Array
+    target: Array
+    z: tuple[str, ...]
+
+    def value(self, y: Values) -> float:
+        """Return the value at values of the leaves."""
+        return float(np.linalg.norm(self.root @ stack(y, self.z) - self.target))
+
+    def pull(self, y: Values) -> Pull:
+        """Return value and gradient; zero where the length vanishes."""
+        squares = Squares(self.root, self.target, 0.0, self.z).pull(y)
+        size = float(np.sqrt(squares.value))
+        return Pull(size, {name: g / (2 * max(size, TINY)) for name, g in squares.gradient.items()},
+                    {name: g / (2 * max(size, TINY)) for name, g in squares.magnitudes.items()})
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the term in CVXPY expressions of the leaves."""
+        return cp.norm(self.root @ stacked_expression(v, self.z) - self.target)
+
+
+@dataclass(frozen=True, eq=False)
+class Inner:
+    """``sum of weights · leaf``, linear."""
+
+    weights: Mapping[str, Array]
+
+    def value(self, y: Values) -> float:
+        """Return the value at values of the leaves."""
+        return float(sum(flat(weights) @ flat(y[name]) for name, weights in self.weights.items()))
+
+    def pull(self, y: Values) -> Pull:
+        """Return value and gradient."""
+        weights = {name: flat(one).astype(float) for name, one in self.weights.items()}
+        return Pull(self.value(y), weights, {name: np.abs(one) for name, one in weights.items()})
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the term in CVXPY expressions of the leaves."""
+        return sum((cp.sum(cp.multiply(weights, v[name])) for name, weights in self.weights.items()), cp.Constant(0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class NuclearNorms:
+    """``sum of weight ‖leaf‖_*``: kinks where a leaf loses rank."""
+
+    weights: Mapping[str, float]
+
+    def value(self, y: Values) -> float:
+        """Return the value at values of the leaves."""
+        return float(sum(t * np.sum(np.linalg.svd(y[name], compute_uv=False)) for name, t in self.weights.items()))
+
+    def nearest(self, name: str, value: Array, pull: Array) -> Array:
+        """Return the subgradient at a value of a leaf that is nearest to minus a pull, both in the leaf's shape."""
+        weight = self.weights[name]
+        u, s, vt = np.linalg.svd(value, full_matrices=False)
+        rank = int(np.sum(s > RANK * max(float(s[0]), TINY)))
+        u, vt = u[:, :rank], vt[:rank]
+        rest = -pull - u @ (u.T @ -pull)
+        rest = rest - rest @ vt.T @ vt
+        left, size, right = np.linalg.svd(rest, full_matrices=False)
+        return weight * u @ vt + (left * np.minimum(size, weight)) @ right
+
+    def excess(self, name: str, part: Array) -> float:
+        """Return how often a dual part in the leaf's shape exceeds the ball of the dual norm."""
+        return float(np.linalg.norm(part, 2)) / max(self.weights[name], TINY)
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the term in CVXPY expressions of the leaves."""
+        return sum((t * cp.normNuc(v[name]) for name, t in self.weights.items()), cp.Constant(0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class GroupNorms:
+    """``sum of weight ‖row‖`` over the rows of leaves: kinks where a row vanishes."""
+
+    weights: Mapping[str, Array]  # of every row
+
+    def value(self, y: Values) -> float:
+        """Return the value at values of the leaves."""
+        return float(sum(np.sum(t * np.linalg.norm(y[name], axis=-1)) for name, t in self.weights.items()))
+
+    def nearest(self, name: str, value: Array, pull: Array) -> Array:
+        """Return the subgradient at a value of a leaf that is nearest to minus a pull, both in the leaf's shape."""
+        weight = np.reshape(self.weights[name], (-1, 1))
+        size, most = (np.linalg.norm(x, axis=-1, keepdims=True) for x in (value, pull))
+        inside = -pull * np.minimum(1.0, weight / np.maximum(most, TINY))
+        there = size > EMPTY * max(float(size.max()), TINY)
+        return np.where(there, weight * value / np.maximum(size, TINY), inside)
+
+    def excess(self, name: str, part: Array) -> float:
+        """Return how often a dual part in the leaf's shape exceeds the ball of the dual norm."""
+        return float(np.max(np.linalg.norm(part, axis=-1) / np.maximum(self.weights[name], TINY)))
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the term in CVXPY expressions of the leaves."""
+        return sum((cp.sum(cp.multiply(t, cp.norm(v[name], 2, axis=1))) for name, t in self.weights.items()),
+                   cp.Constant(0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Squared errors of a run of the model, nonlinear in the unknowns.
+
+    Attributes:
+        linearise: values of the unknowns -> the `Squares` of the errors to first order in them.
+        measure: values of the unknowns -> sum of squares, infinite where the run is not admissible.
+    """
+
+    linearise: Callable[[Values], Squares]
+    measure: Callable[[Values], float]
+
+    def value(self, y: Values) -> float:
+        """Return the value at values of the leaves."""
+        return self.measure(y)
+
+    def pull(self, y: Values) -> Pull:
+        """Return value and gradient."""
+        return self.linearise(y).pull(y)
+
+    def tangent(self, y: Values) -> Squares:
+        """Return the errors to first order about a point."""
+        return self.linearise(y)
+
+
+Term = Squares | Length | Inner | NuclearNorms | GroupNorms | Errors
+
+
+def stack(y: Values, names: tuple[str, ...]) -> Array:
+    """Return named leaves one after another."""
+    return np.concatenate([flat(y[name]) for name in names])
+
+
+def split(vector: Array, y: Values, names: tuple[str, ...]) -> dict[str, Array]:
+    """Return the parts of a vector that belong to leaves one after another."""
+    return dict(zip(names, np.split(vector, np.cumsum([np.size(y[name]) for name in names])[:-1])))
+
+
+def stacked_expression(v: Mapping[str, cp.Expression], names: tuple[str, ...]) -> cp.Expression:
+    """Return expressions of named leaves one after another."""
+    return cp.hstack([cp.vec(v[name], order="F") for name in names])
