@@ -169,7 +169,7 @@ def test_the_rows_of_a_word_are_those_of_its_programme(word):
                 np.testing.assert_allclose(
                     one.residual(problem.space, y) * one.sizes,
                     np.ravel(np.asarray(member.expr.value), order="F") * limit.sizes, atol=1e-9)
-        expected = by_differences(lambda z: sum(
+        expected = by_differences(lambda z, held=held: sum(
             float(np.arange(1, len(one) + 1) @ one.residual(problem.space, problem.leaf_values(z))) for one in held), x)
         slope = problem.slope(x)
         found = sum(np.arange(1, len(one) + 1) @ one.slope(problem.space, problem.leaf_values(x)) @ slope

@@ -355,3 +355,50 @@ def test_alignment_only_flips_signs(plain):
     np.testing.assert_array_equal(aligned(turned, m).b[0], m.b[0])
     np.testing.assert_array_equal(aligned(turned, m).nonlinearities[0].mu, m.nonlinearities[0].mu)
     assert aligned(m, m) is m
+
+
+def determined(fit):
+    """The part of the verdict about the standard error of the step response."""
+    return next(part for part in fit.verdict.parts if part.name == "standard error of the step response")
+
+
+@pytest.mark.parametrize("poles", [(0.9,), (0.92, 0.9, 0.88, 0.86)])
+def test_errors_within_reach_are_those_of_refits_also_where_poles_and_zeros_all_but_cancel(poles):
+    a = np.real(np.poly(poles))
+    points = np.arange(0, 150, 3)
+    u = np.repeat(np.random.default_rng(77).choice([0.0, 1.0, 2.0], 30), 20)
+    clean = lfilter([0.0, 0.0, a.sum()], a, u)
+    truth = lfilter([0.0, 0.0, a.sum()], a, np.ones(150))[points]
+
+    def response(model):
+        return model.step_response(150)[points].ravel()
+
+    deviations, linear, reached = [], [], []
+    for seed in range(6):
+        y = clean + 0.05 * clean.std() * np.random.default_rng(seed).standard_normal(600)
+        fit = optid.fit(optid.Data(u, y), "oe.exact", na=len(poles), nb=2, nk=2, prove=False)
+        known = uncertainty(fit)
+        deviations.append(response(fit.model) - truth)
+        linear.append(float(np.sqrt(np.mean(known.of(response).error ** 2))))
+        reached.append(float(np.sqrt(np.mean(known.source.error_within_reach(response) ** 2))))
+        if len(poles) > 1:
+            assert determined(fit).passed
+    scatter = float(np.sqrt(np.mean(np.square(deviations))))
+    assert 0.4 < np.median(reached) / scatter < 2.5
+    assert (np.median(linear) > 1) == (len(poles) > 1)  # times the static gain
+    if len(poles) == 1:
+        np.testing.assert_allclose(reached, linear, rtol=0.02)
+
+
+def test_a_response_that_the_record_does_not_determine_stays_uncertain():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal(60)
+    y = lfilter([0.0, 0.3], [1, -0.7], u) + 0.5 * rng.standard_normal(60)
+    fit = optid.fit(optid.Data(u, y), "oe.exact", na=1, nb=1, nk=1, prove=False)
+    found = determined(fit)
+    assert not found.passed and float(found.value.removesuffix(" %")) > 12
+
+
+def test_errors_within_reach_need_an_objective():
+    fit = optid.fit(simulated(), "arx", na=2, nb=2, prove=False)
+    assert uncertainty(fit).source.error_within_reach(lambda m: m.a) is None

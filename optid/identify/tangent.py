@@ -29,6 +29,8 @@ from optid.structures.whitening import symmetric_root
 NO_EFFECT = 1e-10
 """Size of an effect on the predictions, relative to the largest, below which a direction counts as undetermined."""
 STEP = 1e-5  # step of the central differences, relative to the size of the parameter
+BENT, HALVINGS = 2.0, 20  # rise of the objective, over the linear one, to which a move is halved; halvings at most
+LEADING, MINOR = 4, 0.1  # directions that are followed, at most; effect of the others, relative to the largest
 MEANINGS = {
     "gaussian": "confidence intervals of least squares, Student's quantile",
     "projected": "confidence intervals under inequalities: hull of projected posterior and basic bootstrap",
@@ -51,6 +53,8 @@ class Tangent:
     noise: Array  # (l, l) covariance of the equation error e, in raw units
     kind: str  # of the intervals, one of `MEANINGS`
     words: tuple[str, ...] = ()  # what the errors are that white ones of one level are not
+    # objective at values of the variables, where it is not quadratic in what the linear model is linear in
+    objective: Callable[[dict[str, Array]], float] | None = field(default=None, repr=False)
 
     @property
     def meaning(self) -> str:
@@ -59,7 +63,7 @@ class Tangent:
 
     def __getstate__(self) -> dict[str, Any]:
         _ = self.neighbours  # `rebuild`, which holds the programme, is not needed afterwards
-        return {**vars(self), "rebuild": None}
+        return {**vars(self), "rebuild": None, "objective": None}
 
     def limits(self, quantity: Quantity, level: float) -> tuple[Array, Array, Array]:
         """Return (standard error, lower end, upper end) of a quantity, flat and relative to its estimate."""
@@ -74,6 +78,39 @@ class Tangent:
                 raise StructureError("the quantity changes its shape with the model, so it has no derivative")
             columns.append((high - low) / gap)
         return np.column_stack(columns) @ self.directions
+
+    def error_within_reach(self, quantity: Quantity) -> Array | None:
+        """Return standard errors (q,) by moves that raise the objective about as the linear model says.
+
+        Where parameters all but cancel, the linear model takes them far beyond where it holds. Along the directions
+        that change the quantity most they go one standard deviation, or as far as the objective lets them. None where
+        the objective is not known.
+        """
+        if self.objective is None or self.rebuild is None:
+            return None
+        u, s, vt = np.linalg.svd(self.slopes(quantity) @ self.local.scatter, full_matrices=False)
+        leading = int(min(LEADING, np.sum(s > MINOR * s[0])))
+        squares = np.sum((u[:, leading:] * s[leading:]) ** 2, axis=1)
+        before = self.objective(_unpacked(self.shapes, self.x))
+        here = np.ravel(np.asarray(quantity(self.rebuild(_unpacked(self.shapes, self.x))), dtype=float))
+        for turn in vt[:leading]:
+            move = self.local.scatter @ turn
+            ends = [self._moved(quantity, here, sign * self.directions @ move, before + BENT * float(move @ move))
+                    for sign in (1.0, -1.0)]
+            squares = squares + np.mean(np.square(ends), axis=0)
+        return np.sqrt(squares)
+
+    def _moved(self, quantity: Quantity, here: Array, step: Array, most: float) -> Array:
+        """Return the change of a quantity by a step, halved until the objective is at most so large."""
+        assert self.objective is not None
+        for k in range(HALVINGS):
+            values = _unpacked(self.shapes, self.x + step / 2**k)
+            with suppress(StructureError), np.errstate(all="ignore"):
+                if self.objective(values) <= most:
+                    there = np.ravel(np.asarray(quantity(self.rebuild(values)), dtype=float))
+                    if np.all(np.isfinite(there)):
+                        return there - here
+        return np.zeros_like(here)
 
     @cached_property
     def neighbours(self) -> list[tuple[Any, Any, float]]:
@@ -131,8 +168,11 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     kind = "penalised" if spread.penalised else "projected" if local.held else "gaussian"
     transform = getattr(fit.data, "transform", None)
     scale = np.ones(len(spread.noise)) if transform is None else np.array(transform.y_scale)
+    criterion = getattr(compressed, "criterion", None)
+    objective = None if criterion is None else lambda values: (
+        criterion.value(z) if criterion.admissible(z := compressed.lifted(values)) else np.inf)
     return Tangent(rebuild, shapes, x, directions, local, program.unit * spread.noise * np.outer(scale, scale),
-                   kind, spread.words)
+                   kind, spread.words, objective)
 
 
 def _unpacked(shapes: dict[str, tuple[int, ...]], x: Array) -> dict[str, Array]:

@@ -201,11 +201,18 @@ def _uncertain(model: Any, data: Data, known: Any, told: Informativity) -> list[
         return []
     shape = (points.size, data.l, data.m)
     size = np.abs(found.value).reshape(shape).max(axis=0)
-    error = np.sqrt(np.mean(found.error.reshape(shape) ** 2, axis=0))
     idle = [told.without_effect(c) for c in range(data.m)]
     size = np.where(idle, size.max(axis=1, keepdims=True), size)
-    with np.errstate(all="ignore"):
-        share = float(np.nanmax(np.where(size > 0, error / size, np.nan), initial=0.0))
+
+    def share_of(errors: Array) -> float:
+        error = np.sqrt(np.mean(errors.reshape(shape) ** 2, axis=0))
+        with np.errstate(all="ignore"):
+            return float(np.nanmax(np.where(size > 0, error / size, np.nan), initial=0.0))
+
+    share = share_of(found.error)
+    if share > UNCERTAIN and hasattr(known.source, "error_within_reach"):  # the linear model may not hold so far
+        reached = known.source.error_within_reach(response)
+        share = share if reached is None else min(share, share_of(reached))
     return [Finding("standard error of the step response", f"{100 * share:.2g} %", share <= UNCERTAIN)]
 
 

@@ -1,0 +1,246 @@
+"""Our own measurements at a point that a solver returned: what it says of the point is a claim, these numbers decide.
+
+The multipliers of a solver count where they make the point stationary; where they do not, or are missing, those count
+that come nearest to it: non-negative least squares over the active rows. The gauge of a product has the multiplier that
+follows from the objective not depending on the scale between its factors.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.core.constraint import Constraint, symmetric_part
+from optid.core.leaves import LeafSpace
+from optid.core.problem import Problem
+from optid.core.terms import GroupNorms, NuclearNorms, Values, flat
+from optid.program.judging import term_size
+from optid.program.prices import ACTIVE
+from optid.program.solution import Residuals
+from optid.program.structure import relative_gradient, variable_size
+from optid.structures.multipliers import fit_multipliers
+
+UNCONFIRMED = 1e-7  # stationarity above which multipliers fitted to the point are tried as well
+ANGLES = 24  # directions in a plane of null vectors of a matrix constraint
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """A point as we measured it.
+
+    Attributes:
+        objective: its value, in units of the problem.
+        residuals: violation, stationarity, complementarity.
+        duals: the multipliers that these rest on, flat by name of the constraint; of rows divided by their sizes.
+        fitted: whether they are ours.
+    """
+
+    objective: float
+    residuals: Residuals
+    duals: dict[str, Array]
+    fitted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """A constraint at a point: residual g (m,), its slope (m, unknowns), and the size of what it adds up."""
+
+    constraint: Constraint
+    residual: Array
+    slope: Array
+    size: float
+
+    @property
+    def excess(self) -> float:
+        """How far it is violated, relative to its size."""
+        g, cone = self.residual, self.constraint.cone
+        if cone == "psd":
+            amount = max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
+        else:
+            amount = float(np.max(np.abs(g) if cone == "zero" else np.maximum(g, 0.0), initial=0.0))
+        # a row is measured in its own units, as is the size of its terms
+        return amount / self.size
+
+    def gradients(self) -> tuple[Array, Array]:
+        """Return the slopes of what is active, and the multipliers that one unit of each stands for."""
+        g, m = self.residual, len(self.constraint)
+        if self.constraint.cone == "psd":
+            values, vectors = np.linalg.eigh(-symmetric_part(g))
+            null = vectors[:, values < ACTIVE * self.size]
+            parts = [flat(np.outer(null @ turn, null @ turn)) for turn in _directions(null.shape[1])]
+            weights = np.array(parts).reshape(-1, m)
+            return weights @ self.slope, weights
+        active = np.flatnonzero((g > -ACTIVE * self.size) | (self.constraint.cone == "zero"))
+        return self.slope[active], np.eye(m)[active]
+
+
+def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
+    """Measure a point of a problem, with flat multipliers by constraint, of which some may be missing or wrong.
+
+    A point with numbers that are not finite is infinitely far from everything.
+    """
+    if not all(np.all(np.isfinite(x[name])) for name in problem.start):
+        return Judgement(np.nan, Residuals(np.inf, "", np.inf, np.inf), {}, False)
+    y, slope = problem.leaf_values(x), None
+    rows = []
+    for one in problem.constraints(x):
+        slope = problem.slope(x) if slope is None else slope
+        rows.append(Row(one, one.residual(problem.space, y), one.slope(problem.space, y) @ slope,
+                        size_of_terms(one, problem.space, y)))
+    violation, worst = 0.0, ""
+    for product in problem.products:
+        level, parts = product.level(x)
+        amount = abs(level) / (1.0 + sum(float(np.sum(np.abs(flat(x[name])))) for name in parts))
+        if not amount <= violation:  # also true for nan
+            violation, worst = amount, "gauge"
+    for row in rows:
+        if not row.excess <= violation:
+            violation, worst = row.excess, row.constraint.name
+
+    lagrangian = Lagrangian.of(problem, x)
+    given = _projected(rows, duals)
+    best, fitted = (np.inf, np.inf) if given is None else lagrangian.measure(rows, given), False
+    if rows and not best[0] <= UNCONFIRMED and (own := _fitted(problem, x, rows, lagrangian)) is not None:
+        again = lagrangian.measure(rows, own)
+        if not again[0] >= best[0]:
+            given, best, fitted = own, again, True
+    named: dict[str, list[Array]] = {}
+    for row, part in zip(rows, given or ()):
+        named.setdefault(row.constraint.name, []).append(part)
+    return Judgement(lagrangian.value, Residuals(violation if np.isfinite(violation) else np.inf, worst, *best),
+                     {name: np.concatenate(parts) for name, parts in named.items()}, fitted)
+
+
+def size_of_terms(one: Constraint, space: LeafSpace, y: Values) -> float:
+    """Return the size of what the rows of a constraint add up, in units of the rows; one where they are empty.
+
+    Every leaf counts with its largest entry, but not below its usual size: where it vanishes only rounding is left.
+    """
+    if one.cone == "other":
+        space.assign(y)
+        return term_size(one.limit.member)
+    total = np.abs(one.right)
+    for name, place in space.places.items():
+        part = np.abs(one.rows[:, place])
+        if part.any():
+            largest = float(np.max(np.abs(y[name]), initial=0.0))
+            total = total + part.sum(axis=1) * max(largest, space.usual_sizes.get(name, 0.0))
+    return float(np.max(total, initial=0.0)) or 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lagrangian:
+    """Objective, its gradient by the unknowns and the magnitudes it is a sum of, to which constraints are added."""
+
+    problem: Problem
+    x: Values
+    value: float
+    gradient: Array
+    magnitudes: Array
+
+    @classmethod
+    def of(cls, problem: Problem, x: Values) -> "Lagrangian":
+        """Return that of the objective alone."""
+        return cls(problem, x, *problem.pull(x))
+
+    @property
+    def yardstick(self) -> float:
+        """The objective, or that of the zero model where it is larger."""
+        return max(abs(self.value), self.problem.scale)
+
+    def measure(self, rows: Sequence[Row], duals: Sequence[Array]) -> tuple[float, float]:
+        """Return stationarity and complementarity with multipliers of the rows."""
+        problem, total, terms, products = self.problem, self.gradient.copy(), self.magnitudes.copy(), 0.0
+        for row, dual in zip(rows, duals):
+            total += dual @ row.slope
+            terms += np.abs(dual) @ np.abs(row.slope)
+            if row.constraint.cone == "psd":  # in this cone only the sum of the products vanishes
+                products += abs(float(dual @ row.residual))
+            elif row.constraint.cone != "zero":
+                products += float(np.sum(np.abs(dual * row.residual)))
+        for gauge, along in gauges(problem, self.x):
+            rate = float(gauge @ along)
+            weight = -float(total @ along) / rate if rate else 0.0
+            total += weight * gauge
+            terms += abs(weight) * np.abs(gauge)
+        worst = 0.0
+        for name, place in problem.slices.items():
+            part, effort = self._free_part(name, total[place], terms[place])
+            size = variable_size(self.x[name], problem.space.usual_sizes.get(name))
+            here = relative_gradient(np.abs(part), effort, self.yardstick, size)
+            if not here <= worst:
+                worst = here
+        # relative to a hundredth of the zero model's objective where the objective vanishes
+        return worst, products / max(abs(self.value), 1e-2 * problem.scale, np.finfo(float).tiny)
+
+    def _free_part(self, name: str, part: Array, terms: Array) -> tuple[Array, Array]:
+        """Return the gradient by an unknown with the nearest subgradient of terms with kinks, and its magnitudes."""
+        shape = np.shape(self.x[name])
+        if name in self.problem.symmetric:
+            part = flat((part.reshape(shape, order="F") + part.reshape(shape, order="F").T) / 2)
+        for term in self.problem.terms:
+            if isinstance(term, NuclearNorms | GroupNorms) and name in term.weights:
+                nearest = flat(term.nearest(name, self.x[name], part.reshape(shape, order="F")))
+                part, terms = part + nearest, terms + np.abs(nearest)
+        return part, terms
+
+
+def gauges(problem: Problem, x: Values) -> list[tuple[Array, Array]]:
+    """Return the slope of every gauge by the unknowns, and the direction in which the scale of its product changes."""
+    found = []
+    for product in problem.products:
+        slope, along = np.zeros(problem.size), np.zeros(problem.size)
+        for name, part in product.level(x)[1].items():
+            slope[problem.slices[name]] = part
+        along[problem.slices[product.mu]] = flat(x[product.mu])
+        along[problem.slices[product.b]] = -flat(x[product.b])
+        found.append((slope, along))
+    return found
+
+
+def _projected(rows: Sequence[Row], duals: Mapping[str, Array]) -> list[Array] | None:
+    """Return the multipliers of a solver on the dual cones; None where one is missing or not finite."""
+    found, taken = [], {}
+    for row in rows:
+        name, m = row.constraint.name, len(row.constraint)
+        start = taken.get(name, 0)
+        taken[name] = start + m
+        part = np.ravel(np.asarray(duals.get(name, ()), dtype=float))[start : start + m]
+        if part.size != m or not np.all(np.isfinite(part)):
+            return None
+        if row.constraint.cone == "psd":
+            values, vectors = np.linalg.eigh(symmetric_part(part))
+            part = flat((vectors * np.maximum(values, 0.0)) @ vectors.T)
+        found.append(part if row.constraint.cone in ("zero", "psd") else np.maximum(part, 0.0))
+    return found
+
+
+def _fitted(problem: Problem, x: Values, rows: Sequence[Row], lagrangian: Lagrangian) -> list[Array] | None:
+    """Return the multipliers that leave least of the gradient; None where the iterations do not suffice."""
+    units = np.ones(problem.size)
+    for name, place in problem.slices.items():
+        units[place] = variable_size(x[name], problem.space.usual_sizes.get(name))
+    held = [gauge[None] for gauge, _ in gauges(problem, x)]
+    parts = [row.gradients() for row in rows]
+    slopes = np.vstack([np.zeros((0, problem.size)), *held, *(slope for slope, _ in parts)])
+    equal = np.concatenate([np.ones(len(held), dtype=bool), *(
+        np.full(len(slope), row.constraint.cone == "zero") for row, (slope, _) in zip(rows, parts))])
+    try:
+        weights, _ = fit_multipliers(slopes * units, -lagrangian.gradient * units, equal)
+    except RuntimeError:
+        return None
+    counts = np.cumsum([len(held), *(len(slope) for slope, _ in parts)])
+    return [weights[a:b] @ stands for a, b, (_, stands) in zip(counts, counts[1:], parts)]
+
+
+def _directions(count: int) -> Array:
+    """Return unit vectors of a null space: a fine fan in a plane, axes and diagonals in more dimensions."""
+    if count <= 1:
+        return np.eye(count)
+    if count == 2:
+        angle = np.pi * np.arange(ANGLES) / ANGLES
+        return np.column_stack([np.cos(angle), np.sin(angle)])
+    axes = np.eye(count)
+    diagonals = [(axes[i] + sign * axes[j]) / np.sqrt(2) for i in range(count) for j in range(i) for sign in (1, -1)]
+    return np.vstack([axes, *diagonals])
