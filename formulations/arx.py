@@ -17,10 +17,9 @@ from optid.program.program import Program
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 
-LEAST_SQUARES = steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 
 
-@LEAST_SQUARES
+@steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
         constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none",
         offset: bool | str = True) -> Program | Procedure:
@@ -49,7 +48,7 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
                           na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge, prior=prior, offset=offset)
 
 
-@LEAST_SQUARES
+@steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence[int] = 0, prior: str = "dc",
         constraints: Sequence[Any] = (), offset: bool | str = True) -> Program | Procedure:
     """Minimise ``‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.

@@ -13,7 +13,7 @@ from typing import Any
 
 _AS_IN = re.compile(r"[Aa]s in `(\w+)`")
 _SHARED = re.compile(r"[Aa]rguments as in\s+`(?:([\w.]+)\.)?(\w+)`")
-_TRANSPARENT = {"recorded"}  # decorators that keep signature and docstring
+_TRANSPARENT = {"recorded", "steps", "subspace_steps"}  # decorators that keep signature and docstring
 _NAMED = re.compile(r"Named variables: ([^.]*)\.")
 
 
@@ -69,7 +69,8 @@ def _in_source(module: str, name: str) -> Description | None:
     """Read a function from the source of its module; None where it is not there, or a decorator may change it."""
     functions = _functions(module)
     node = functions.get(name)
-    if node is None or {ast.unparse(d) for d in node.decorator_list} - _TRANSPARENT:
+    decorators = [] if node is None else [d.func if isinstance(d, ast.Call) else d for d in node.decorator_list]
+    if node is None or {ast.unparse(d) for d in decorators} - _TRANSPARENT:
         return None
     given = node.args
     plain = [*given.posonlyargs, *given.args]

@@ -137,7 +137,7 @@ def test_an_inner_solver_of_one_s_choice():
 
 
 def test_it_refuses_what_is_not_rank_one():
-    with pytest.raises(optid.errors.StructureError, match="gauss_newton solves rank-one"):
+    with pytest.raises(optid.errors.StructureError, match="'gauss_newton' does not take the step 'arx'"):
         optid.fit(record(), "arx", na=1, nb=1, solver="gauss_newton")
 
 

@@ -146,7 +146,7 @@ def test_refusals():
     data = plain((200,))
     with pytest.raises(StructureError, match="30000 samples.*up to 20000.*hammerstein_oe.exact"):
         quiet(Data(np.tile(data.u, (150, 1)), np.tile(data.y, (150, 1))), shooting.exact, **ORDERS)
-    refuses(StructureError, "not convex in", quiet, data, shooting.exact, solver="clarabel", **ORDERS)
+    refuses(StructureError, "is not convex and is taken by", quiet, data, shooting.exact, solver="clarabel", **ORDERS)
     refuses(StructureError, "gauge=.*use one of norm", quiet, data, shooting.exact, gauge="none", **ORDERS)
     refuses(StructureError, "one output", quiet, Data(data.u, np.hstack([data.y, data.y**2])), shooting.exact, **ORDERS)
     refuses(StructureError, "na .the number of poles.", quiet, data, shooting.exact, **ORDERS | {"na": -1})

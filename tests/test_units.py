@@ -54,7 +54,7 @@ LOOSE = {
     "subspace.nuclear": ("subspace.nuclear", STATES | {"weight": 30.0}, None),
     "poles": ("hammerstein_ss.sid", STATES | CUBIC, poles),
 }
-WEIGHED = ("ss.exact", "ss.shooting")  # errors in units of their own variances
+WEIGHED = ("ss.exact", "ss.shooting", "subspace.nuclear")  # errors in units of their own variances, or of the outputs
 
 
 def record(seed=0, count=200, noise=0.3):

@@ -10,9 +10,12 @@ import numpy as np
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.choice import find
+from optid.backends.rank_one_sqp import RankOneSQP, takes
 from optid.backends.step_qp import Coordinates, StepQP
 from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
+from optid.core.judge import gauges
+from optid.core.problem import Problem
 from optid.errors import StructureError
 from optid.models.gauges import gauge_factor
 from optid.program.expressions import flat_value
@@ -47,8 +50,39 @@ def run(program: Program, settings: Settings) -> Answer:
         status, word = (Status.LOCAL, "stationary") if found.converged else (Status.LIMIT, "iteration limit")
         return Answer(status, word, to_values(program, form, found.point),
                       {"residual": -2.0 * r, "gauge": np.zeros(len(form.blocks))}, found.iterations)
-    whole = _Constrained(program, form, settings, str(options.get("inner", "clarabel")))
-    return whole.solve(count, seed, int(options.get("directions", DIRECTIONS)), int(options.get("descents", DESCENTS)))
+    inner, directions = str(options.get("inner", "clarabel")), int(options.get("directions", DIRECTIONS))
+    descents = int(options.get("descents", DESCENTS))
+    if program.core is not None and inner == "clarabel" and takes(program.core):
+        return _in_core(program, _minimum(program, form, count, seed).point, seed, directions, descents)
+    return _Constrained(program, form, settings, inner).solve(count, seed, directions, descents)
+
+
+def _in_core(program: Program, free: Point, seed: int, directions: int, descents: int) -> Answer:
+    """Solve the problem of the core that a programme states, and say it in the programme's words."""
+    problem: Problem = program.core
+
+    def said(duals: Values) -> Values:
+        """Return multipliers of the rows of the programme, which has other sizes of them."""
+        found = {name: np.array(dual) for name, dual in duals.items()}
+        for one in problem.constraints():
+            here = slice(one.first, one.first + len(one))
+            found[one.name][here] *= program.limits[one.name][one.position].sizes / one.sizes
+        return found
+
+    def is_proved(x: Values, duals: Values) -> bool:
+        return program.certify is not None and certify_rank_one(program, x, said(duals), max_size=0)[0].proved
+
+    end = RankOneSQP(problem, program.start, free, is_proved).solve(seed, directions, descents)
+    if not end.x:
+        return Answer(end.status, end.word, iterations=end.steps)
+    (squares,) = problem.bilinear_terms
+    _, total, _ = problem.pull(end.x)
+    slope, y = problem.slope(end.x), problem.leaf_values(end.x)
+    for one in problem.constraints():
+        total = total + end.duals[one.name][one.first : one.first + len(one)] @ one.slope(problem.space, y) @ slope
+    gauge = np.array([-(total @ along) / (held @ along) for held, along in gauges(problem, end.x)])
+    duals = {"residual": -2.0 * squares.residual(y), "gauge": gauge, **said(end.duals)}
+    return Answer(end.status, end.word, end.x, duals, end.steps)
 
 
 def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) -> LocalSolution:

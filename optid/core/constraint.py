@@ -38,6 +38,8 @@ class Constraint:
         right: (m,).
         moving: whether its builder looked at values of an iterate.
         builder: position of its builder.
+        position: of it in its group.
+        first: its first row among those of its group.
     """
 
     name: str
@@ -47,6 +49,8 @@ class Constraint:
     right: Array
     moving: bool
     builder: int
+    position: int = 0
+    first: int = 0
 
     def __len__(self) -> int:
         return len(self.right)
@@ -146,8 +150,12 @@ class ConstraintReader:
             for name, limits in built.items():
                 if any(one.name == name and one.builder != number for one in found):
                     raise StructureError(f"there are two constraints named {name!r}; give each its own name")
-                found += [self._rows(view, name, limit, moving, number)
-                          for limit in limits if limit.member.size]  # a straight line has no curvature
+                first = 0
+                # a straight line has no curvature
+                for position, limit in enumerate(limit for limit in limits if limit.member.size):
+                    one = replace(self._rows(view, name, limit, moving, number), position=position, first=first)
+                    found.append(one)
+                    first += len(one)
         return found
 
     def _rows(self, view: View, name: str, limit: Limit, moving: bool, number: int) -> Constraint:

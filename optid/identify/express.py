@@ -1,5 +1,6 @@
 """A problem of the core as a programme in CVXPY, for the back ends, judgement and proofs of programmes."""
 
+from dataclasses import replace
 from typing import Any
 
 import cvxpy as cp
@@ -34,7 +35,7 @@ def as_program(problem: Problem) -> Program:
                 "view": View({**unknowns, **thetas}, **problem.facts)}
 
     common = {"recover": problem.model, "scale": problem.scale, "unit": problem.unit,
-              "compressed": problem.compressed}
+              "compressed": problem.compressed, "core": replace(problem, builders=())}
     if not products:
         stated = statement()
         return Program(problem.name, **stated, start={}, structural=frozenset({"residual"}),

@@ -72,6 +72,7 @@ class Program:
         step: whether a procedure goes on from its answer and has evidence of its own: no bound is asked for.
         courses: variables besides the derived ones that the structural constraints determine from the others.
         limits: {name of a user constraint: what its members say, before their rows were divided by their size}.
+        core: the problem of the core that it states, None where there is none.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Program:
     courses: frozenset[str] = frozenset()
     settled: bool = False
     step: bool = False
+    core: Any = field(default=None, repr=False)
 
     @classmethod
     def deferred(cls, name: str, statement: Callable[[], Mapping[str, Any]], *, start: Values,
@@ -242,7 +244,8 @@ class Program:
                     constraints[name], limits[name] = zip(*(limit.posed(usual) for limit in group))
                 else:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
-        return replace(self, constraints=constraints, variables=variables, limits=limits)
+        core = None if self.core is None else self.core.subject_to(*builders)
+        return replace(self, constraints=constraints, variables=variables, limits=limits, core=core)
 
     @cached_property
     def usual_sizes(self) -> dict[int, float]:
@@ -285,13 +288,13 @@ class Program:
 
         return replace(self, objective=self.objective.tree_copy(swap), constraints=constraints, variables=left,
                        parameters=parameters, view=view, recover=recover, limits=limits,
-                       structure=None, certify=None,
+                       structure=None, certify=None, core=None,
                        derived={name: e.tree_copy(swap) for name, e in self.derived.items()},
                        start={name: v for name, v in self.start.items() if name in left})
 
     def without(self, *names: str) -> "Program":
         """Return the programme without the named constraints."""
-        return replace(self, constraints={k: g for k, g in self.constraints.items() if k not in names})
+        return replace(self, constraints={k: g for k, g in self.constraints.items() if k not in names}, core=None)
 
     def assign(self, values: Values) -> None:
         """Write values into the CVXPY variables and recompute the derived ones."""
