@@ -18,7 +18,6 @@ from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 
 
-
 @steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
         constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none",

@@ -75,7 +75,8 @@ def _programme(record: EquationError, builders: Sequence[Any], gauge: str) -> Pr
     program = as_program(_problem(record, builders, gauge))
     pairs = tuple(zip(record.keys("mu"), record.keys("b")))
     if gauge == "norm" and signs_are_fixed(program, pairs):
-        return replace(program, recover=partial(program.recover, signed=True), start=_signed_start(program, pairs))
+        return replace(program, recover=partial(_factored_model, record, gauge, True),
+                       start=_signed_start(program, pairs))
     return program
 
 
@@ -88,12 +89,15 @@ def _problem(record: EquationError, builders: Sequence[Any], gauge: str) -> Prob
     z = (*linear, *(one.name for one in products))
     objective = Squares.of(record.problem, z)  # ‖R [a; offset; vec mu bᵀ] - s‖²
 
-    def model(x: Values, signed: bool = False) -> HammersteinTF:
-        return record.model(x, [x[one.mu] for one in products], [x[one.b] for one in products], gauge=gauge,
-                            flip=gauge == "norm" and not signed)
+    return Problem("hammerstein_arx.exact", _start(record, products), (objective,), products,
+                   partial(_factored_model, record, gauge, False), record.facts(gauge), builders=tuple(builders),
+                   **record.common())
 
-    return Problem("hammerstein_arx.exact", _start(record, products), (objective,), products, model,
-                   record.facts(gauge), builders=tuple(builders), **record.common())
+
+def _factored_model(record: EquationError, gauge: str, signed: bool, x: Values) -> HammersteinTF:
+    """Return the model of values; `signed` keeps their signs, else f rises where the output rises."""
+    return record.model(x, [x[name] for name in record.keys("mu")], [x[name] for name in record.keys("b")],
+                        gauge=gauge, flip=gauge == "norm" and not signed)
 
 
 def _start(record: EquationError, products: Sequence[Product]) -> dict[str, np.ndarray]:

@@ -1,6 +1,7 @@
 """The judge of the core: solved points stand, with multipliers that agree with those of programmes; others do not."""
 
 import warnings
+from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
@@ -8,12 +9,15 @@ import pytest
 from test_core import exact_problem, record
 
 from formulations.arx import _problem as arx_problem
+from optid.certificate.multipliers import least_multipliers
 from optid.core.judge import judge
+from optid.core.prices import price_constraints
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
 from optid.errors import DataWarning
 from optid.identify.equation_error import compress
 from optid.identify.express import as_program
+from optid.program.prices import price_constraints as program_prices
 from optid.registry import named_constraint
 from optid.solving.solve import solve
 
@@ -49,6 +53,38 @@ def test_a_solution_is_stationary_and_its_multipliers_are_those_of_the_programme
         if np.linalg.matrix_rank(np.vstack([one.slope(problem.space, {}) @ problem.slope(x)
                                             for one in problem.constraints() if one.name == name])) == len(ours):
             np.testing.assert_allclose(ours, theirs, atol=2e-3 * np.max(np.abs(theirs)) + 1e-6 * found.objective)
+
+
+@pytest.mark.parametrize("words", [*WORDS[1:], ("odd", "range:-0.1,0.15"), ("even", "monotone:increasing")])
+@pytest.mark.parametrize("m", [1, 2])
+def test_prices_are_those_of_the_programme(words, m):
+    named = words if m == 1 else tuple(
+        word if word.startswith(("coefficients", "stable")) else f"{word}{',' if ':' in word else ':'}channel=u1"
+        for word in words)
+    problem = exact_problem(3, named, m)
+    x, solution = solved(problem)
+    program = replace(as_program(problem), core=None)  # its own route, through the expressions of CVXPY
+    theirs = program_prices(program, solution, least_multipliers)
+    judged = judge(problem, x, solution.duals)
+    ours = price_constraints(problem, x, judged.duals, judged.objective)
+    assert [p.name for p in ours] == [p.name for p in theirs] and ours
+    for one, other in zip(ours, theirs):
+        assert (one.active, one.rows, one.words) == (other.active, other.rows, other.words)
+        assert one.slack == pytest.approx(other.slack, abs=1e-9) and one.step == pytest.approx(other.step, rel=1e-9)
+        size = solution.objective / other.step
+        assert one.multiplier == pytest.approx(other.multiplier, rel=2e-3, abs=1e-6 * size)
+        assert one.points_per_step == pytest.approx(other.points_per_step, rel=2e-3, abs=1e-4)
+
+
+def test_degenerate_multipliers_are_priced_by_the_least():
+    def twice(v):
+        return {"one": v["a"][0] <= -1.0, "same": 2 * v["a"][0] <= -2.0, "idle": v["a"][1] >= -50}
+
+    problem = arx_problem(compress(RECORD, na=2, nb=2, nk=1, basis="linear"), (twice,))
+    x, solution = solved(problem)
+    judged = judge(problem, x, solution.duals)
+    prices = {p.name: p.multiplier for p in price_constraints(problem, x, judged.duals, judged.objective)}
+    assert prices["one"] == pytest.approx(0, abs=1e-6 * solution.objective) == prices["same"] == prices["idle"]
 
 
 @pytest.mark.parametrize("words", WORDS[1:5])

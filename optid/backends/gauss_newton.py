@@ -14,7 +14,6 @@ from optid.backends.rank_one_sqp import RankOneSQP, takes
 from optid.backends.step_qp import Coordinates, StepQP
 from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
-from optid.core.judge import gauges
 from optid.core.problem import Problem
 from optid.errors import StructureError
 from optid.models.gauges import gauge_factor
@@ -58,31 +57,16 @@ def run(program: Program, settings: Settings) -> Answer:
 
 
 def _in_core(program: Program, free: Point, seed: int, directions: int, descents: int) -> Answer:
-    """Solve the problem of the core that a programme states, and say it in the programme's words."""
+    """Solve the problem of the core that a programme states."""
     problem: Problem = program.core
 
-    def said(duals: Values) -> Values:
-        """Return multipliers of the rows of the programme, which has other sizes of them."""
-        found = {name: np.array(dual) for name, dual in duals.items()}
-        for one in problem.constraints():
-            here = slice(one.first, one.first + len(one))
-            found[one.name][here] *= program.limits[one.name][one.position].sizes / one.sizes
-        return found
-
     def is_proved(x: Values, duals: Values) -> bool:
-        return program.certify is not None and certify_rank_one(program, x, said(duals), max_size=0)[0].proved
+        return program.certify is not None and certify_rank_one(program, x, duals, max_size=0)[0].proved
 
     end = RankOneSQP(problem, program.start, free, is_proved).solve(seed, directions, descents)
     if not end.x:
         return Answer(end.status, end.word, iterations=end.steps)
-    (squares,) = problem.bilinear_terms
-    _, total, _ = problem.pull(end.x)
-    slope, y = problem.slope(end.x), problem.leaf_values(end.x)
-    for one in problem.constraints():
-        total = total + end.duals[one.name][one.first : one.first + len(one)] @ one.slope(problem.space, y) @ slope
-    gauge = np.array([-(total @ along) / (held @ along) for held, along in gauges(problem, end.x)])
-    duals = {"residual": -2.0 * squares.residual(y), "gauge": gauge, **said(end.duals)}
-    return Answer(end.status, end.word, end.x, duals, end.steps)
+    return Answer(end.status, end.word, end.x, end.duals, end.steps)
 
 
 def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) -> LocalSolution:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
@@ -35,7 +36,7 @@ MOST_SIGNED = 3  # blocks whose signs are all tried
 
 
 @dataclass(frozen=True, eq=False)
-class End:
+class DescentEnd:
     """Where a descent ended: merit, point, flat multipliers by constraint, and why."""
 
     merit: float
@@ -71,7 +72,7 @@ class RankOneSQP:
         self.constraints = tuple(sorted(problem.constraints(), key=lambda one: one.cone != "zero"))
         self.settings = Settings(accuracy=INNER, warm=False)
 
-    def solve(self, seed: int, directions: int, descents: int) -> End:
+    def solve(self, seed: int, directions: int, descents: int) -> DescentEnd:
         """Try directions of b, follow the best ones to their ends, and return the best end."""
         idle = self._idle()
         if idle is not None:
@@ -82,7 +83,7 @@ class RankOneSQP:
             nearest = filter(None, map(self._allowed, points))
             settled = [found for found in map(self._settle, nearest) if found is not None]
         if not settled:
-            return End(np.inf, {}, {}, Status.FAILED, "no start satisfies the constraints", 0)
+            return DescentEnd(np.inf, {}, {}, Status.FAILED, "no start satisfies the constraints", 0)
         settled.sort(key=lambda pair: pair[0])
         distinct: list[dict[str, Array]] = []
         for _, x in settled:
@@ -140,18 +141,18 @@ class RankOneSQP:
             directions = tuple(b / max(float(np.linalg.norm(b)), TINY) for b in point.bs)
             if not any(all(abs(float(d @ e)) > SAME for d, e in zip(directions, kept.bs)) for kept in distinct):
                 distinct.append(Point(point.w, point.mus, directions))
-        return [self._values(one) for point in distinct[:most] for one in signed(point)]
+        return [self._values(one) for point in distinct[:most] for one in sign_patterns(point)]
 
-    def _idle(self) -> End | None:
+    def _idle(self) -> DescentEnd | None:
         """Return the minimum without the constraints, where it satisfies them with one of its signs."""
-        for point in signed(self.free):
+        for point in sign_patterns(self.free):
             x = self._values(point)
             if self.problem.violation(x, self.constraints) <= INSIDE and self._in_gauge(x):
                 sizes = {one.name: 0 for one in self.constraints}
                 for one in self.constraints:
                     sizes[one.name] += len(one)
-                duals = {name: np.zeros(size) for name, size in sizes.items()}
-                return End(0.0, x, duals, Status.LOCAL, "stationary; no constraint is active", 0)
+                duals: dict[str, Array] = {name: np.zeros(size) for name, size in sizes.items()}
+                return DescentEnd(0.0, x, duals, Status.LOCAL, "stationary; no constraint is active", 0)
         return None
 
     def _in_gauge(self, x: Values) -> bool:
@@ -218,7 +219,7 @@ class RankOneSQP:
         return sizes
 
     @cached_property
-    def _z(self) -> Array:
+    def _z(self) -> NDArray[np.intp]:
         places = self.problem.space.places
         return np.concatenate([np.arange(places[name].start, places[name].stop) for name in self.squares.z])
 
@@ -295,7 +296,7 @@ class RankOneSQP:
                  for (one, tangent, _), part in zip(rows, parts)]
         return np.vstack([*(gauge for gauge, _ in gauges(self.problem, x)), *found])
 
-    def _descend(self, x: dict[str, Array]) -> End:
+    def _descend(self, x: dict[str, Array]) -> DescentEnd:
         """Follow the steps from x to their end."""
         scale = self.lifted.scale
         weight, damping, floor = 1e-3 * scale + TINY, 0.0, 1e-9 * scale
@@ -327,7 +328,7 @@ class RankOneSQP:
             x, damping = new, 0.1 * damping if damping > 1e-9 else 0.0
             if size < 1e-9 or (size < 1e-7 and before - after <= 1e-13 * (before + floor)):
                 status, word = Status.LOCAL, "stationary"
-        return End(self._merit(x, weight), x, self._multipliers(x, duals), status, word, count)
+        return DescentEnd(self._merit(x, weight), x, self._multipliers(x, duals), status, word, count)
 
     def _multipliers(self, x: Values, found: dict[str, Array]) -> dict[str, Array]:
         """Return multipliers at x: those of the last step, or fitted to the gradient where that leaves less of it.
@@ -367,7 +368,7 @@ def to_point(problem: Problem, linear: Sequence[str], x: Values) -> Point:
                  tuple(flat(x[one.mu]) for one in ordered), tuple(flat(x[one.b]) for one in ordered))
 
 
-def signed(point: Point) -> Iterator[Point]:
+def sign_patterns(point: Point) -> Iterator[Point]:
     """Yield the same model with every pattern of signs of (mu_i, b_i)."""
     for pattern in range(2 ** min(len(point.bs), MOST_SIGNED)):
         signs = [-1.0 if pattern >> i & 1 else 1.0 for i in range(len(point.bs))]

@@ -13,6 +13,8 @@ from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import Linear
+from optid.core.problem import Problem
+from optid.core.terms import Squares
 from optid.program.expressions import affine_parts, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
@@ -120,6 +122,8 @@ def lift(program: Program, form: LeastSquaresStructure) -> Lifted:
     """Bring the user constraints of a programme into lifted form."""
     if not program.user_constraints:
         return Lifted(Linear.none(len(form.problem.target)))
+    if program.core is not None:
+        return lift_rows(program.core, form)
     where = places(program, form)
     lifted = Lifted(Linear.none(where.size))
     factors = {program.variables[name].id: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
@@ -136,6 +140,26 @@ def lift(program: Program, form: LeastSquaresStructure) -> Lifted:
                     fits = True
             if not fits:
                 lifted.refused = lifted.refused or name
+    return lifted
+
+
+def lift_rows(problem: Problem, form: LeastSquaresStructure) -> Lifted:
+    """Bring the constraints of a problem of the core into lifted form."""
+    (squares,) = (term for term in problem.terms if isinstance(term, Squares))
+    space, names = problem.space, set(squares.z)
+    where = np.concatenate([np.arange(space.places[name].start, space.places[name].stop) for name in squares.z])
+    factors = {name: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
+    lifted = Lifted(Linear.none(len(form.problem.target)))
+    for one in problem.constraints():
+        used = {name for name, place in space.places.items() if one.rows[:, place].any()}
+        equal, fits = one.cone == "zero", False
+        if one.cone in ("zero", "below") and used <= names:
+            lifted.add(one.rows[:, where], one.right, equal)
+            fits = True
+        elif one.cone in ("zero", "below") and len(used) == 1 and (name := next(iter(used))) in factors:
+            fits = _lift_factor(lifted, form, *factors[name], one.rows[:, space.places[name]], one.right, equal)
+        if not fits:
+            lifted.refused = lifted.refused or one.name
     return lifted
 
 

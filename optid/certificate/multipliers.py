@@ -11,12 +11,10 @@ from optid.program.expressions import flat_value, jacobians
 from optid.program.judging import Lagrangian, term_size
 from optid.program.limits import EQUALITIES, rows_of, spans
 from optid.program.program import Program
-from optid.structures.multipliers import fit_multipliers
+from optid.structures.multipliers import exchange_multipliers, fit_multipliers
 
 ACTIVE = 1e-6  # slack, relative to the size of the constraint's terms, up to which an inequality may have a multiplier
 LARGEST = 4_000_000  # entries of the system of equations, at most
-DEPENDENT = 1e-7  # singular value, of rows of length one, below which they say the same
-STATIONARY = 1e-5  # relative residual up to which multipliers make a point stationary
 INDEPENDENT = 1e-10  # length of a row beside the equalities, relative to its own, that is no combination of them
 
 
@@ -54,29 +52,7 @@ def least_multipliers(program: Program, duals: Mapping[str, Array]) -> Callable[
     system = _stationarity(program)
     if system is None or any(isinstance(member, PSD) for group in program.constraints.values() for member in group):
         return None
-    columns, equality, places, target = system
-    lengths = np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
-    if np.linalg.matrix_rank(columns / lengths[:, None], tol=DEPENDENT) == len(columns):
-        return None
-    known = np.array([float(duals[key][span] @ direction) if key in duals else 0.0 for key, span, direction in places])
-    reached = columns.T @ known  # what they reach, they may be exchanged for
-    if np.linalg.norm(reached - target) > STATIONARY * max(1.0, float(np.linalg.norm(columns.T * known))):
-        return None
-
-    def least(name: str, effect: Array) -> Array:
-        from scipy.optimize import linprog
-
-        cost = np.array([float(effect[span] @ direction) if key == name else 0.0 for key, span, direction in places])
-        found = linprog(cost / lengths, A_eq=(columns / lengths[:, None]).T, b_eq=reached,
-                        bounds=[(None, None) if free else (0, None) for free in equality])
-        there = known if found.status else found.x / lengths
-        chosen = np.zeros_like(duals[name])
-        for weight, (key, span, direction) in zip(there, places):
-            if key == name:
-                chosen[span] += weight * direction
-        return chosen
-
-    return least
+    return exchange_multipliers(*system, duals)
 
 
 def _stationarity(program: Program) -> tuple[Array, np.ndarray, list[tuple[str, slice, Array]], Array] | None:

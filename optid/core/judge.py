@@ -34,22 +34,33 @@ class Judgement:
         residuals: violation, stationarity, complementarity.
         duals: the multipliers that these rest on, flat by name of the constraint; of rows divided by their sizes.
         fitted: whether they are ours.
+        gauge: multipliers of the gauges of the products.
     """
 
     objective: float
     residuals: Residuals
     duals: dict[str, Array]
     fitted: bool
+    gauge: Array
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
-    """A constraint at a point: residual g (m,), its slope (m, unknowns), and the size of what it adds up."""
+class RowsAtPoint:
+    """A constraint at a point.
+
+    Attributes:
+        constraint: it.
+        residual: g (m,).
+        slope: (m, unknowns).
+        size: of what the rows add up.
+        size_in_words: the same in the units in which the user wrote it.
+    """
 
     constraint: Constraint
     residual: Array
     slope: Array
     size: float
+    size_in_words: float
 
     @property
     def excess(self) -> float:
@@ -81,13 +92,8 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     A point with numbers that are not finite is infinitely far from everything.
     """
     if not all(np.all(np.isfinite(x[name])) for name in problem.start):
-        return Judgement(np.nan, Residuals(np.inf, "", np.inf, np.inf), {}, False)
-    y, slope = problem.leaf_values(x), None
-    rows = []
-    for one in problem.constraints(x):
-        slope = problem.slope(x) if slope is None else slope
-        rows.append(Row(one, one.residual(problem.space, y), one.slope(problem.space, y) @ slope,
-                        size_of_terms(one, problem.space, y)))
+        return Judgement(np.nan, Residuals(np.inf, "", np.inf, np.inf), {}, False, np.zeros(len(problem.products)))
+    rows = rows_at(problem, x)
     violation, worst = 0.0, ""
     for product in problem.products:
         level, parts = product.level(x)
@@ -98,7 +104,7 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
         if not row.excess <= violation:
             violation, worst = row.excess, row.constraint.name
 
-    lagrangian = Lagrangian.of(problem, x)
+    lagrangian = LagrangianAtPoint.of(problem, x)
     given = _projected(rows, duals)
     best, fitted = (np.inf, np.inf) if given is None else lagrangian.measure(rows, given), False
     if rows and not best[0] <= UNCONFIRMED and (own := _fitted(problem, x, rows, lagrangian)) is not None:
@@ -109,28 +115,45 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     for row, part in zip(rows, given or ()):
         named.setdefault(row.constraint.name, []).append(part)
     return Judgement(lagrangian.value, Residuals(violation if np.isfinite(violation) else np.inf, worst, *best),
-                     {name: np.concatenate(parts) for name, parts in named.items()}, fitted)
+                     {name: np.concatenate(parts) for name, parts in named.items()}, fitted,
+                     lagrangian.gauge_multipliers(rows, given or ()))
+
+
+def rows_at(problem: Problem, x: Values) -> list[RowsAtPoint]:
+    """Return the constraints of a problem at a point."""
+    held = problem.constraints(x)
+    if not held:
+        return []
+    y, slope = problem.leaf_values(x), problem.slope(x)
+    return [RowsAtPoint(one, one.residual(problem.space, y), one.slope(problem.space, y) @ slope,
+                *sizes_of_terms(one, problem.space, y)) for one in held]
 
 
 def size_of_terms(one: Constraint, space: LeafSpace, y: Values) -> float:
-    """Return the size of what the rows of a constraint add up, in units of the rows; one where they are empty.
+    """Return the size of what the rows of a constraint add up, in units of the rows; one where they are empty."""
+    return sizes_of_terms(one, space, y)[0]
+
+
+def sizes_of_terms(one: Constraint, space: LeafSpace, y: Values) -> tuple[float, float]:
+    """Return the size of what the rows of a constraint add up, in units of the rows and in the user's.
 
     Every leaf counts with its largest entry, but not below its usual size: where it vanishes only rounding is left.
     """
     if one.cone == "other":
         space.assign(y)
-        return term_size(one.limit.member)
+        size = term_size(one.limit.member)
+        return size, size
     total = np.abs(one.right)
     for name, place in space.places.items():
         part = np.abs(one.rows[:, place])
         if part.any():
             largest = float(np.max(np.abs(y[name]), initial=0.0))
             total = total + part.sum(axis=1) * max(largest, space.usual_sizes.get(name, 0.0))
-    return float(np.max(total, initial=0.0)) or 1.0
+    return float(np.max(total, initial=0.0)) or 1.0, float(np.max(total * one.sizes, initial=0.0)) or 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Lagrangian:
+class LagrangianAtPoint:
     """Objective, its gradient by the unknowns and the magnitudes it is a sum of, to which constraints are added."""
 
     problem: Problem
@@ -140,7 +163,7 @@ class Lagrangian:
     magnitudes: Array
 
     @classmethod
-    def of(cls, problem: Problem, x: Values) -> "Lagrangian":
+    def of(cls, problem: Problem, x: Values) -> "LagrangianAtPoint":
         """Return that of the objective alone."""
         return cls(problem, x, *problem.pull(x))
 
@@ -149,7 +172,7 @@ class Lagrangian:
         """The objective, or that of the zero model where it is larger."""
         return max(abs(self.value), self.problem.scale)
 
-    def measure(self, rows: Sequence[Row], duals: Sequence[Array]) -> tuple[float, float]:
+    def measure(self, rows: Sequence[RowsAtPoint], duals: Sequence[Array]) -> tuple[float, float]:
         """Return stationarity and complementarity with multipliers of the rows."""
         problem, total, terms, products = self.problem, self.gradient.copy(), self.magnitudes.copy(), 0.0
         for row, dual in zip(rows, duals):
@@ -159,9 +182,7 @@ class Lagrangian:
                 products += abs(float(dual @ row.residual))
             elif row.constraint.cone != "zero":
                 products += float(np.sum(np.abs(dual * row.residual)))
-        for gauge, along in gauges(problem, self.x):
-            rate = float(gauge @ along)
-            weight = -float(total @ along) / rate if rate else 0.0
+        for weight, (gauge, _) in zip(self.gauge_multipliers(rows, duals), gauges(problem, self.x)):
             total += weight * gauge
             terms += abs(weight) * np.abs(gauge)
         worst = 0.0
@@ -173,6 +194,19 @@ class Lagrangian:
                 worst = here
         # relative to a hundredth of the zero model's objective where the objective vanishes
         return worst, products / max(abs(self.value), 1e-2 * problem.scale, np.finfo(float).tiny)
+
+    def floor(self) -> Array:
+        """Return what the components of the gradient are relative to (unknowns,)."""
+        floor = self.magnitudes.copy()
+        for name, place in self.problem.slices.items():
+            floor[place] += self.yardstick / variable_size(self.x[name], self.problem.space.usual_sizes.get(name))
+        return np.where(floor > 0, floor, 1.0)
+
+    def gauge_multipliers(self, rows: Sequence[RowsAtPoint], duals: Sequence[Array]) -> Array:
+        """Return those with which nothing changes along the scale of a product, on which the objective rests."""
+        total = self.gradient + sum((dual @ row.slope for row, dual in zip(rows, duals)), np.zeros(self.problem.size))
+        rates = [(float(total @ along), float(gauge @ along)) for gauge, along in gauges(self.problem, self.x)]
+        return np.array([-pull / rate if rate else 0.0 for pull, rate in rates])
 
     def _free_part(self, name: str, part: Array, terms: Array) -> tuple[Array, Array]:
         """Return the gradient by an unknown with the nearest subgradient of terms with kinks, and its magnitudes."""
@@ -199,7 +233,7 @@ def gauges(problem: Problem, x: Values) -> list[tuple[Array, Array]]:
     return found
 
 
-def _projected(rows: Sequence[Row], duals: Mapping[str, Array]) -> list[Array] | None:
+def _projected(rows: Sequence[RowsAtPoint], duals: Mapping[str, Array]) -> list[Array] | None:
     """Return the multipliers of a solver on the dual cones; None where one is missing or not finite."""
     found, taken = [], {}
     for row in rows:
@@ -216,7 +250,8 @@ def _projected(rows: Sequence[Row], duals: Mapping[str, Array]) -> list[Array] |
     return found
 
 
-def _fitted(problem: Problem, x: Values, rows: Sequence[Row], lagrangian: Lagrangian) -> list[Array] | None:
+def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian: LagrangianAtPoint
+            ) -> list[Array] | None:
     """Return the multipliers that leave least of the gradient; None where the iterations do not suffice."""
     units = np.ones(problem.size)
     for name, place in problem.slices.items():

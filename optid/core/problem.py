@@ -181,6 +181,11 @@ class Problem:
         """Names of the constraints of the user."""
         return tuple(name for name in dict.fromkeys(one.name for one in self._at_start) if name not in self.structural)
 
+    @cached_property
+    def is_measured(self) -> bool:
+        """Whether every constraint is read into rows or a matrix, so that CVXPY is not needed to measure it."""
+        return all(one.cone != "other" for one in self._at_start)
+
     def violation(self, x: Values, constraints: tuple[Constraint, ...] | None = None) -> float:
         """Return the sum of the violations at a point, of rows divided by their sizes."""
         held, y = self.constraints(x) if constraints is None else constraints, self.leaf_values(x)

@@ -4,7 +4,7 @@ Terms speak about named quantities, *leaves*: the unknowns of a problem, or what
 Values of leaves are arrays by name; a flat one runs column by column.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -121,7 +121,7 @@ class Inner:
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
-        return sum((cp.sum(cp.multiply(weights, v[name])) for name, weights in self.weights.items()), cp.Constant(0.0))
+        return added([cp.sum(cp.multiply(weights, v[name])) for name, weights in self.weights.items()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class NuclearNorms:
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
-        return sum((t * cp.normNuc(v[name]) for name, t in self.weights.items()), cp.Constant(0.0))
+        return added([t * cp.normNuc(v[name]) for name, t in self.weights.items()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,8 +178,7 @@ class GroupNorms:
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
-        return sum((cp.sum(cp.multiply(t, cp.norm(v[name], 2, axis=1))) for name, t in self.weights.items()),
-                   cp.Constant(0.0))
+        return added([cp.sum(cp.multiply(t, cp.norm(v[name], 2, axis=1))) for name, t in self.weights.items()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +217,14 @@ def stack(y: Values, names: tuple[str, ...]) -> Array:
 def split(vector: Array, y: Values, names: tuple[str, ...]) -> dict[str, Array]:
     """Return the parts of a vector that belong to leaves one after another."""
     return dict(zip(names, np.split(vector, np.cumsum([np.size(y[name]) for name in names])[:-1])))
+
+
+def added(expressions: Sequence[Any]) -> cp.Expression:
+    """Return the sum of expressions."""
+    found: cp.Expression = cp.Constant(0.0)
+    for one in expressions:
+        found = found + one
+    return found
 
 
 def stacked_expression(v: Mapping[str, cp.Expression], names: tuple[str, ...]) -> cp.Expression:

@@ -18,7 +18,7 @@ from optid.structures.least_squares import LinearStructure, RankOneStructure
 def as_program(problem: Problem) -> Program:
     """Return the programme of a problem whose objective is one term of squares, with its constraints."""
     (squares,) = problem.terms
-    assert isinstance(squares, Squares)
+    assert isinstance(squares, Squares) and squares.lifted is not None
     products = {product.name: product for product in problem.products}
 
     def statement() -> dict[str, Any]:
@@ -39,7 +39,7 @@ def as_program(problem: Problem) -> Program:
     if not products:
         stated = statement()
         return Program(problem.name, **stated, start={}, structural=frozenset({"residual"}),
-                       structure=LinearStructure(squares.lifted or squares, squares.z), **common,
+                       structure=LinearStructure(squares.lifted, squares.z), **common,
                        ).subject_to(*problem.builders)
     linear = tuple(name for name in squares.z if name not in products)
     pairs = tuple((one.mu, one.b) for one in map(products.__getitem__, squares.z[len(linear) :]))

@@ -14,6 +14,8 @@ import numpy as np
 from optid.annotations import check_values
 from optid.bases import Linear, fitted_bases
 from optid.certificate.multipliers import least_multipliers
+from optid.core import prices as core_prices
+from optid.core.problem import Problem
 from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
 from optid.errors import (
@@ -380,12 +382,20 @@ def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], find
     told = {} if compressed is None else {word: getattr(compressed.statistics, word) for word in words}
     figures = {**told, **outcome.figures}
     findings = findings + examine_figures(figures)
-    prices = price_constraints(outcome.program, outcome.solution, least_multipliers)
+    prices = _prices(outcome.program, outcome.solution)
     earlier = price_earlier_steps(outcome.constrained, outcome.program)
     log.debug("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
               time.perf_counter() - started)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
                time.perf_counter() - started, settings)
+
+
+def _prices(program: Program, solution: Solution) -> tuple[Price, ...]:
+    problem: Problem | None = program.core
+    if problem is None or not problem.is_measured:
+        return price_constraints(program, solution, least_multipliers)
+    return core_prices.price_constraints(problem, solution.values, solution.duals, solution.objective / program.unit
+                                         ) if solution.has_point else ()
 
 
 def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:

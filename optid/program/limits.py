@@ -52,11 +52,14 @@ class Limit:
         shared = isinstance(member, EQUALITIES | INEQUALITIES) and any(side.size == 1 for side in sides)
         return cls(member, bound="" if shared else None)
 
-    def posed(self, usual: Mapping[int, float]) -> tuple[Constraint, "Limit"]:
-        """Divide the rows by their size, so that no solver sees the units in which the constraint was written."""
+    def posed(self, usual: Mapping[int, float], known: np.ndarray | None = None) -> tuple[Constraint, "Limit"]:
+        """Divide the rows by their size, so that no solver sees the units in which the constraint was written.
+
+        The sizes follow from those of the variables where they are not known.
+        """
         if not isinstance(self.member, EQUALITIES | INEQUALITIES):
             return self.member, self
-        sizes = row_sizes(self.member.expr, usual)
+        sizes = row_sizes(self.member.expr, usual) if known is None else known
         expression = self.member.expr
         if sizes.size > 1:
             scaled = cp.multiply(np.reshape(1 / sizes, expression.shape, order="F"), expression)

@@ -66,8 +66,7 @@ def price_constraints(program: Program, solution: Solution, least: Least | None 
     program.assign(solution.values)
     unit = program.unit
     energy = solution.scale if program.compressed is None else unit * float(np.sum(program.compressed.energy))
-    # two roots: the product of two sums of squares may leave the range of numbers
-    worth = 50.0 / np.sqrt(max(solution.objective, 1e-9 * energy)) / np.sqrt(energy) if energy > 0 else np.nan
+    worth = points_per_multiplier(solution.objective, energy)
     found, usual = [], program.usual_sizes
     exchanged = least(program, solution.duals) if least is not None and solution.duals else None
     for name, group in program.user_constraints.items():
@@ -85,6 +84,12 @@ def price_constraints(program: Program, solution: Solution, least: Least | None 
         found.append(Price(name, active, rows, max(slack, 0.0), unit * slope, unit * slope * worth, steps[chosen],
                            limits[chosen].words or "the size of what it bounds"))
     return tuple(found)
+
+
+def points_per_multiplier(objective: float, energy: float) -> float:
+    """Return the points of one-step fit that a multiplier of one is worth; the energy is that of the outputs."""
+    # two roots: the product of two sums of squares may leave the range of numbers
+    return float(50.0 / np.sqrt(max(objective, 1e-9 * energy)) / np.sqrt(energy)) if energy > 0 else np.nan
 
 
 def price_earlier_steps(steps: Mapping[str, tuple[Program, Solution]], last: Program) -> tuple[Price, ...]:

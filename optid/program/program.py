@@ -18,6 +18,7 @@ from optid.program.solution import Bound
 from optid.program.structure import Structure
 from optid.program.view import Values, View
 
+AFFINE = ("zero", "below")  # cones of constraints of the core whose rows have sizes
 STATED = ("objective", "constraints", "variables", "view", "derived")  # the statement of a programme in CVXPY
 
 
@@ -212,7 +213,10 @@ class Program:
         convex_only = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
-        usual = self.usual_sizes
+        usual, core, sizes = self.usual_sizes, None, {}
+        if self.core is not None:
+            core = self.core.subject_to(*builders)
+            sizes = {(one.name, one.position): one.limit.sizes for one in core.constraints() if one.cone in AFFINE}
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder
@@ -241,10 +245,10 @@ class Program:
                             "State it in the named variables of the relaxation or use an exact formulation."
                         )
                 if self.view.units is not None:
-                    constraints[name], limits[name] = zip(*(limit.posed(usual) for limit in group))
+                    constraints[name], limits[name] = zip(*(limit.posed(usual, sizes.get((name, k)))
+                                                            for k, limit in enumerate(group)))
                 else:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
-        core = None if self.core is None else self.core.subject_to(*builders)
         return replace(self, constraints=constraints, variables=variables, limits=limits, core=core)
 
     @cached_property

@@ -11,6 +11,9 @@ from optid.backends.choice import find
 from optid.certificate.convex import TANGENT, certify_convex
 from optid.certificate.infeasibility import satisfiable
 from optid.certificate.multipliers import fitted_multipliers
+from optid.core.judge import judge as judge_in_core
+from optid.core.problem import Problem
+from optid.core.terms import Squares
 from optid.program.judging import judge, measure_violation
 from optid.program.program import Program, Values
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
@@ -95,6 +98,8 @@ def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -
     Where the solver's multipliers do not make it stationary, those count that come nearest to it.
     """
     duals = _usable(program, answer.duals)
+    if program.core is not None and program.user_constraints and program.core.is_measured:
+        return _judged_in_core(program.core, answer.values, duals, base)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
         values, objective, residuals = judge(program, answer.values, duals)
         claims = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE)
@@ -105,6 +110,19 @@ def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -
             if own is not None and not again.stationarity >= residuals.stationarity:
                 duals, residuals = own, again
     return replace(base, values=values, duals=duals, objective=objective, residuals=residuals)
+
+
+def _judged_in_core(problem: Problem, values: Values, duals: Values, base: Solution) -> Solution:
+    """Return a solution at a point of a problem of the core; a value of another shape is a `ValueError`."""
+    x = {name: np.reshape(np.asarray(values[name], dtype=float), np.shape(start), order="F")
+         for name, start in problem.start.items()}
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = judge_in_core(problem, x, duals)
+        (squares,) = (term for term in problem.terms if isinstance(term, Squares))
+        residual = squares.residual(problem.leaf_values(x))
+    structural = {"residual": -2.0 * residual, **({"gauge": found.gauge} if problem.products else {})}
+    return replace(base, values={**x, "residual": residual}, duals={**structural, **found.duals},
+                   objective=found.objective, residuals=found.residuals)
 
 
 def _reference(program: Program, back_end: BackEnd) -> BackEnd | None:

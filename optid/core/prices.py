@@ -1,0 +1,85 @@
+"""What every constraint of a problem costs: activity, slack, multiplier, and the multiplier in points of fit."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.core.constraint import symmetric_part
+from optid.core.judge import LagrangianAtPoint, RowsAtPoint, gauges, rows_at
+from optid.core.problem import Problem
+from optid.core.terms import Values
+from optid.program.limits import slope_of
+from optid.program.prices import ACTIVE, Price, points_per_multiplier
+from optid.structures.multipliers import exchange_multipliers
+
+GAUGE = ""  # what the multipliers of gauges are called, which no constraint is
+
+
+def price_constraints(problem: Problem, x: Values, duals: Mapping[str, Array], objective: float) -> tuple[Price, ...]:
+    """Return the price of every constraint of the user at a point with its multipliers, objective in its own units.
+
+    Where the multipliers of a point are not unique, those count that say least. See `optid.program.prices.Price`.
+    """
+    if not problem.constraint_names:
+        return ()
+    y = problem.leaf_values(x)
+    problem.space.assign(y)  # steps and shifts of bounds may be expressions of the leaves
+    rows, worth = rows_at(problem, x), points_per_multiplier(problem.unit * objective, problem.energy)
+    exchange, found = least_multipliers(problem, x, rows, duals), []
+    for name in problem.constraint_names:
+        group = [row for row in rows if row.constraint.name == name]
+        gaps = [_slacks(row) for row in group]
+        active = sum(int(np.count_nonzero(gap <= ACTIVE * _size(row))) for row, gap in zip(group, gaps))
+        limits = tuple(row.constraint.limit for row in group)
+        steps = [0.01 * _size(row) if limit.step is None else limit.step() for row, limit in zip(group, limits)]
+        choose = None if exchange is None else partial(exchange, name)
+        slope, chosen = slope_of(limits, steps, duals[name], choose) if name in duals else (np.nan, 0)
+        found.append(Price(
+            name, active, sum(gap.size for gap in gaps),
+            max(min(float(np.min(gap, initial=np.inf)) for gap in gaps), 0.0), problem.unit * slope,
+            problem.unit * slope * worth, steps[chosen], limits[chosen].words or "the size of what it bounds"))
+    return tuple(found)
+
+
+def _slacks(row: RowsAtPoint) -> Array:
+    """Distance of every row from its bound, in units of the constraint; zero for equalities."""
+    sizes = row.constraint.sizes
+    if row.constraint.cone == "zero":
+        return np.zeros(len(row.constraint))
+    if row.constraint.cone == "psd":
+        return np.array([float(np.linalg.eigvalsh(-symmetric_part(row.residual * sizes))[0])])
+    return -row.residual * sizes
+
+
+def _size(row: RowsAtPoint) -> float:
+    """Size of the terms of a constraint, in its own units."""
+    return row.size_in_words
+
+
+def least_multipliers(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], duals: Mapping[str, Array]
+                      ) -> Callable[[str, Array], Array] | None:
+    """Return, for an effect of the multipliers of a named constraint, those of all at the point that have the least.
+
+    None where they are unique, or not polyhedral.
+    """
+    if any(row.constraint.cone == "psd" for row in rows):
+        return None
+    lagrangian = LagrangianAtPoint.of(problem, x)
+    floor = lagrangian.floor()
+    held = [gauge for gauge, _ in gauges(problem, x)]
+    parts = [row.gradients() for row in rows]
+    columns = np.vstack([np.zeros((0, problem.size)), *(gauge[None] for gauge in held), *(part for part, _ in parts)])
+    equality = np.concatenate([np.ones(len(held), dtype=bool), *(
+        np.full(len(part), row.constraint.cone == "zero") for row, (part, _) in zip(rows, parts))])
+    places = [(GAUGE, slice(k, k + 1), np.ones(1)) for k in range(len(held))]
+    for row, (_, stands) in zip(rows, parts):
+        span = slice(row.constraint.first, row.constraint.first + len(row.constraint))
+        places += [(row.constraint.name, span, direction) for direction in stands]
+    known = [duals.get(row.constraint.name, np.zeros(0)) for row in rows]
+    weights = lagrangian.gauge_multipliers(rows, [
+        part[row.constraint.first : row.constraint.first + len(row.constraint)] for row, part in zip(rows, known)]
+    ) if all(part.size for part in known) else np.zeros(len(held))
+    return exchange_multipliers(columns / floor, equality, places, -lagrangian.gradient / floor,
+                                {**duals, GAUGE: weights})
