@@ -7,8 +7,7 @@
 With several inputs the per-channel names carry the input, as in ``mu[valve]``.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -26,9 +25,8 @@ from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.identify.express import as_program
-from optid.identify.gauges import FIXED, in_gauge, signs_are_fixed
+from optid.identify.gauges import FIXED, in_gauge
 from optid.models import HammersteinTF
-from optid.program.judging import measure_violation
 from optid.program.program import Program
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
@@ -72,11 +70,10 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
 
 
 def _programme(record: EquationError, builders: Sequence[Any], gauge: str) -> Program:
-    program = as_program(_problem(record, builders, gauge))
-    pairs = tuple(zip(record.keys("mu"), record.keys("b")))
-    if gauge == "norm" and signs_are_fixed(program, pairs):
-        return replace(program, recover=partial(_factored_model, record, gauge, True),
-                       start=_signed_start(program, pairs))
+    problem = _problem(record, builders, gauge)
+    program = as_program(problem)
+    if gauge == "norm" and problem.fixes_signs:
+        return program.beginning(problem.signed_start(), partial(_factored_model, record, gauge, True))
     return program
 
 
@@ -109,21 +106,6 @@ def _start(record: EquationError, products: Sequence[Product]) -> dict[str, np.n
     for c, (one, channel) in enumerate(zip(products, record.layout.inputs)):
         b = point.bs[c].reshape(record.b_shape(c), order="F")
         start.update(zip((one.mu, one.b), in_gauge(one.gauge, point.mus[c], b, record.past(start), channel)))
-    return start
-
-
-def _signed_start(program: Program, pairs: Sequence[tuple[str, str]]) -> Mapping[str, np.ndarray]:
-    """Turn the sign of every (mu, b) of the start to where the constraints are violated least.
-
-    Methods that follow one start would otherwise stay at ``mu = 0`` on a plant whose sign the constraints turn round.
-    """
-    def violation(values: Values) -> float:
-        program.assign(values)
-        return measure_violation(program)[0]
-
-    start = program.start
-    for mu, b in pairs:
-        start = min(start, {**start, mu: -start[mu], b: -start[b]}, key=violation)
     return start
 
 

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from test_core import exact_problem, record
 
+import optid
 from formulations.arx import _problem as arx_problem
 from optid.certificate.multipliers import least_multipliers
 from optid.core.judge import judge
 from optid.core.prices import price_constraints
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
-from optid.errors import DataWarning
+from optid.errors import DataWarning, StructureError
 from optid.identify.equation_error import compress
 from optid.identify.express import as_program
 from optid.program.prices import price_constraints as program_prices
@@ -170,3 +171,29 @@ def test_kinks_are_judged_by_the_nearest_subgradient(kind):
 
 def test_the_words_of_the_tests_are_words():
     assert all(named_constraint(word) for words in WORDS for word in words)
+
+
+@pytest.mark.parametrize("words, fixed", [(("monotone:increasing",), True), (("odd",), False), (("gain:1",), False),
+                                          (("coefficients:a,-1.5,1",), False), (("sign:b,negative",), True)])
+def test_signs_that_constraints_fix(words, fixed):
+    problem = exact_problem(0, words)
+    assert problem.fixes_signs == fixed
+    turned = {**problem.start, "mu": -problem.start["mu"], "b": -problem.start["b"]}
+    start = problem.signed_start()
+    assert problem.violation(start) == min(problem.violation(problem.start), problem.violation(turned))
+    if words == ("sign:b,negative",):
+        assert np.all(start["b"] <= 0)
+
+
+def test_a_constrained_fit_states_nothing_in_cvxpy_until_it_is_needed():
+    fit = optid.fit(RECORD, na=2, nb=2, nk=1, basis="triangular:6", constraints=["monotone:increasing", "gain:0.5"])
+    assert not fit.program.is_stated and fit.prices[1].binding and fit.solution.proof
+    assert set(fit.program.user_constraints) == {"monotone:increasing", "gain"}
+    assert fit.values["Theta"].shape == (6, 2) and fit.program.is_stated  # asked for in the words of constraints
+    assert set(fit.program.limits) == {"monotone:increasing", "gain"}
+    assert all(fit.program.user_constraints.values())
+
+
+def test_what_is_wrong_with_a_constraint_is_said_when_it_is_posed():
+    with pytest.raises(StructureError, match="asks for 'q'"):
+        optid.fit(RECORD, na=2, nb=2, basis="triangular:6", constraints=[lambda v: v["q"] <= 1])

@@ -65,15 +65,18 @@ class Constraint:
         if self.cone != "other":
             return self.rows @ space.vector(y) - self.right
         space.assign(y)
-        expression = getattr(self.limit.member, "expr", None)
+        expression = rows_of(self.limit.member)
         return np.atleast_1d(self.limit.member.violation()).ravel() if expression is None else flat_value(expression)
 
     def slope(self, space: LeafSpace, y: Values) -> Array:
-        """Return the derivative (m, leaves) of g at values of the leaves."""
+        """Return the derivative (m, leaves) of g at values of the leaves; NaN where CVXPY knows none."""
         if self.cone != "other":
             return self.rows
         space.assign(y)
-        parts = jacobians(self.limit.member.expr) or {}  # type: ignore[attr-defined]
+        expression = rows_of(self.limit.member)
+        parts = None if expression is None else jacobians(expression)
+        if parts is None:
+            return np.full((len(self), space.size), np.nan)
         return np.asarray(side_by_side(parts, space.variables.values(), self.limit.member.size))
 
     def violation(self, space: LeafSpace, y: Values) -> float:

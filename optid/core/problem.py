@@ -13,6 +13,8 @@ from optid.core.constraint import Constraint, ConstraintReader
 from optid.core.leaves import Leaf, LeafSpace, Product, slices_of
 from optid.core.terms import Errors, Squares, Term, Values, flat
 
+TRIALS = 5  # random points at which constraints are compared with those of the opposite signs
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -182,6 +184,43 @@ class Problem:
         return tuple(name for name in dict.fromkeys(one.name for one in self._at_start) if name not in self.structural)
 
     @cached_property
+    def fixes_signs(self) -> bool:
+        """Whether the constraints tell (mu, b) of some product from (-mu, -b); compared at random points.
+
+        Those about ``mu bᵀ`` do not, nor do equations such as a symmetry of f.
+        """
+        if not self._at_start:
+            return False
+        rng = np.random.default_rng(0)
+        for _ in range(TRIALS):
+            x = {name: rng.normal(size=np.shape(value)) for name, value in self.start.items()}
+            here = self._violations(x)
+            for product in self.products:
+                there = self._violations(_turned(x, product))
+                if not np.allclose(here, there, rtol=1e-6, atol=1e-9 * np.max(here, initial=1.0)):
+                    return True
+        return False
+
+    def signed_start(self) -> dict[str, Array]:
+        """Return the start with the sign of every (mu, b) with which the constraints are violated least.
+
+        Methods that follow one start would otherwise stay at ``mu = 0`` where the constraints turn the sign round.
+        """
+        start = dict(self.start)
+        for product in self.products:
+            start = min(start, _turned(start, product), key=self.violation)
+        return start
+
+    def _violations(self, x: Values) -> Array:
+        """Return the violation of every row (of a matrix: the largest) at a point."""
+        y, found = self.leaf_values(x), []
+        for one in self.constraints():
+            g = one.residual(self.space, y)
+            found.append(np.array([one.violation(self.space, y)]) if one.cone in ("psd", "other") else
+                         np.abs(g) if one.cone == "zero" else np.maximum(g, 0.0))
+        return np.concatenate(found)
+
+    @cached_property
     def is_measured(self) -> bool:
         """Whether every constraint is read into rows or a matrix, so that CVXPY is not needed to measure it."""
         return all(one.cone != "other" for one in self._at_start)
@@ -190,3 +229,8 @@ class Problem:
         """Return the sum of the violations at a point, of rows divided by their sizes."""
         held, y = self.constraints(x) if constraints is None else constraints, self.leaf_values(x)
         return sum(one.violation(self.space, y) for one in held)
+
+
+def _turned(x: Values, product: Product) -> dict[str, Array]:
+    """Return a point with the signs of both factors of a product changed."""
+    return {**x, product.mu: -x[product.mu], product.b: -x[product.b]}

@@ -19,7 +19,8 @@ from optid.program.structure import Structure
 from optid.program.view import Values, View
 
 AFFINE = ("zero", "below")  # cones of constraints of the core whose rows have sizes
-STATED = ("objective", "constraints", "variables", "view", "derived")  # the statement of a programme in CVXPY
+STATED = ("objective", "constraints", "variables", "view", "derived", "limits")  # of the statement in CVXPY
+FOLLOWS = ("problem", "kind", "usual_sizes")  # what is kept of a programme and follows from its statement
 
 
 def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
@@ -103,7 +104,8 @@ class Program:
                  structure: Structure, **known: Any) -> "Program":
         """Return a programme that is stated in CVXPY only when the statement is first used.
 
-        Back ends and judgement for its structure do not use it; constraints of the user do at once.
+        Back ends and judgement for its structure do not use it; constraints of the user do at once, unless a problem
+        of the core reads them.
 
         Args:
             name: of the formulation.
@@ -123,7 +125,7 @@ class Program:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         stated = vars(self)["_statement"]()
         del vars(self)["_statement"]
-        vars(self).update(stated)
+        vars(self).update({"limits": {}, **stated})
         if held := vars(self).pop("_held"):
             with suppress(ValueError):  # CVXPY takes no derived value that overflowed; the judgement has said so
                 self.assign(held)
@@ -182,9 +184,9 @@ class Program:
 
     @property
     def user_constraints(self) -> dict[str, tuple[Constraint, ...]]:
-        """The constraints that are not part of the formulation itself."""
+        """The constraints that are not part of the formulation itself; names alone until they are stated."""
         if not self.is_stated:
-            return {}
+            return {} if self.core is None else dict.fromkeys(self.core.constraint_names, ())
         return {name: group for name, group in self.constraints.items() if name not in self.structural}
 
     def nonconvex_parts(self) -> list[str]:
@@ -210,6 +212,8 @@ class Program:
         """
         if not builders:
             return self
+        if not self.is_stated and self.core is not None:
+            return self._stated_later(builders)
         convex_only = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
@@ -250,6 +254,28 @@ class Program:
                 else:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
         return replace(self, constraints=constraints, variables=variables, limits=limits, core=core)
+
+    def _stated_later(self, builders: tuple[Any, ...]) -> "Program":
+        """Return a deferred programme under constraints that its core has read; what is wrong with them is said now."""
+        core = self.core.subject_to(*builders)
+        core.constraints()
+
+        def statement() -> dict[str, Any]:
+            _ = self.objective
+            whole = self.subject_to(*builders)
+            return {part: getattr(whole, part) for part in STATED}
+
+        return self._copied(core=core, _statement=statement, _held={})
+
+    def _copied(self, **known: Any) -> "Program":
+        """Return a copy with some attributes changed, that is stated only if this one is."""
+        made = object.__new__(type(self))
+        vars(made).update({name: value for name, value in vars(self).items() if name not in FOLLOWS} | known)
+        return made
+
+    def beginning(self, start: Values, recover: Callable[[Values], Any]) -> "Program":
+        """Return the programme with another start and another model of its values, stated no earlier than this one."""
+        return self._copied(start=start, recover=recover)
 
     @cached_property
     def usual_sizes(self) -> dict[int, float]:
