@@ -154,6 +154,7 @@ def test_the_gradient_of_a_problem_is_that_of_its_value(m):
 def test_the_rows_of_a_word_are_those_of_its_programme(word):
     problem = exact_problem(2, [word])
     program = as_program(problem)
+    _ = program.objective  # which states it
     rng = np.random.default_rng(0)
     for _ in range(3):
         x = {name: value + 0.5 * rng.normal(size=np.shape(value)) for name, value in problem.start.items()}
