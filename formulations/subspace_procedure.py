@@ -2,7 +2,7 @@
 
 1. The observability matrix from projections: `optid.identify.subspace.observability`, no programme.
 2. (A, C) from its shift invariance, poles where the constraints want them: `formulations.shift`.
-3. B, D, E, offset and x0 with the constraints on coefficients, for these (A, C): `realisation_programme`,
+3. B, D, E, offset and x0 with the constraints on coefficients, for these (A, C): `realisation_problem`,
 
        min ‖R [x0; offset; vec Theta_1; ...] - s‖²,    Theta_i = mu_i [B_i; D_i]ᵀ
 
@@ -23,7 +23,7 @@ form: ``Theta`` (P, n + l), the lumped ``Bu`` (n, p), ``Du`` (l, p) and ``Ez`` (
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -35,21 +35,19 @@ from formulations.constraints.poles import stable
 from formulations.shift import constrained_shift
 from optid.bases import Linear
 from optid.certificate.hankel import simulation_bound
-from optid.certificate.lifting import certify_rank_one
-from optid.data.channels import Transform
+from optid.core.leaves import Product
+from optid.core.problem import Problem
+from optid.core.terms import Squares
 from optid.errors import DataWarning
+from optid.identify.express import as_program
 from optid.identify.noise import with_noise_or_reason
 from optid.identify.subspace.observability import INSIDE, Observability, estimate_observability
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.realisation import Realisation
 from optid.models.roots import spectral_radius
-from optid.program.expressions import flat
-from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.program.units import energy_unit, outer_bases
-from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.least_squares import LinearStructure, RankOneStructure
 
 # multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme
 RELAXED = 150
@@ -76,7 +74,7 @@ def identified(plan: Plan, found: Observability | None = None) -> Procedure:
         a, doubt = shift.a, shift.reason if shift.status is Status.INACCURATE else ""
     step = found.step(a)
     step = replace(step, factored=plan.split == "exact" and any(min(shape) > 1 for shape in step.form.blocks))
-    program = realisation_programme(step, plan)
+    program = as_program(realisation_problem(step, plan), RELAXED)
     solution: Solution = yield program
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
@@ -100,57 +98,34 @@ def _bound(plan: Plan, step: Realisation, solution: Solution, unit: float, block
     return replace(bound, value=unit * bound.value)
 
 
-def realisation_programme(realisation: Realisation, plan: Plan) -> Program:
-    """Build the least squares of a plan under its constraints on coefficients; ``recover`` gives the model."""
-    problem, form, units = realisation.problem, realisation.form, plan.units
-    names, linear = realisation.names, ("x0", "offset") if form.offset else ("x0",)
-    if realisation.factored:
-        structure = RankOneStructure(problem, linear, tuple((mu, b) for mu, b, _ in names), "norm")
-        certify, structural = partial(certify_rank_one, max_size=RELAXED), frozenset({"residual", "gauge"})
-    else:
-        structure = LinearStructure(problem, (*linear, *(theta for _, _, theta in names)))
-        certify, structural = None, frozenset({"residual"})
+def realisation_problem(realisation: Realisation, plan: Plan) -> Problem:
+    """Return the least squares of a plan for given (A, C), ``‖R [x0; offset; vec Theta_1; ...] - s‖²``."""
+    form, units = realisation.form, plan.units
+    start = realisation.start()
+    linear, thetas = ("x0", "offset") if form.offset else ("x0",), tuple(name for _, _, name in realisation.names)
+    products = tuple(Product(mu, b) for mu, b, _ in realisation.names) if realisation.factored else ()
 
-    def statement() -> dict[str, Any]:
-        shape = form.n if form.experiments == 1 else (form.n, form.experiments)
-        variables = {name: cp.Variable(shape if name == "x0" else form.l, name=name) for name in linear}
-        gauge = {}
-        if realisation.factored:
-            mus = [cp.Variable(p, name=mu) for (mu, _, _), (p, _) in zip(names, form.blocks)]
-            bs = [cp.Variable(entries, name=b) for (_, b, _), (_, entries) in zip(names, form.blocks)]
-            thetas = [cp.outer(mu, b) for mu, b in zip(mus, bs)]
-            factors = {one.name(): one for pair in zip(mus, bs) for one in pair}
-            gauge = {"gauge": tuple(cp.sum_squares(b) == 1 for b in bs)}
-        else:
-            thetas = [cp.Variable(shape, name=theta) for (_, _, theta), shape in zip(names, form.blocks)]
-            factors = {theta.name(): theta for theta in thetas}
-        error = problem.root @ cp.hstack([flat(part) for part in (*variables.values(), *thetas)]) - problem.target
-        residual = cp.Variable(error.size, name="residual")
-        variables |= factors
-        return {"objective": cp.Minimize(cp.sum_squares(residual) + problem.remainder),
-                "constraints": {"residual": (residual == error,), **gauge}, "derived": {"residual": error},
-                "variables": {**variables, "residual": residual}, "view": _view(realisation, units, variables, thetas)}
+    objective = Squares.of(realisation.problem, (*linear, *thetas))
 
-    relative = np.any(form.weights != 1)  # to the sizes of the outputs, which have the same unit as the residuals
-    return Program.deferred(
-        "split", statement, start=realisation.start(), recover=partial(realisation.model, plan.data),
-        structural=structural, scale=problem.scale, unit=1.0 if relative else energy_unit(units),
-        structure=structure, certify=certify).subject_to(*plan.about("coefficients"))
+    x, relative = form.expansion, np.any(form.weights != 1)  # to the sizes of outputs in the unit of the residuals
+    facts = {"channels": x.input_names, "outputs": x.output_names, "units": units,
+             "bases": dict(zip(x.input_names, outer_bases(x.inputs, units))),
+             "gauge": "norm" if realisation.factored else "", "reference": {"A": form.a, "C": form.c}}
+    return Problem("split", start, (objective,), products, partial(realisation.model, plan.data), facts,
+                   partial(_matrices, realisation), plan.about("coefficients"), realisation.problem.scale,
+                   1.0 if relative else energy_unit(units))
 
 
-def _view(realisation: Realisation, units: Transform, variables: dict[str, Any], thetas: Sequence[cp.Expression]
-          ) -> View:
-    """Return what constraints may speak about; Theta_i is (P, n + l) or, without feedthrough, (P, n)."""
-    form, x, n = realisation.form, realisation.form.expansion, realisation.form.n
-    expressions = variables | {name: theta for (_, _, name), theta in zip(realisation.names, thetas)}
+def _matrices(realisation: Realisation, variables: Mapping[str, Any], x: object) -> dict[str, cp.Expression]:
+    """Return the matrices that constraints may use besides Theta_i, (P, n + l) or, without feedthrough, (P, n)."""
+    form, n = realisation.form, realisation.form.n
+    expansion, thetas = form.expansion, [variables[name] for _, _, name in realisation.names]
     inner = [theta[:, :n].T for theta in thetas]
     direct = [theta[:, n:].T if direct else np.zeros((form.l, theta.shape[0]))
               for theta, direct in zip(thetas, form.feedthrough)]
-    expressions["Bu"], expressions["Du"] = cp.hstack(inner[: x.m]), cp.hstack(direct)
-    if x.q:
-        expressions["Ez"] = cp.hstack(inner[x.m :])
-    if all(isinstance(basis, Linear) for basis in x.inputs):
-        expressions["B"], expressions["D"] = expressions["Bu"], expressions["Du"]
-    return View(expressions, channels=x.input_names, outputs=x.output_names,
-                bases=dict(zip(x.input_names, outer_bases(x.inputs, units))),
-                gauge="norm" if realisation.factored else "", reference={"A": form.a, "C": form.c}, units=units)
+    found = {"Bu": cp.hstack(inner[: expansion.m]), "Du": cp.hstack(direct)}
+    if expansion.q:
+        found["Ez"] = cp.hstack(inner[expansion.m :])
+    if all(isinstance(basis, Linear) for basis in expansion.inputs):
+        found |= {"B": found["Bu"], "D": found["Du"]}
+    return found

@@ -22,6 +22,8 @@ from optid.program.solution import Bound, relative_gap
 from optid.structures.least_squares import LeastSquaresStructure, rank_one_of
 from optid.structures.rank_one import Point, RankOne
 
+MAX_SIZE = 700  # multipliers up to which the semidefinite relaxation is tried
+
 
 @dataclass
 class Lifted:
@@ -55,7 +57,7 @@ class Lifted:
         return alone
 
 
-def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = 700
+def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = MAX_SIZE
                      ) -> tuple[Bound, Values | None]:
     """Return the bound at a point under user constraints, and values to restart from where it proposes a better point.
 

@@ -171,7 +171,8 @@ class Program:
         Raises:
             StructureError: naming the part that is neither convex nor smooth.
         """
-        if self.structure is not None and self.structure.kind and not self.is_stated:
+        rows_alone = self.core is None or all(one.cone in AFFINE for one in self.core.constraints())
+        if self.structure is not None and self.structure.kind and not self.is_stated and rows_alone:
             return self.structure.kind
         if self.problem.is_dcp():
             return _convex_class(self.problem)
