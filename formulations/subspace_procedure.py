@@ -116,7 +116,7 @@ def realisation_problem(realisation: Realisation, plan: Plan) -> Problem:
                    1.0 if relative else energy_unit(units))
 
 
-def _matrices(realisation: Realisation, variables: Mapping[str, Any], x: object) -> dict[str, cp.Expression]:
+def _matrices(realisation: Realisation, variables: Mapping[str, Any], x: object) -> dict[str, Any]:
     """Return the matrices that constraints may use besides Theta_i, (P, n + l) or, without feedthrough, (P, n)."""
     form, n = realisation.form, realisation.form.n
     expansion, thetas = form.expansion, [variables[name] for _, _, name in realisation.names]

@@ -212,7 +212,7 @@ def test_9_hessians_are_exact():
     import casadi as ca
 
     program = case("rank_one_fit").build()
-    assert solve(program, "ipopt").status is Status.LOCAL
+    assert solve(program, "ipopt").status in (Status.LOCAL, Status.OPTIMAL)
     compiled = [value for value in program.problem._solver_cache["optid"].values() if isinstance(value, ca.Function)]
     assert len(compiled) == 1 and compiled[0].stats()["n_call_nlp_hess_l"] > 0
 

@@ -1,26 +1,30 @@
-"""Sequential quadratic programmes for least squares with products under affine constraints of leaves, without CVXPY.
+"""Sequential quadratic programmes for least squares with products under constraints; with affine ones without CVXPY.
 
 Every step minimises the quadratic model of the Lagrangian: the least squares in the tangent of ``Theta = mu bᵀ``, with
 the exact second-order terms of the products, also where constraints multiply them, made definite first across the
-active constraints, where a step has no freedom anyway (Nocedal and Wright 2006, chapter 18). A step for which the
-tangents are a poor model is corrected by solving for everything but b, which is convex.
+active constraints, where a step has no freedom anyway (Nocedal and Wright 2006, chapter 18). Constraints that are
+convex in the leaves, cones among them, enter a step as they are, and smooth others by their tangents. A step for which
+the tangents are a poor model is corrected by solving for everything but b, which is convex.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cvxpy as cp
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
-from optid.backends.back_end import Settings
-from optid.backends.conic import solve_least_squares
+from optid.backends.back_end import Answer, Settings
+from optid.backends.conic import solve_least_squares, tolerances
 from optid.core.constraint import Constraint
 from optid.core.judge import ACTIVE, gauges, size_of_terms
 from optid.core.problem import Problem
 from optid.core.terms import Values, flat
+from optid.program.expressions import solve_quietly
+from optid.program.limits import EQUALITIES
 from optid.program.solution import Status
 from optid.structures.bilinear import starts
 from optid.structures.multipliers import fit_multipliers
@@ -33,6 +37,7 @@ INNER = 1e-11  # accuracy of the quadratic programmes
 INSIDE = 1e-14  # violation that is none
 TINY = 1e-300
 MOST_SIGNED = 3  # blocks whose signs are all tried
+GAUGE = "gauge"  # under which the multipliers of the gauges stand beside those of the constraints
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,17 +52,11 @@ class DescentEnd:
     steps: int
 
 
-def takes(problem: Problem) -> bool:
-    """Whether a problem is one term of squares with products, under constraints that are affine in its leaves."""
-    return len(problem.terms) == 1 and bool(problem.bilinear_terms) and all(
-        one.cone in ("zero", "below") and not one.moving for one in problem.constraints())
-
-
 class RankOneSQP:
     """The method on one problem.
 
     Args:
-        problem: that `takes` accepts.
+        problem: one term of squares with products, under constraints that do not depend on an iterate.
         start: where to begin.
         free: the minimum without the constraints.
         is_proved: whether a point and its multipliers are quickly proved to be the global minimum.
@@ -70,6 +69,9 @@ class RankOneSQP:
         assert squares.lifted is not None
         self.squares, self.lifted = squares, squares.lifted
         self.constraints = tuple(sorted(problem.constraints(), key=lambda one: one.cone != "zero"))
+        # in the order of the sides of a programme: equalities, inequalities, and what CVXPY alone states
+        self.tangents = tuple(sorted((one for one in self.constraints if not _convex(one)), key=_is_below))
+        self.convex = tuple(one for one in self.constraints if _convex(one))
         self.settings = Settings(accuracy=INNER, warm=False)
 
     def solve(self, seed: int, directions: int, descents: int) -> DescentEnd:
@@ -167,6 +169,8 @@ class RankOneSQP:
             other[place] = False
         sides: dict[str, list[tuple[Array, Array]]] = {"zero": [], "below": []}
         for one in self.constraints:
+            if one.cone not in sides:
+                continue
             alone = ~np.any(one.rows[:, other], axis=1)
             rows = np.hstack([one.rows[alone][:, place] for place in places])
             sides[one.cone].append((rows, one.right[alone]))
@@ -201,9 +205,13 @@ class RankOneSQP:
 
     @cached_property
     def bent(self) -> tuple[Constraint, ...]:
-        """The constraints about products."""
-        places = [self.problem.space.places[product.name] for product in self.products]
-        return tuple(one for one in self.constraints if any(one.rows[:, place].any() for place in places))
+        """The constraints about products, or by their tangents alone."""
+        space = self.problem.space
+        places = [space.places[product.name] for product in self.products]
+        thetas = {space.variables[product.name].id for product in self.products} if self.convex else set()
+        return tuple(one for one in self.constraints if any(one.rows[:, place].any() for place in places)
+                     or one.cone == "other" and not _convex(one)
+                     or _convex(one) and thetas & {variable.id for variable in one.limit.member.variables()})
 
     @cached_property
     def sizes(self) -> Array:
@@ -236,12 +244,12 @@ class RankOneSQP:
         hessian = jacobian.T @ jacobian
         diagonal = np.diag(hessian)
         scale = np.sqrt(np.maximum(diagonal, 1e-8 * max(float(np.max(diagonal)), TINY)))
-        rows = [(one, one.rows @ slope, one.residual(problem.space, y)) for one in self.constraints]
-        parts = _parts(self.constraints, duals)
+        rows = [(one, one.slope(problem.space, y) @ slope, one.residual(problem.space, y)) for one in self.tangents]
+        parts = _parts(self.tangents, duals)
         if not pinned:
             pull = np.zeros(problem.space.size)
             pull[self._z] = self.squares.root.T @ residual
-            for one, dual in zip(self.constraints, parts or ()):
+            for one, dual in zip(self.tangents, parts or ()):
                 pull = pull + one.rows.T @ dual / 2
             hessian = hessian + self._curvature(x, pull)
         scaled, shift = hessian / np.outer(scale, scale), max(damping, 1e-12)
@@ -259,19 +267,46 @@ class RankOneSQP:
         else:
             for (gauge, _), product in zip(gauges(problem, x), problem.products):
                 sides["zero"].append(((gauge * sizes)[None], np.array([gauge @ at - product.level(x)[0]])))
-        units = []
+        pins, units = sum(len(right) for _, right in sides["zero"]), []
         for one, tangent, g in rows:
             right = tangent @ at - g
             units.append(float(np.max(np.abs(tangent) @ sizes + np.abs(right), initial=0.0)) or 1.0)
-            sides[one.cone].append((tangent * sizes / units[-1], right / units[-1]))
-        found = solve_least_squares(upper / unit, (upper @ (at / sizes) - descent) / unit, sides["zero"],
-                                    sides["below"], self.settings)
+            sides["below" if _is_below(one) else "zero"].append((tangent * sizes / units[-1], right / units[-1]))
+        scaled_model = upper / unit, (upper @ (at / sizes) - descent) / unit
+        if self.convex:
+            found = self._with_convex(*scaled_model, sides, at, slope, y)
+        else:
+            found = solve_least_squares(*scaled_model, sides["zero"], sides["below"], self.settings)
         if not found.values:
             return None
-        counts = np.cumsum([sum(len(right) for _, right in sides["zero"]) - sum(
-            len(one) for one in self.constraints if one.cone == "zero"), *map(len, self.constraints)])
-        multipliers = [unit**2 * found.duals["rows"][a:b] / u for a, b, u in zip(counts, counts[1:], units)]
-        return problem.unpack(found.values["x"] * sizes), _by_name(self.constraints, multipliers)
+        counts = np.cumsum([pins, *map(len, self.tangents), *map(len, self.convex)])
+        multipliers = [unit**2 * found.duals["rows"][a:b] / u
+                       for a, b, u in zip(counts, counts[1:], [*units, *[1.0] * len(self.convex)])]
+        named = _by_name((*self.tangents, *self.convex), multipliers)
+        if not pinned:
+            named[GAUGE] = unit**2 * found.duals["rows"][:pins]
+        return problem.unpack(found.values["x"] * sizes), named
+
+    def _with_convex(self, matrix: Array, target: Array, sides: Mapping[str, list[tuple[Array, Array]]], at: Array,
+                     slope: Array, y: Values) -> Answer:
+        """Solve a step with convex constraints of the leaves, as `solve_least_squares` does; their multipliers last."""
+        space, w = self.problem.space, cp.Variable(at.size)
+        leaves = slope @ (cp.multiply(self.sizes, w) - at) + space.vector(y)
+        links = [cp.vec(variable, order="F") == leaves[space.places[name]]
+                 for name, variable in space.variables.items()]
+        rows = [part @ w == right for part, right in sides["zero"]] + [
+            part @ w <= right for part, right in sides["below"]]
+        members = [one.limit.member for one in self.convex]
+        step = cp.Problem(cp.Minimize(cp.sum_squares(matrix @ w - target)), [*links, *rows, *members])
+        try:
+            solve_quietly(step, **tolerances("clarabel", self.settings))
+        except cp.SolverError as error:
+            return Answer(Status.FAILED, str(error))
+        duals = [dual.value for one in (*rows, *members) for dual in one.dual_variables]
+        if w.value is None or any(dual is None for dual in duals):
+            return Answer(Status.FAILED, str(step.status))
+        return Answer(Status.LOCAL, str(step.status), {"x": np.asarray(w.value)},
+                      {"rows": np.concatenate([np.zeros(0), *map(flat, duals)])})
 
     def _curvature(self, x: Values, pull: Array) -> Array:
         """Return second derivatives of ``pullᵀ leaves``, made definite along the scale between mu and b."""
@@ -336,7 +371,7 @@ class RankOneSQP:
         A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
         """
         parts = _parts(self.constraints, found)
-        if parts is None:
+        if parts is None or not all(one.cone in ("zero", "below") for one in self.constraints):
             return found
         problem, y, slope = self.problem, self.problem.leaf_values(x), self.problem.slope(x)
         jacobian = self._jacobian(slope)
@@ -412,3 +447,13 @@ def _definite(matrix: Array, rows: Array, shift: float) -> Array:
     values, vectors = np.linalg.eigh(along.T @ matrix @ along)
     vectors, values = along @ vectors, np.maximum(np.abs(values), 1e-10 * size)
     return np.linalg.cholesky((vectors * values) @ vectors.T + size * across + shift * np.eye(len(matrix)))
+
+
+def _convex(one: Constraint) -> bool:
+    """Whether a constraint that is not rows is convex in the leaves, so that CVXPY states it."""
+    return one.cone == "psd" or one.cone == "other" and one.limit.member.is_dcp()
+
+
+def _is_below(one: Constraint) -> bool:
+    """Whether rows, or the tangents of another constraint, are inequalities."""
+    return one.cone == "below" or one.cone == "other" and not isinstance(one.limit.member, EQUALITIES)

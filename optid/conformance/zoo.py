@@ -12,10 +12,14 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from optid.core.leaves import Product
+from optid.core.problem import Problem
+from optid.core.terms import Squares
+from optid.identify.express import as_program
 from optid.program.program import Program
 from optid.program.view import View
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
-from optid.structures.least_squares import LinearStructure, RankOneStructure
+from optid.structures.least_squares import LinearStructure
 from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
 from optid.structures.rank_one import RankOne
 
@@ -211,23 +215,16 @@ def _least_squares() -> Case:
 
 
 def _rank_one() -> list[Case]:
-    problem = _compressed_fit()
-    root, target, remainder, scale = problem.root, problem.target, problem.remainder, problem.scale
-    structure = RankOneStructure(problem, ("a",), (("mu", "b"),))
     rising = {"mu": np.array([-1.0, 0.0, 0.0, 1.0]), "b": np.array([0.7, 0.7])}
 
     def bilinear(name: str, sign: float, convex: bool, value: float) -> Case:
-        def statement(a: Any, mu: Any, b: Any, r: Any) -> tuple:
-            theta = cp.outer(mu, b)
-            residual = root @ cp.hstack([a, cp.vec(theta, order="F")]) - target
-            extra = {"convex": cp.diff(mu, 2) >= 0} if convex else {}
-            return cp.sum_squares(r) + remainder, {
-                "residual": r == residual, "gauge": cp.sum_squares(b) == 1, **extra}, {
-                "structural": frozenset({"residual", "gauge"}), "derived": {"r": residual}, "structure": structure,
-                "expressions": {"Theta": theta}, "scale": scale}
-
-        start = {"a": np.zeros(1), **{key: sign * value for key, value in rising.items()}}
-        return _case(name, {"a": 1, "mu": 4, "b": 2, "r": len(root)}, statement, start, value=value)
+        def build() -> Program:
+            problem = _compressed_fit()
+            start = {"a": np.zeros(1), **{key: sign * value for key, value in rising.items()}}
+            rules = (lambda v: {"convex": cp.diff(v["mu"], 2) >= 0},) if convex else ()
+            return as_program(Problem(name, start, (Squares.of(problem, ("a", "Theta")),), (Product("mu", "b"),),
+                                      builders=rules, scale=problem.scale))
+        return Case(name, build, value=value)
 
     # digits by least squares for every direction of b, a single angle
     return [bilinear("rank_one_fit", 1.0, False, 0.34051374007229496),

@@ -77,7 +77,7 @@ class Constraint:
         parts = None if expression is None else jacobians(expression)
         if parts is None:
             return np.full((len(self), space.size), np.nan)
-        return np.asarray(side_by_side(parts, space.variables.values(), self.limit.member.size))
+        return np.asarray(side_by_side(parts, space.variables.values(), len(self)))
 
     def violation(self, space: LeafSpace, y: Values) -> float:
         """Return the sum of the violations of its rows, or the largest one of a matrix."""
@@ -175,8 +175,8 @@ class ConstraintReader:
         expression, cone = _in_cone(member)
         parts = None if expression is None else affine_parts(expression)
         if parts is None or any(variable.id not in leaves for variable in parts[0]):
-            return Constraint(name, limit, "other", np.zeros((member.size, self.space.size)), np.zeros(member.size),
-                              moving, number)
+            count = sum(dual.size for dual in member.dual_variables)
+            return Constraint(name, limit, "other", np.zeros((count, self.space.size)), np.zeros(count), moving, number)
         rows, right = np.zeros((parts[1].size, self.space.size)), -parts[1]
         for variable, part in parts[0].items():
             rows[:, self.space.places[leaves[variable.id]]] = part.toarray() if hasattr(part, "toarray") else part

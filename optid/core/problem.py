@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from optid.arrays import Array
@@ -43,7 +42,7 @@ class Problem:
     leaves: tuple[Leaf, ...] = ()
     model: Callable[[Values], Any] = dict
     facts: Mapping[str, Any] = field(default_factory=dict)
-    further: Callable[[Mapping[str, cp.Variable], Values], Mapping[str, cp.Expression]] | None = None
+    further: Callable[[Mapping[str, Any], Values], Mapping[str, Any]] | None = None
     builders: tuple[Any, ...] = ()
     scale: float = 1.0
     unit: float = 1.0

@@ -121,7 +121,7 @@ class Inner:
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
-        return added([cp.sum(cp.multiply(weights, v[name])) for name, weights in self.weights.items()])
+        return sum_of([cp.sum(cp.multiply(weights, v[name])) for name, weights in self.weights.items()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class NuclearNorms:
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
-        return added([t * cp.normNuc(v[name]) for name, t in self.weights.items()])
+        return sum_of([t * cp.normNuc(v[name]) for name, t in self.weights.items()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ class GroupNorms:
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
-        return added([cp.sum(cp.multiply(t, cp.norm(v[name], 2, axis=1))) for name, t in self.weights.items()])
+        return sum_of([cp.sum(cp.multiply(t, cp.norm(v[name], 2, axis=1))) for name, t in self.weights.items()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +219,7 @@ def split(vector: Array, y: Values, names: tuple[str, ...]) -> dict[str, Array]:
     return dict(zip(names, np.split(vector, np.cumsum([np.size(y[name]) for name in names])[:-1])))
 
 
-def added(expressions: Sequence[Any]) -> cp.Expression:
+def sum_of(expressions: Sequence[Any]) -> cp.Expression:
     """Return the sum of expressions."""
     found: cp.Expression = cp.Constant(0.0)
     for one in expressions:

@@ -46,5 +46,6 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE) -> Program:
     return Program.deferred(
         problem.name, statement, start=problem.start, recover=problem.model, structure=structure,
         structural=frozenset({"residual", "gauge"} if products else {"residual"}), scale=problem.scale,
-        unit=problem.unit, compressed=problem.compressed, certify=partial(certify_rank_one, max_size=max_size) if products else None,
+        unit=problem.unit, compressed=problem.compressed,
+        certify=partial(certify_rank_one, max_size=max_size) if products else None,
         core=replace(problem, builders=())).subject_to(*problem.builders)

@@ -259,7 +259,8 @@ class Program:
     def _stated_later(self, builders: tuple[Any, ...]) -> "Program":
         """Return a deferred programme under constraints that its core has read; what is wrong with them is said now."""
         core = self.core.subject_to(*builders)
-        core.constraints()
+        if taken := self.structural & set(core.constraint_names):
+            raise StructureError(f"there are two constraints named {min(taken)!r}; give each its own name")
 
         def statement() -> dict[str, Any]:
             _ = self.objective
