@@ -14,10 +14,13 @@ import scipy.sparse as sp
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
+from optid.core.problem import Problem
+from optid.core.terms import Squares
 from optid.program.expressions import solve_quietly
 from optid.program.program import Program
 from optid.program.solution import Status
 
+SHARP = 1e-11  # accuracy of small least squares
 Side = tuple[np.ndarray, np.ndarray]  # rows (r, n) and right-hand sides (r,)
 STATUS = {
     cp.OPTIMAL: Status.OPTIMAL,
@@ -83,6 +86,8 @@ def solve_with(name: str, program: Program, settings: Settings) -> Answer:
 
     An exception inside the solver becomes ``Status.FAILED`` with its words.
     """
+    if name == "clarabel" and not settings.options and not settings.verbose and _has_rows_alone(program):
+        return _least_squares_in_rows(program.core, settings)
     problem, options = program.problem, tolerances(name, settings)
     if name == "clarabel" and program.scale < 1:  # objectives are in units of the data; its relative gap is one to 1
         options |= {key: options[key] * max(program.scale, 1e-8) for key in ("tol_gap_abs", "tol_gap_rel")
@@ -142,3 +147,46 @@ def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[
         return Answer(status, str(found.status))
     return Answer(status, str(found.status), {"x": np.asarray(found.x)[:n]}, {"rows": np.asarray(found.z)[k:]},
                   int(found.iterations))
+
+
+def _has_rows_alone(program: Program) -> bool:
+    """Whether a programme states one term of squares without products, under rows: Clarabel needs no CVXPY for it."""
+    problem: Problem | None = program.core
+    if problem is None or len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares) or problem.leaves:
+        return False
+    return all(one.cone in ("zero", "below") for one in problem.constraints())
+
+
+def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
+    """Solve such a problem, in units in which the record accounts for every unknown."""
+    (squares,) = problem.terms
+    assert isinstance(squares, Squares)
+    places = problem.space.places
+    columns = np.concatenate([np.arange(places[name].start, places[name].stop) for name in squares.z])
+    effect, reach = np.linalg.norm(squares.root, axis=0), float(np.sqrt(problem.scale))
+    sizes = np.ones(problem.size)
+    for place in places.values():
+        most = float(np.max(effect[np.isin(columns, np.arange(place.start, place.stop))], initial=0.0))
+        sizes[place] = reach / most if most > 0 and reach > 0 else 1.0
+    matrix = np.zeros((len(squares.root), problem.size))
+    matrix[:, columns] = squares.root
+    unit = max(float(np.max(np.abs(matrix * sizes))), np.finfo(float).tiny)
+    held = sorted(problem.constraints(), key=lambda one: one.cone != "zero")
+    units = [float(np.max(np.abs(one.rows) @ sizes + np.abs(one.right), initial=0.0)) or 1.0 for one in held]
+    sides: dict[str, list[Side]] = {"zero": [], "below": []}
+    for one, size in zip(held, units):
+        sides[one.cone].append((one.rows * sizes / size, one.right / size))
+    sharp = replace(settings, accuracy=min(settings.accuracy, SHARP))  # which costs an iteration or two
+    found = solve_least_squares(matrix * sizes / unit, squares.target / unit, sides["zero"], sides["below"], sharp)
+    if not found.values:
+        return found
+    x = problem.unpack(found.values["x"] * sizes)
+    duals: dict[str, list[np.ndarray]] = {}
+    edges = np.cumsum([0, *map(len, held)])
+    parts = [unit**2 * found.duals["rows"][a:b] / size for a, b, size in zip(edges, edges[1:], units)]
+    for one, part in sorted(zip(held, parts), key=lambda pair: pair[0].position):
+        duals.setdefault(one.name, []).append(part)
+    residual = squares.residual(problem.leaf_values(x))
+    return Answer(found.status, found.word, {**x, "residual": residual}, {
+        "residual": -2.0 * residual, **{name: np.concatenate(several) for name, several in duals.items()}},
+        found.iterations)

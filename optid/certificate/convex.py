@@ -18,6 +18,8 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.certificate.lifting import lift
+from optid.core.judge import in_dual_cone
+from optid.core.problem import Problem
 from optid.program.expressions import differences, flat_value
 from optid.program.judging import Lagrangian, bounds_of
 from optid.program.program import Program, Values
@@ -39,12 +41,13 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
 
     None where it cannot be formed (no multipliers, an objective with kinks).
     """
-    program.assign(values)
     form = program.structure if isinstance(program.structure, LeastSquaresStructure) else None
+    if program.core is None or not program.core.is_measured:
+        program.assign(values)
     if form is None:
         found, method = _tangent_bound(program, duals, objective), TANGENT
     else:
-        found, method = _least_squares_bound(program, form, duals, objective), "convex dual"
+        found, method = _least_squares_bound(program, form, values, duals, objective), "convex dual"
     if found is None or not np.isfinite(found[0]):
         return None
     value, words = found
@@ -53,17 +56,36 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
     return Bound(value, gap <= CLOSED, method, f"{state}: {words}, relative gap {gap:.1e}")
 
 
-def _least_squares_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float
+def _least_squares_bound(program: Program, form: LeastSquaresStructure, values: Values, duals: Values, objective: float
                          ) -> tuple[float, str]:
-    best = _quadratic_bound(program, form, duals, objective), "least-squares dual of the multipliers"
+    best = _quadratic_bound(program, form, values, duals, objective), "least-squares dual of the multipliers"
     if relative_gap(objective, best[0], program.scale) > CLOSED and (own := _own_multipliers(program, form)):
-        value = _quadratic_bound(program, form, own, objective)
+        value = _quadratic_bound(program, form, values, own, objective)
         best = max(best, (value, "least-squares dual of multipliers by least-distance programming"))
     return best
 
 
-def _quadratic_bound(program: Program, form: LeastSquaresStructure, duals: Values, objective: float) -> float:
+def _bound_by_rows(problem: Problem, form: LeastSquaresStructure, values: Values, duals: Values, objective: float
+                   ) -> float:
+    """The same from the rows of a problem of the core, whose leaves are all in z."""
+    x = {name: np.reshape(values[name], np.shape(start), order="F") for name, start in problem.start.items()}
+    root, z = form.problem.root, form.flat(x)
+    pull, value = 2.0 * root.T @ (root @ z - form.problem.target), objective
+    for one in problem.constraints():
+        if one.name not in duals:
+            return -np.inf
+        dual = in_dual_cone(one, duals[one.name][one.first : one.first + len(one)])
+        columns = np.concatenate([one.rows[:, problem.space.places[name]] for name in form.linear], axis=1)
+        pull, value = pull + columns.T @ dual, value + float(dual @ one.residual(problem.space, x))
+    step = solve_triangular(root, pull, trans=1)
+    return value - float(step @ step) / 4
+
+
+def _quadratic_bound(program: Program, form: LeastSquaresStructure, values: Values, duals: Values, objective: float
+                     ) -> float:
     """Minimum over all z of the Lagrangian of least squares, whose constraints are the user's; -inf without one."""
+    if program.core is not None and program.core.is_measured:
+        return _bound_by_rows(program.core, form, values, duals, objective)
     lagrangian = Lagrangian.of(program, duals, program.user_constraints)
     if lagrangian is None:
         return -np.inf
@@ -147,5 +169,9 @@ def _own_multipliers(program: Program, form: LeastSquaresStructure) -> dict[str,
         return None
     if weights is None:
         return None
-    counts = [sum(member.size for member in group) for group in program.user_constraints.values()]
-    return dict(zip(program.user_constraints, np.split(2.0 * size * weights / lengths, np.cumsum(counts)[:-1])))
+    if program.core is not None:
+        counts = {name: sum(len(one) for one in program.core.constraints() if one.name == name)
+                  for name in program.core.constraint_names}
+    else:
+        counts = {name: sum(member.size for member in group) for name, group in program.user_constraints.items()}
+    return dict(zip(counts, np.split(2.0 * size * weights / lengths, np.cumsum([*counts.values()])[:-1])))

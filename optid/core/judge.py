@@ -243,11 +243,16 @@ def _projected(rows: Sequence[RowsAtPoint], duals: Mapping[str, Array]) -> list[
         part = np.ravel(np.asarray(duals.get(name, ()), dtype=float))[start : start + m]
         if part.size != m or not np.all(np.isfinite(part)):
             return None
-        if row.constraint.cone == "psd":
-            values, vectors = np.linalg.eigh(symmetric_part(part))
-            part = flat((vectors * np.maximum(values, 0.0)) @ vectors.T)
-        found.append(part if row.constraint.cone in ("zero", "psd") else np.maximum(part, 0.0))
+        found.append(in_dual_cone(row.constraint, part))
     return found
+
+
+def in_dual_cone(constraint: Constraint, dual: Array) -> Array:
+    """Return flat multipliers of a constraint, projected on its dual cone."""
+    if constraint.cone == "psd":
+        values, vectors = np.linalg.eigh(symmetric_part(dual))
+        return flat((vectors * np.maximum(values, 0.0)) @ vectors.T)
+    return dual if constraint.cone == "zero" else np.maximum(dual, 0.0)
 
 
 def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian: LagrangianAtPoint
