@@ -10,7 +10,7 @@ from optid import Data
 from optid.backends.back_end import BackEnd
 from optid.backends.choice import back_ends
 from optid.cli.results import solver_choice
-from optid.errors import DataWarning, LookupFailed, OptidError, SolverRefused
+from optid.errors import DataWarning, LookupFailed, OptidError, SolverRefused, StructureError
 from optid.program.solution import Status
 from optid.registry import FORMULATIONS, defaults, formulation, registered
 from optid.solving.steps import choose_solvers, takers
@@ -164,6 +164,8 @@ def test_a_back_end_of_the_user_serves_a_step():
 def test_the_command_line_names_steps():
     assert solver_choice("scs") == "scs"
     assert solver_choice("shift with fixed P=scs, split=ipopt") == {"shift with fixed P": "scs", "split": "ipopt"}
+    with pytest.raises(StructureError, match="'shift' twice"):
+        solver_choice("shift=scs,shift=clarabel")
 
 
 def test_studies_compare_solvers_of_the_main_step():

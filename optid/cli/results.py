@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.cli.terminal import Waiting, coloured, hearing, note, say
-from optid.errors import DataError
+from optid.errors import DataError, StructureError
 from optid.registry import CONSTRAINTS, FORMULATIONS, entry_point, render
 
 
@@ -29,10 +29,15 @@ def check_names(constraints: Iterable[str] | None, solver: str = "auto", formula
 
 
 def solver_choice(text: str) -> str | dict[str, str]:
-    """Read a solver, or "STEP=SOLVER,..." for steps of a formulation."""
+    """Read a solver, or "STEP=SOLVER,..." for steps of a formulation; a step twice is a `StructureError`."""
     if "=" not in text:
         return text
-    return {step.strip(): word.strip() for step, _, word in (part.partition("=") for part in text.split(","))}
+    found: dict[str, str] = {}
+    for step, _, word in (part.partition("=") for part in text.split(",")):
+        if step.strip() in found:
+            raise StructureError(f"--solver {text!r} names the step {step.strip()!r} twice")
+        found[step.strip()] = word.strip()
+    return found
 
 
 def reading_for(model: Any, how: Mapping[str, Any]) -> dict[str, Any]:
