@@ -110,7 +110,7 @@ def test_the_step_model_is_the_second_order_expansion_of_the_lagrangian():
     """Against finite differences, at a point with multipliers for a bilinear constraint."""
     program = program_of(record(), [shape.gain(1.0, at=0.1)])
     problem, free = program.core, minimise(program.structure.problem).point
-    steps = RankOneSQP(problem, program.start, free, lambda x, duals: False)
+    steps = RankOneSQP(problem, program.start, free, lambda x, duals: False).model
     rng = np.random.default_rng(0)
     x, pull = rng.normal(size=problem.size), rng.normal(size=problem.space.size)
 
@@ -120,7 +120,7 @@ def test_the_step_model_is_the_second_order_expansion_of_the_lagrangian():
     h = 1e-4 * np.eye(problem.size)
     second = np.array([[(value(x + e + d) - value(x + e - d) - value(x - e + d) + value(x - e - d)) / 4e-8 for e in h]
                        for d in h])
-    curved = steps._curvature(problem.unpack(x), pull)
+    curved = steps.curvature(problem.unpack(x), pull)
     b = problem.slices["b"]
     curved[b, b] = 0.0  # what is added along the scale between mu and b
     assert np.allclose(curved, second, atol=1e-5)

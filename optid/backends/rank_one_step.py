@@ -1,0 +1,261 @@
+"""The quadratic programme of one step on least squares with products under constraints.
+
+    minimise  ‖R dz(x) + r‖² + curvature of mu bᵀ    subject to  the tangents of the constraints, and the convex ones
+
+The exact second-order terms of the products count also where constraints multiply them; the model is made definite
+first across the active constraints, where a step has no freedom anyway (Nocedal and Wright 2006, chapter 18). With
+affine constraints alone it goes straight to Clarabel.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import cvxpy as cp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from optid.arrays import Array
+from optid.backends.back_end import Answer, Settings
+from optid.backends.conic import solve_least_squares, tolerances
+from optid.core.constraint import Constraint
+from optid.core.judge import ACTIVE, gauges, size_of_terms
+from optid.core.leaves import Product
+from optid.core.problem import Problem
+from optid.core.terms import Values, flat
+from optid.program.expressions import solve_quietly
+from optid.program.limits import EQUALITIES
+from optid.program.solution import Status
+from optid.structures.multipliers import fit_multipliers
+
+INNER = 1e-11  # accuracy of the quadratic programmes
+TINY = 1e-300
+GAUGE = "gauge"  # under which the multipliers of the gauges stand beside those of the constraints
+
+
+class RankOneStep:
+    """Steps on one problem: one term of squares with products, under constraints that do not depend on an iterate.
+
+    Args:
+        problem: the problem.
+        usual: a point at which the effect of every unknown is of its usual size.
+    """
+
+    def __init__(self, problem: Problem, usual: Values) -> None:
+        self.problem, self.usual = problem, usual
+        (self.squares,) = problem.bilinear_terms
+        self.constraints = tuple(sorted(problem.constraints(), key=lambda one: one.cone != "zero"))
+        # in the order of the sides of a programme: equalities, inequalities, and what CVXPY alone states
+        self.tangents = tuple(sorted((one for one in self.constraints if not _convex(one)), key=_is_below))
+        self.convex = tuple(one for one in self.constraints if _convex(one))
+        self.settings = Settings(accuracy=INNER, warm=False)
+
+    @cached_property
+    def products(self) -> list[Product]:
+        """The products, in the order of the blocks."""
+        by_name = {product.name: product for product in self.problem.products}
+        return [by_name[name] for name in self.squares.z if name in by_name]
+
+    @cached_property
+    def bent(self) -> tuple[Constraint, ...]:
+        """The constraints about products, or by their tangents alone."""
+        space = self.problem.space
+        places = [space.places[product.name] for product in self.products]
+        thetas = {space.variables[product.name].id for product in self.products} if self.convex else set()
+        return tuple(one for one in self.constraints if any(one.rows[:, place].any() for place in places)
+                     or one.cone == "other" and not _convex(one)
+                     or _convex(one) and thetas & {variable.id for variable in one.limit.member.variables()})
+
+    @cached_property
+    def sizes(self) -> Array:
+        """How much of every unknown would account for the whole record, by its largest effect; (unknowns,).
+
+        Solvers stop at absolute tolerances, so the programmes are written in these units and not in those of the data.
+        """
+        effect = np.linalg.norm(self._jacobian(self.problem.slope(self.usual)), axis=0)
+        reach, sizes = float(np.sqrt(self.problem.scale)), np.ones(self.problem.size)
+        for place in self.problem.slices.values():
+            most = float(np.max(effect[place], initial=0.0))
+            sizes[place] = reach / most if most > 0 and reach > 0 else 1.0
+        return sizes
+
+    @cached_property
+    def _z(self) -> NDArray[np.intp]:
+        places = self.problem.space.places
+        return np.concatenate([np.arange(places[name].start, places[name].stop) for name in self.squares.z])
+
+    def _jacobian(self, slope: Array) -> Array:
+        return self.squares.root @ slope[self._z]
+
+    def step(self, x: Values, duals: Mapping[str, Array], damping: float = 0.0, pinned: bool = False
+              ) -> tuple[dict[str, Array], dict[str, Array]] | None:
+        """Return the minimum of the quadratic model at x under the tangents of the constraints, and its multipliers."""
+        problem, sizes, at = self.problem, self.sizes, self.problem.pack(x)
+        y, slope = problem.leaf_values(x), problem.slope(x)
+        residual = self.squares.residual(y)
+        jacobian = self._jacobian(slope)
+        hessian = jacobian.T @ jacobian
+        diagonal = np.diag(hessian)
+        scale = np.sqrt(np.maximum(diagonal, 1e-8 * max(float(np.max(diagonal)), TINY)))
+        rows = [(one, one.slope(problem.space, y) @ slope, one.residual(problem.space, y)) for one in self.tangents]
+        parts = _parts(self.tangents, duals)
+        if not pinned:
+            pull = np.zeros(problem.space.size)
+            pull[self._z] = self.squares.root.T @ residual
+            for one, dual in zip(self.tangents, parts or ()):
+                pull = pull + one.rows.T @ dual / 2
+            hessian = hessian + self.curvature(x, pull)
+        scaled, shift = hessian / np.outer(scale, scale), max(damping, 1e-12)
+        factor = _cholesky(scaled, shift)
+        if factor is None:
+            factor = _definite(scaled, self._active(x, rows, parts) / scale, shift)
+        upper = factor.T * (scale * sizes)
+        unit = max(float(np.max(np.abs(upper))), TINY)
+        descent = solve_triangular(factor, jacobian.T @ residual / scale, lower=True)
+        sides: dict[str, list[tuple[Array, Array]]] = {"zero": [], "below": []}
+        if pinned:
+            bs = np.concatenate([np.arange(problem.slices[one.b].start, problem.slices[one.b].stop)
+                                 for one in self.products])
+            sides["zero"].append((np.eye(problem.size)[bs], at[bs] / sizes[bs]))
+        else:
+            for (gauge, _), product in zip(gauges(problem, x), problem.products):
+                sides["zero"].append(((gauge * sizes)[None], np.array([gauge @ at - product.level(x)[0]])))
+        pins, units = sum(len(right) for _, right in sides["zero"]), []
+        for one, tangent, g in rows:
+            right = tangent @ at - g
+            units.append(float(np.max(np.abs(tangent) @ sizes + np.abs(right), initial=0.0)) or 1.0)
+            sides["below" if _is_below(one) else "zero"].append((tangent * sizes / units[-1], right / units[-1]))
+        scaled_model = upper / unit, (upper @ (at / sizes) - descent) / unit
+        if self.convex:
+            found = self._with_convex(*scaled_model, sides, at, slope, y)
+        else:
+            found = solve_least_squares(*scaled_model, sides["zero"], sides["below"], self.settings)
+        if not found.values:
+            return None
+        counts = np.cumsum([pins, *map(len, self.tangents), *map(len, self.convex)])
+        multipliers = [unit**2 * found.duals["rows"][a:b] / u
+                       for a, b, u in zip(counts, counts[1:], [*units, *[1.0] * len(self.convex)])]
+        named = _by_name((*self.tangents, *self.convex), multipliers)
+        if not pinned:
+            named[GAUGE] = unit**2 * found.duals["rows"][:pins]
+        return problem.unpack(found.values["x"] * sizes), named
+
+    def _with_convex(self, matrix: Array, target: Array, sides: Mapping[str, list[tuple[Array, Array]]], at: Array,
+                     slope: Array, y: Values) -> Answer:
+        """Solve a step with convex constraints of the leaves, as `solve_least_squares` does; their multipliers last."""
+        space, w = self.problem.space, cp.Variable(at.size)
+        leaves = slope @ (cp.multiply(self.sizes, w) - at) + space.vector(y)
+        links = [cp.vec(variable, order="F") == leaves[space.places[name]]
+                 for name, variable in space.variables.items()]
+        rows = [part @ w == right for part, right in sides["zero"]] + [
+            part @ w <= right for part, right in sides["below"]]
+        members = [one.limit.member for one in self.convex]
+        step = cp.Problem(cp.Minimize(cp.sum_squares(matrix @ w - target)), [*links, *rows, *members])
+        try:
+            solve_quietly(step, **tolerances("clarabel", self.settings))
+        except cp.SolverError as error:
+            return Answer(Status.FAILED, str(error))
+        duals = [dual.value for one in (*rows, *members) for dual in one.dual_variables]
+        if w.value is None or any(dual is None for dual in duals):
+            return Answer(Status.FAILED, str(step.status))
+        return Answer(Status.LOCAL, str(step.status), {"x": np.asarray(w.value)},
+                      {"rows": np.concatenate([np.zeros(0), *map(flat, duals)])})
+
+    def curvature(self, x: Values, pull: Array) -> Array:
+        """Return second derivatives of ``pullᵀ leaves``, made definite along the scale between mu and b."""
+        problem = self.problem
+        found = np.zeros((problem.size, problem.size))
+        for product in self.products:
+            mu, b = problem.slices[product.mu], problem.slices[product.b]
+            block = pull[problem.space.places[product.name]].reshape(mu.stop - mu.start, -1, order="F")
+            found[mu, b] += block
+            found[b, mu] += block.T
+            if product.gauge == "norm":  # the linearised gauge fixes this direction; it only needs to be definite
+                found[b, b] += np.outer(flat(x[product.b]), flat(x[product.b])) * float(np.sum(x[product.mu] ** 2))
+        return found
+
+    def _active(self, x: Values, rows: Sequence[tuple[Constraint, Array, Array]], parts: Sequence[Array] | None
+                ) -> Array:
+        """Return the slopes of the gauges, of equalities and of inequalities with a multiplier; none without any."""
+        if parts is None:
+            return np.zeros((0, self.problem.size))
+        largest = max((float(np.max(np.abs(part), initial=0.0)) for part in parts), default=0.0)
+        found = [tangent if one.cone == "zero" else tangent[part > 1e-6 * largest]
+                 for (one, tangent, _), part in zip(rows, parts)]
+        return np.vstack([*(gauge for gauge, _ in gauges(self.problem, x)), *found])
+
+    def multipliers(self, x: Values, found: dict[str, Array]) -> dict[str, Array]:
+        """Return multipliers at x: those of the last step, or fitted to the gradient where that leaves less of it.
+
+        A step has multipliers for the point that it reaches, which differ where it moved a b that means nothing.
+        """
+        parts = _parts(self.constraints, found)
+        if parts is None or not all(one.cone in ("zero", "below") for one in self.constraints):
+            return found
+        problem, y, slope = self.problem, self.problem.leaf_values(x), self.problem.slope(x)
+        jacobian = self._jacobian(slope)
+        gradient = 2.0 * jacobian.T @ self.squares.residual(y)
+        units = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
+        held = [gauge * units for gauge, _ in gauges(problem, x)]
+        rows = np.vstack([np.zeros((0, problem.size)), *(one.rows @ slope * units for one in self.constraints)])
+        equal = np.concatenate([np.full(len(one), one.cone == "zero") for one in self.constraints])
+        active = np.concatenate([one.residual(problem.space, y) > -ACTIVE * size_of_terms(one, problem.space, y)
+                                 for one in self.constraints]) | equal
+        gauged, fitted = np.array(held).reshape(-1, problem.size), np.zeros(len(rows))
+        both = np.vstack([gauged, rows[active]])
+        weights, rest = fit_multipliers(both, -gradient * units, np.r_[np.full(len(gauged), True), equal[active]])
+        fitted[active] = weights[len(gauged) :]
+        left = rows.T @ np.concatenate(parts) + gradient * units
+        left = left - gauged.T @ np.linalg.lstsq(gauged.T, left)[0]
+        if rest >= np.linalg.norm(left):
+            return found
+        edges = np.cumsum([len(one) for one in self.constraints])[:-1]
+        return _by_name(self.constraints, np.split(fitted, edges))
+
+
+def _by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> dict[str, Array]:
+    """Join the multipliers of the members of every group, in the order in which these were stated."""
+    found: dict[str, list[tuple[int, Array]]] = {}
+    for one, part in zip(constraints, parts):
+        found.setdefault(one.name, []).append((one.position, part))
+    return {name: np.concatenate([part for _, part in sorted(several, key=lambda pair: pair[0])])
+            for name, several in found.items()}
+
+
+def _parts(constraints: Sequence[Constraint], duals: Mapping[str, Array]) -> list[Array] | None:
+    """Return the multipliers of every constraint out of those by name; None where some are missing."""
+    if any(one.name not in duals for one in constraints):
+        return None
+    return [duals[one.name][one.first : one.first + len(one)] for one in constraints]
+
+
+def _cholesky(matrix: Array, shift: float) -> Array | None:
+    try:
+        return np.linalg.cholesky(matrix + shift * np.eye(len(matrix)))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _definite(matrix: Array, rows: Array, shift: float) -> Array:
+    """Cholesky factor of a matrix made definite: across the active rows, and where that is not enough along them."""
+    size = float(np.max(np.abs(matrix)))
+    rank = np.linalg.matrix_rank(rows) if len(rows) else 0
+    basis = np.linalg.svd(rows, full_matrices=True)[2] if len(rows) else np.eye(len(matrix))
+    across, along = basis[:rank].T @ basis[:rank], basis[rank:].T
+    for weight in (1.0, 1e2, 1e4):
+        factor = _cholesky(matrix + weight * size * across, shift)
+        if factor is not None:
+            return factor
+    values, vectors = np.linalg.eigh(along.T @ matrix @ along)
+    vectors, values = along @ vectors, np.maximum(np.abs(values), 1e-10 * size)
+    return np.linalg.cholesky((vectors * values) @ vectors.T + size * across + shift * np.eye(len(matrix)))
+
+
+def _convex(one: Constraint) -> bool:
+    """Whether a constraint that is not rows is convex in the leaves, so that CVXPY states it."""
+    return one.cone == "psd" or one.cone == "other" and one.limit.member.is_dcp()
+
+
+def _is_below(one: Constraint) -> bool:
+    """Whether rows, or the tangents of another constraint, are inequalities."""
+    return one.cone == "below" or one.cone == "other" and not isinstance(one.limit.member, EQUALITIES)
