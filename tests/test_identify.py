@@ -252,15 +252,19 @@ def test_fits_without_a_block_go_on_from_the_whole_record(formulation, arguments
     assert np.sum(warm) < 1.05 * np.sum(errors)
 
 
-def stuck_on_the_whole(monkeypatch, module, data, good):
-    """Let fits of a module end in a poor optimum on the whole record and from there, in a good one elsewhere."""
+def stuck_on_the_whole(monkeypatch, module, data, good, before=0):
+    """Let fits of a module end in a poor optimum on the whole record and from there, in a good one elsewhere.
+
+    Without the first few blocks, so many before it shows, it is as poor as on the whole record.
+    """
     calls = []
 
     def scripted(given, formulation_name=None, *, initial=None, **arguments):
         calls.append((given is data, initial))
         from_poor = initial is not None and initial is not good.model
         lost = from_poor or (initial is None and given is data)
-        scale = 9.0 if from_poor else 1.2  # without a block it is much worse there
+        shown = from_poor and sum(not whole for whole, _ in calls) > before
+        scale = 9.0 if shown else 1.2  # without a block it is much worse there
         model = replace(good.model, B=scale * good.model.B) if lost else good.model
         return SimpleNamespace(model=model, solution=SimpleNamespace(
             objective=2.0 if lost else 1.0, status=good.solution.status))
@@ -269,20 +273,22 @@ def stuck_on_the_whole(monkeypatch, module, data, good):
     return calls
 
 
-def test_a_better_optimum_without_a_block_is_where_the_whole_fit_goes_on(monkeypatch):
+@pytest.mark.parametrize("before", [0, 1, 3])
+def test_a_better_optimum_without_a_block_is_where_the_whole_fit_goes_on(monkeypatch, before):
     """Functions of latent signals have many optima; what is chosen is fitted in the same way."""
     data = plant(400)
     good = optid.fit(data, "hammerstein_ss.sid", nx=1, basis="linear")
     candidate, blocks = Candidate(LATENT, "lfr.exact", {"nx": 1, "channels": 1}), Blocks.of(data)
-    calls = stuck_on_the_whole(monkeypatch, trying, blocks.data, good)
+    calls = stuck_on_the_whole(monkeypatch, trying, blocks.data, good, before)
     found = tried(candidate, blocks, None, {}, (), None)
-    assert found.complete and found.restarted == 0
+    order = (*blocks.moving[::2], *blocks.moving[1::2])
+    assert found.complete and found.restarted == order[before] and found.order == order
     expected = [blocks.errors(good.model, b)[0] for b in range(4)]
     np.testing.assert_allclose(found.energy[np.argsort(found.order)], expected, rtol=1e-12)
     assert found.estimation == pytest.approx(blocks.fit(good.model))
     # the whole record, a block warm and cold, the whole record from there, four blocks
-    assert [whole for whole, _ in calls] == [True, False, False, True, False, False, False, False]
-    assert all(initial is good.model for _, initial in calls[3:])
+    assert [whole for whole, _ in calls] == [True, *[False] * (2 + before), True, False, False, False, False]
+    assert all(initial is good.model for _, initial in calls[3 + before :])
 
     calls = stuck_on_the_whole(monkeypatch, searching, data, good)
     settings = {"constraints": (), "solver": "auto"}

@@ -197,7 +197,7 @@ def _steps(known: Trial, whole: Fit, fitted: Callable[..., Fit], blocks: Blocks,
     if rival is not None and (refusal := _no_better(known.candidate, energies, measures, rival)):
         yield replace(known, reason=refusal)
     order, refusal = (*blocks.moving[::2], *blocks.moving[1::2]), None  # every other one first
-    known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)))
+    known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)), order=())
     for done, b in enumerate(order, start=1):
         try:
             found, searched = _left_out(known.candidate, fitted, blocks, b, horizon, whole.model, energies[b])
