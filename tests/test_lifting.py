@@ -72,6 +72,7 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
     assert not lifted.refused and not lifted.cones
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     rng = np.random.default_rng(1)
+    _ = program.objective  # which states it
     for _ in range(5):
         a, mu, b, d = rng.normal(size=2), rng.normal(size=6), rng.normal(size=2), rng.normal(size=1)
         program.assign({"a": a, "mu": mu, "b": b, "offset": d})
