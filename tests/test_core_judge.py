@@ -77,6 +77,23 @@ def test_prices_are_those_of_the_programme(words, m):
         assert one.points_per_step == pytest.approx(other.points_per_step, rel=2e-3, abs=1e-4)
 
 
+def test_the_price_of_a_matrix_is_that_of_the_programme():
+    def build(v):
+        first, second = v["a"][:1], v["a"][1:]
+        return {"matrix": 5 * (cp.bmat([[first, second], [second, first]]) + 0.95 * np.eye(2)) >> 0}
+
+    linear = arx_problem(compress(RECORD, na=2, nb=2, nk=1, basis="linear"), (build,))
+    for problem in (exact_problem(3, (build,)), linear):
+        x, solution = solved(problem)
+        theirs = program_prices(replace(as_program(problem), core=None), solution)
+        judged = judge(problem, x, solution.duals)
+        assert judged.residuals.stationarity <= 1e-6 and theirs[0].active == 1
+        ours = price_constraints(problem, x, judged.duals, judged.objective)
+        assert ours[0].multiplier == pytest.approx(theirs[0].multiplier, rel=1e-3)
+        assert ours[0].points_per_step == pytest.approx(theirs[0].points_per_step, rel=1e-3)
+        assert ours[0].slack == pytest.approx(theirs[0].slack, abs=1e-7)
+
+
 def test_degenerate_multipliers_are_priced_by_the_least():
     def twice(v):
         return {"one": v["a"][0] <= -1.0, "same": 2 * v["a"][0] <= -2.0, "idle": v["a"][1] >= -50}

@@ -34,7 +34,7 @@ class Constraint:
         name: of the group.
         limit: the constraint as the user wrote it, its bound, and what its rows were divided by.
         cone: "zero", "below", "psd", or "other" where CVXPY alone measures it.
-        rows: (m, leaves), divided by their sizes; zeros where the cone is "other".
+        rows: (m, leaves), but for a matrix divided by their sizes; zeros where the cone is "other".
         right: (m,).
         moving: whether its builder looked at values of an iterate.
         builder: position of its builder.
@@ -180,11 +180,10 @@ class ConstraintReader:
         rows, right = np.zeros((parts[1].size, self.space.size)), -parts[1]
         for variable, part in parts[0].items():
             rows[:, self.space.places[leaves[variable.id]]] = part.toarray() if hasattr(part, "toarray") else part
-        sizes = np.abs(rows) @ self.space.entry_sizes
         if cone == "psd":
-            sizes = np.full(len(right), float(np.max(sizes, initial=0.0)) or 1.0)
-        else:  # no solver sees the units in which a row was written
-            sizes = np.where(sizes > NEGLIGIBLE * np.abs(right), sizes, 1.0)
+            return Constraint(name, limit, cone, rows, right, moving, number)
+        sizes = np.abs(rows) @ self.space.entry_sizes  # no solver sees the units in which a row was written
+        sizes = np.where(sizes > NEGLIGIBLE * np.abs(right), sizes, 1.0)
         return Constraint(name, replace(limit, sizes=sizes), cone, rows / sizes[:, None], right / sizes, moving, number)
 
 
