@@ -7,7 +7,8 @@ contain one of the words, or of all. Recorded are objective, status, proof, verd
 errors, the free run, and the figures of the printed text, without its wording.
 
 Tolerances are those of the method: an equation error has one optimum to the accuracy of a factorisation; a descent on
-simulation or prediction errors ends within 1e-6 of its own, where multipliers hold half the digits; subspace procedures
+simulation or prediction errors, or on the likelihood of a prior, ends within 1e-6 of its own, where multipliers hold
+half the digits; subspace procedures
 pass on the accuracy of the conic programmes on their way.
 """
 
@@ -112,9 +113,9 @@ def fits() -> dict[str, tuple[Tolerances, Callable[[], Any]]]:
         "arx a level each": (EQUATION, one(experiments, "arx", offset="each", **arx)),
         "arx gain, sign": (EQUATION, one(linear, "arx", constraints=["gain:6", "sign:b,positive"], **arx)),
         "arx stable": (CONIC, one(linear, "arx", constraints=["stable:0.6"], **arx)),
-        "arx tc": (CONIC, one(linear, "arx", prior="tc", **arx)),
+        "arx tc": (DESCENT, one(linear, "arx", prior="tc", **arx)),
         "arx huber": (CONIC, one(linear, "arx", loss="huber", **arx)),
-        "fir dc": (CONIC, one(linear, "fir", nb=30)),
+        "fir dc": (DESCENT, one(linear, "fir", nb=30)),
         "exact": (EQUATION, one(siso, exact, **hammerstein)),
         "exact two inputs": (EQUATION, one(miso, exact, **hammerstein)),
         "exact two outputs": (EQUATION, one(mimo, exact, **hammerstein)),
