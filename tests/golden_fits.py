@@ -8,8 +8,7 @@ errors, the free run, and the figures of the printed text, without its wording.
 
 Tolerances are those of the method: an equation error has one optimum to the accuracy of a factorisation; a descent on
 simulation or prediction errors, or on the likelihood of a prior, ends within 1e-6 of its own, where multipliers hold
-half the digits; subspace procedures
-pass on the accuracy of the conic programmes on their way.
+half the digits; subspace procedures pass on the accuracy of the conic programmes on their way.
 """
 
 import argparse
