@@ -115,6 +115,7 @@ def test_a_product_its_slope_chain_and_gauge(gauge, shape):
     scaled = one.in_gauge(x)
     assert one.level(scaled)[0] == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(one.value(scaled), one.value(x))
+    assert np.all(np.isfinite(one.in_gauge({**x, "a": np.array([-1.5, 0.5])})["mu[valve]"]))  # a pole at 1
     nothing = {**x, "b[valve]": np.zeros(shape)}
     assert np.all(np.isfinite(one.in_gauge(nothing)["mu[valve]"]))
 

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
+from optid.core.constraint import join_by_name
 from optid.core.problem import Problem
 from optid.core.terms import Squares
 from optid.program.expressions import solve_quietly
@@ -181,12 +182,8 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     if not found.values:
         return found
     x = problem.unpack(found.values["x"] * sizes)
-    duals: dict[str, list[np.ndarray]] = {}
     edges = np.cumsum([0, *map(len, held)])
     parts = [unit**2 * found.duals["rows"][a:b] / size for a, b, size in zip(edges, edges[1:], units)]
-    for one, part in sorted(zip(held, parts), key=lambda pair: pair[0].position):
-        duals.setdefault(one.name, []).append(part)
     residual = squares.residual(problem.leaf_values(x))
-    return Answer(found.status, found.word, {**x, "residual": residual}, {
-        "residual": -2.0 * residual, **{name: np.concatenate(several) for name, several in duals.items()}},
-        found.iterations)
+    return Answer(found.status, found.word, {**x, "residual": residual},
+                  {"residual": -2.0 * residual, **join_by_name(held, parts)}, found.iterations)

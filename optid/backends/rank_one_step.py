@@ -17,8 +17,8 @@ from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Settings
-from optid.backends.conic import solve_least_squares, tolerances
-from optid.core.constraint import Constraint
+from optid.backends.conic import SHARP, solve_least_squares, tolerances
+from optid.core.constraint import Constraint, join_by_name
 from optid.core.judge import ACTIVE, gauges, size_of_terms
 from optid.core.leaves import Product
 from optid.core.problem import Problem
@@ -28,7 +28,6 @@ from optid.program.limits import EQUALITIES
 from optid.program.solution import Status
 from optid.structures.multipliers import fit_multipliers
 
-INNER = 1e-11  # accuracy of the quadratic programmes
 TINY = 1e-300
 GAUGE = "gauge"  # under which the multipliers of the gauges stand beside those of the constraints
 
@@ -48,7 +47,7 @@ class RankOneStep:
         # in the order of the sides of a programme: equalities, inequalities, and what CVXPY alone states
         self.tangents = tuple(sorted((one for one in self.constraints if not _convex(one)), key=_is_below))
         self.convex = tuple(one for one in self.constraints if _convex(one))
-        self.settings = Settings(accuracy=INNER, warm=False)
+        self.settings = Settings(accuracy=SHARP, warm=False)
 
     @cached_property
     def products(self) -> list[Product]:
@@ -135,7 +134,7 @@ class RankOneStep:
         counts = np.cumsum([pins, *map(len, self.tangents), *map(len, self.convex)])
         multipliers = [unit**2 * found.duals["rows"][a:b] / u
                        for a, b, u in zip(counts, counts[1:], [*units, *[1.0] * len(self.convex)])]
-        named = _by_name((*self.tangents, *self.convex), multipliers)
+        named = join_by_name((*self.tangents, *self.convex), multipliers)
         if not pinned:
             named[GAUGE] = unit**2 * found.duals["rows"][:pins]
         return problem.unpack(found.values["x"] * sizes), named
@@ -210,23 +209,14 @@ class RankOneStep:
         if rest >= np.linalg.norm(left):
             return found
         edges = np.cumsum([len(one) for one in self.constraints])[:-1]
-        return _by_name(self.constraints, np.split(fitted, edges))
-
-
-def _by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> dict[str, Array]:
-    """Join the multipliers of the members of every group, in the order in which these were stated."""
-    found: dict[str, list[tuple[int, Array]]] = {}
-    for one, part in zip(constraints, parts):
-        found.setdefault(one.name, []).append((one.position, part))
-    return {name: np.concatenate([part for _, part in sorted(several, key=lambda pair: pair[0])])
-            for name, several in found.items()}
+        return join_by_name(self.constraints, np.split(fitted, edges))
 
 
 def _parts(constraints: Sequence[Constraint], duals: Mapping[str, Array]) -> list[Array] | None:
     """Return the multipliers of every constraint out of those by name; None where some are missing."""
     if any(one.name not in duals for one in constraints):
         return None
-    return [duals[one.name][one.first : one.first + len(one)] for one in constraints]
+    return [duals[one.name][one.span] for one in constraints]
 
 
 def _cholesky(matrix: Array, shift: float) -> Array | None:

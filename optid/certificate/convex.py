@@ -74,7 +74,7 @@ def _bound_by_rows(problem: Problem, form: LeastSquaresStructure, values: Values
     for one in problem.constraints():
         if one.name not in duals:
             return -np.inf
-        dual = in_dual_cone(one, duals[one.name][one.first : one.first + len(one)])
+        dual = in_dual_cone(one, duals[one.name][one.span])
         columns = np.concatenate([one.rows[:, problem.space.places[name]] for name in form.linear], axis=1)
         pull, value = pull + columns.T @ dual, value + float(dual @ one.residual(problem.space, x))
     step = solve_triangular(root, pull, trans=1)

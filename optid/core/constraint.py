@@ -56,6 +56,11 @@ class Constraint:
         return len(self.right)
 
     @property
+    def span(self) -> slice:
+        """Its place in the flat multipliers of its group."""
+        return slice(self.first, self.first + len(self))
+
+    @property
     def sizes(self) -> Array:
         """What the rows were divided by (m,)."""
         return np.broadcast_to(self.limit.sizes, (len(self),))
@@ -87,6 +92,15 @@ class Constraint:
         if self.cone == "psd":
             return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
         return float(np.sum(np.maximum(g, 0.0)))
+
+
+def join_by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> dict[str, Array]:
+    """Join the multipliers of the members of every group, in the order in which these were stated."""
+    found: dict[str, list[tuple[int, Array]]] = {}
+    for one, part in zip(constraints, parts):
+        found.setdefault(one.name, []).append((one.position, part))
+    return {name: np.concatenate([part for _, part in sorted(several, key=lambda pair: pair[0])])
+            for name, several in found.items()}
 
 
 def symmetric_part(vector: Array) -> Array:

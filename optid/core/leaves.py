@@ -61,8 +61,11 @@ class Product:
     def in_gauge(self, x: Values) -> dict[str, Array]:
         """Return the point with the same product in the gauge; as it is where that is not possible."""
         b = flat(x[self.b])
-        size = {"norm": float(np.linalg.norm(b)), "b0": float(b[0])}.get(
-            self.gauge, float(b.sum()) / (1.0 + float(np.sum(x.get("a", 0.0)))))
+        if self.gauge == "gain":
+            rest = 1.0 + float(np.sum(x.get("a", 0.0)))
+            size = float(b.sum()) / rest if rest else 0.0  # a pole at 1 has no static gain
+        else:
+            size = float(np.linalg.norm(b)) if self.gauge == "norm" else float(b[0])
         if not np.isfinite(size) or size == 0:
             return dict(x)
         return {**x, self.mu: x[self.mu] * size, self.b: x[self.b] / size}

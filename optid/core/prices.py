@@ -31,9 +31,9 @@ def price_constraints(problem: Problem, x: Values, duals: Mapping[str, Array], o
     for name in problem.constraint_names:
         group = [row for row in rows if row.constraint.name == name]
         gaps = [_slacks(row) for row in group]
-        active = sum(int(np.count_nonzero(gap <= ACTIVE * _size(row))) for row, gap in zip(group, gaps))
+        active = sum(int(np.count_nonzero(gap <= ACTIVE * row.size_in_words)) for row, gap in zip(group, gaps))
         limits = tuple(row.constraint.limit for row in group)
-        steps = [0.01 * _size(row) if limit.step is None else limit.step() for row, limit in zip(group, limits)]
+        steps = [0.01 * row.size_in_words if limit.step is None else limit.step() for row, limit in zip(group, limits)]
         choose = None if exchange is None else partial(exchange, name)
         slope, chosen = slope_of(limits, steps, duals[name], choose) if name in duals else (np.nan, 0)
         found.append(Price(
@@ -53,11 +53,6 @@ def _slacks(row: RowsAtPoint) -> Array:
     return -row.residual * sizes
 
 
-def _size(row: RowsAtPoint) -> float:
-    """Size of the terms of a constraint, in its own units."""
-    return row.size_in_words
-
-
 def least_multipliers(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], duals: Mapping[str, Array]
                       ) -> Callable[[str, Array], Array] | None:
     """Return, for an effect of the multipliers of a named constraint, those of all at the point that have the least.
@@ -75,11 +70,10 @@ def least_multipliers(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], 
         np.full(len(part), row.constraint.cone == "zero") for row, (part, _) in zip(rows, parts))])
     places = [(GAUGE, slice(k, k + 1), np.ones(1)) for k in range(len(held))]
     for row, (_, stands) in zip(rows, parts):
-        span = slice(row.constraint.first, row.constraint.first + len(row.constraint))
-        places += [(row.constraint.name, span, direction) for direction in stands]
+        places += [(row.constraint.name, row.constraint.span, direction) for direction in stands]
     known = [duals.get(row.constraint.name, np.zeros(0)) for row in rows]
     weights = lagrangian.gauge_multipliers(rows, [
-        part[row.constraint.first : row.constraint.first + len(row.constraint)] for row, part in zip(rows, known)]
+        part[row.constraint.span] for row, part in zip(rows, known)]
     ) if all(part.size for part in known) else np.zeros(len(held))
     return exchange_multipliers(columns / floor, equality, places, -lagrangian.gradient / floor,
                                 {**duals, GAUGE: weights})

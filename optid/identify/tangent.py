@@ -84,7 +84,7 @@ class Tangent:
 
         Where parameters all but cancel, the linear model takes them far beyond where it holds. Along the directions
         that change the quantity most they go one standard deviation, or as far as the objective lets them. None where
-        the objective is not known.
+        the objective is not known, or lets them go nowhere.
         """
         if self.objective is None or self.rebuild is None:
             return None
@@ -97,11 +97,13 @@ class Tangent:
             move = self.local.scatter @ turn
             ends = [self._moved(quantity, here, sign * self.directions @ move, before + BENT * float(move @ move))
                     for sign in (1.0, -1.0)]
-            squares = squares + np.mean(np.square(ends), axis=0)
+            if any(end is None for end in ends):
+                return None
+            squares = squares + np.mean(np.square(np.array(ends, dtype=float)), axis=0)
         return np.sqrt(squares)
 
-    def _moved(self, quantity: Quantity, here: Array, step: Array, most: float) -> Array:
-        """Return the change of a quantity by a step, halved until the objective is at most so large."""
+    def _moved(self, quantity: Quantity, here: Array, step: Array, most: float) -> Array | None:
+        """Return the change of a quantity by a step, halved until the objective is at most so large; None if never."""
         assert self.objective is not None
         for k in range(HALVINGS):
             values = _unpacked(self.shapes, self.x + step / 2**k)
@@ -110,7 +112,7 @@ class Tangent:
                     there = np.ravel(np.asarray(quantity(self.rebuild(values)), dtype=float))
                     if np.all(np.isfinite(there)):
                         return there - here
-        return np.zeros_like(here)
+        return None
 
     @cached_property
     def neighbours(self) -> list[tuple[Any, Any, float]]:
