@@ -235,13 +235,10 @@ def gauges(problem: Problem, x: Values) -> list[tuple[Array, Array]]:
 
 def _projected(rows: Sequence[RowsAtPoint], duals: Mapping[str, Array]) -> list[Array] | None:
     """Return the multipliers of a solver on the dual cones; None where one is missing or not finite."""
-    found, taken = [], {}
+    found = []
     for row in rows:
-        name, m = row.constraint.name, len(row.constraint)
-        start = taken.get(name, 0)
-        taken[name] = start + m
-        part = np.ravel(np.asarray(duals.get(name, ()), dtype=float))[start : start + m]
-        if part.size != m or not np.all(np.isfinite(part)):
+        part = np.ravel(np.asarray(duals.get(row.constraint.name, ()), dtype=float))[row.constraint.span]
+        if part.size != len(row.constraint) or not np.all(np.isfinite(part)):
             return None
         found.append(in_dual_cone(row.constraint, part))
     return found
