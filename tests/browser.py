@@ -16,7 +16,11 @@ NO_BROWSER = "no chromium, chromium-browser or google-chrome on PATH"
 QUIET = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
          "--disable-background-networking", "--disable-component-update", "--disable-dev-shm-usage")
 DRIVEN = ("--allow-pre-commit-input", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
-          "--remote-debugging-pipe")
+          "--remote-debugging-pipe", "--disable-background-timer-throttling", "--disable-renderer-backgrounding",
+          "--disable-backgrounding-occluded-windows", "--disable-hang-monitor")
+# two frames; a browser that draws none while it is starved of the processor would otherwise never go on
+DREW = ("new Promise((done) => { setTimeout(done, 1000); "
+        "requestAnimationFrame(() => requestAnimationFrame(done)); })")
 KEYS = {"Enter": (13, "\r"), "Tab": (9, ""), "Escape": (27, ""), "ArrowLeft": (37, ""), "ArrowRight": (39, ""),
         "ArrowUp": (38, ""), "ArrowDown": (40, ""), " ": (32, " ")}
 
@@ -169,8 +173,8 @@ class Browser:
     def where(self, selector: str) -> dict[str, float]:
         """Scroll an element into view, let the page come to rest, and return its place in the window."""
         return self.run(f"(async () => {{ const e = document.querySelector({json.dumps(selector)}); "
-                        "e.scrollIntoView({block: 'center', behavior: 'instant'}); for (let k = 0; k < 2; k++) "
-                        "await new Promise((done) => requestAnimationFrame(done)); const r = e.getBoundingClientRect();"
+                        "e.scrollIntoView({block: 'center', behavior: 'instant'}); "
+                        f"await {DREW}; const r = e.getBoundingClientRect(); "
                         "return {x: r.x, y: r.y, width: r.width, height: r.height}; })()")
 
     def mouse(self, kind: str, x: float, y: float, **more: Any) -> None:

@@ -22,9 +22,21 @@ from optid.identify.search import identify
 from optid.identify.search import search as searching
 from optid.identify.search import trial as trying
 from optid.identify.search.cpu_limit import OutOfTime, cpu_limit
-from optid.identify.search.ladder import RUNGS, Ladder, bases
+from optid.identify.search.determined import determined_bases
+from optid.identify.search.ladder import RUNGS, Ladder
 from optid.identify.search.pool import Pool
-from optid.identify.search.trial import CLEAR, INPUTS, KINDS, LATENT, LINEAR, Candidate, Trial, free_parameters, tried
+from optid.identify.search.trial import (
+    CLEAR,
+    FEEDBACK,
+    INPUTS,
+    KINDS,
+    LATENT,
+    LINEAR,
+    Candidate,
+    Trial,
+    free_parameters,
+    tried,
+)
 from optid.models.layout import Layout
 from optid.statistics import collect
 
@@ -440,8 +452,8 @@ def test_a_basis_has_no_more_functions_than_the_samples_determine():
     three, gap = rng.choice([-1.0, 0.2, 1.0], 500), np.concatenate([rng.uniform(0, 1, 250), rng.uniform(5, 6, 250)])
     smooth, one = rng.normal(size=500), rng.choice([0.0, 1.0], 500)
     data = optid.Data(np.column_stack([three, gap, smooth, one]), rng.normal(size=500))
-    assert bases(data, "polynomial:3") == ["polynomial:2", "polynomial:3", "polynomial:3", "linear"]
-    words = bases(data, "triangular:10")
+    assert determined_bases(data, "polynomial:3") == ["polynomial:2", "polynomial:3", "polynomial:3", "linear"]
+    words = determined_bases(data, "triangular:10")
     assert words[0] in ("triangular:2", "linear") and words[3] == "linear" and words[1] != "triangular:10"
     fit = optid.fit(data, "hammerstein_oe.exact", na=1, nb=1, basis=words, prove=False)  # no cell is empty
     assert fit.solution.status.value == "locally optimal"
@@ -595,3 +607,30 @@ def test_the_trials_do_not_depend_on_the_number_of_processes(short):
     assert [(t.candidate.key, t.score, t.energy.tolist()) for t in one.trials] == [
         (t.candidate.key, t.score, t.energy.tolist()) for t in two.trials]
     assert one.units == two.units and one.fit.model.to_dict() == two.fit.model.to_dict()
+
+
+def test_a_model_that_leaves_the_range_when_the_inputs_come_otherwise_is_dropped(monkeypatch):
+    data = plant(400)
+    blocks = Blocks.of(data)
+    fit = optid.fit(data, "arx", na=1, nb=1, nk=1)
+    assert blocks.excursion(fit.model) < 0.2
+    u = np.concatenate([data.u, data.u[::-1], np.roll(data.u, 200, axis=0)])  # of a state at rest
+    state = fit.model.initial_state(data.window(0, 132))
+    run, y = fit.model.simulate(u, x0=state)[400:], data.y
+    expected = max(y.min() - run.min(), run.max() - y.max()) / (y.max() - y.min())
+    assert blocks.excursion(fit.model) == pytest.approx(max(expected, 0.0), abs=1e-12)
+    candidate = Candidate(LATENT, "wiener_ss.exact", {"nx": 1, "output_basis": "polynomial:3"})
+    assert tried(candidate, blocks, None, {}, (), None).complete
+    monkeypatch.setattr(Blocks, "excursion", lambda *_: 0.6)
+    assert "leaves the range of the outputs" in tried(candidate, blocks, None, {}, (), None).reason
+    assert tried(candidate, blocks, None, {}, (), 1).complete  # predictions do not run freely
+    assert tried(Candidate(LINEAR, "arx", {"na": 1, "nb": 1, "nk": [1]}), blocks, None, {}, (), None).complete
+
+
+def test_functions_of_states_have_one_level_for_all_experiments():
+    data = optid.Data.join(plant(200), plant(200, seed=1).mapped(lambda u: u, lambda y: y + 3))
+    ladder = Ladder.of(Blocks.of(data), several=True)
+    assert ladder.levels_differ
+    for kind, formulation, word in ((LINEAR, "oe.exact", "each"), (INPUTS, "hammerstein_oe.exact", "each"),
+                                    (LATENT, "wiener_ss.exact", None), (FEEDBACK, "hammerstein_ss.exact", None)):
+        assert ladder.levelled(Candidate(kind, formulation, {"nx": 2})).arguments.get("offset") == word

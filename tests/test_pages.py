@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, NO_BROWSER, Browser
+from browser import CHROMIUM, DREW, NO_BROWSER, Browser
 from sample_fits import example_fit, feedback_fit, mimo_fit, two_by_two
 
 import optid
@@ -97,8 +97,7 @@ def shown(browser, path, width, dark=False):
     ready = float(browser.run("document.documentElement.dataset.ready"))
     browser.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
     browser.run("(async () => { for (const host of document.querySelectorAll('[data-chart]')) { host.scrollIntoView("
-                "{behavior: 'instant'}); await new Promise((done) => requestAnimationFrame(() => "
-                "requestAnimationFrame(done))); } })()")
+                f"{{behavior: 'instant'}}); await {DREW}; }} }})()")
     browser.wait(DRAWN)
     return ready
 

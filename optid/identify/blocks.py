@@ -1,23 +1,26 @@
 """Blocked cross-validation: contiguous blocks of a record, each left out of the fit once and simulated by it.
 
 Neighbouring samples are not independent, so that leaving out single samples would test nothing. The parts on both sides
-of a block become experiments of their own; the model fitted to them is simulated over the block.
+of a block become experiments of their own; the model fitted to them is simulated over the block. Where inputs repeat
+their moves, in experiments or periods, a block is the same piece of all of them.
 """
 
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, as_list, check_integer
 from optid.data.record import Data
+from optid.data.repeats import Part, copies
 from optid.data.stretches import between_gaps
 from optid.errors import DataError, OptidError, RankError
 
 SHORTEST = 10  # samples of a part of an experiment: the output of shorter ones is mostly that of the initial state
+PHASE, MOVES = 50, 4  # samples and moves of inputs in a block of what is repeated; shorter repetitions are kept whole
 NEAR = 0.15  # an experiment that ends this near to the border of two blocks, as a share of their length, moves it
 LEAD, LEAST = 0.33, 30  # share of a block that the initial state of unstable models is fitted to; samples at least
 PIECES = 20  # stretches of a record at most: every one costs time of its own
@@ -31,14 +34,6 @@ fitted to the beginning of the block is too inaccurate for plants that integrate
 """
 
 
-class Part(NamedTuple):
-    """Samples first to last - 1 of one experiment."""
-
-    experiment: int
-    first: int
-    last: int
-
-
 @dataclass(frozen=True, eq=False)
 class Blocks:
     """A record divided into blocks, each made of parts of experiments."""
@@ -50,7 +45,8 @@ class Blocks:
     def of(cls, data: Data, count: int = 4) -> "Blocks":
         """Divide a record into blocks of nearly equal length; a `RankError` where it is too short."""
         check_integer(count, "blocks", 2)
-        lengths = [e.n_samples for e in data.experiments]
+        repeated = _repeated(data, count)
+        lengths = [group[0].last - group[0].first for group in repeated]
         ends = np.cumsum(lengths)
         total = int(ends[-1])
         if total < count * SHORTEST:
@@ -62,8 +58,9 @@ class Blocks:
             cuts.append(border if abs(border - cut) <= NEAR * total / count else cut)
         parts = []
         for low, high in zip(cuts, [*cuts[1:], total]):
-            inside = [Part(i, max(low - s, 0), min(high, e) - s) for i, (s, e) in enumerate(zip(ends - lengths, ends))
-                      if s < high and e > low]
+            inside = [Part(one.experiment, one.first + max(low - s, 0), min(one.first + min(high, e) - s, one.last))
+                      for group, s, e in zip(repeated, ends - lengths, ends) if s < high and e > low
+                      for one in group if one.first + max(low - s, 0) < one.last]
             parts.append(tuple(p for p in inside if p.last - p.first >= SHORTEST) or tuple(inside))
         return cls(data, tuple(parts))
 
@@ -160,9 +157,45 @@ class Blocks:
             return True
         return any(np.any(np.abs(run - e.y) > RUNAWAY * self.outputs[1]) for run, e in zip(runs, part.experiments))
 
+    def excursion(self, model: Any) -> float:
+        """Return how far a free run leaves the range of an output when the inputs come in other orders, in ranges.
+
+        After every experiment, from a state fitted to its first third, come its inputs backwards, and then from the
+        middle on: what a function of a latent signal does beside the samples it was fitted to shows in no block, and
+        a plant meets it with the next record.
+        """
+        whole = between_gaps(self.data.raw(), 2).raw()
+        y = np.vstack([e.y for e in whole.experiments])
+        low, high = np.nanmin(y, axis=0), np.nanmax(y, axis=0)
+        largest = 0.0
+        for i, e in enumerate(whole.experiments):
+            n = e.n_samples
+            try:
+                state = model.initial_state(whole.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
+                run = model.simulate(np.concatenate([e.u, e.u[::-1], np.roll(e.u, n // 2, axis=0)]), x0=state)[n:]
+            except OptidError:
+                return np.inf
+            with np.errstate(over="ignore", invalid="ignore"):
+                beyond = np.maximum(low - run, run - high) / np.maximum(high - low, 1e-300)
+            largest = max(largest, float(np.max(np.where(np.isfinite(beyond), beyond, np.inf))))
+        return largest
+
     def fit(self, model: Any, horizon: int | None = None) -> float:
         """Return the fit in % of one model over all blocks; minus infinity where it diverges in one."""
         return pooled_fit(*map(np.array, zip(*(self.errors(model, b, horizon) for b in range(len(self))))))
+
+
+def _repeated(data: Data, count: int) -> list[list[Part]]:
+    """Return the experiments, one list each, or where long sequences of moves come again all copies of each."""
+    u = [e.u for e in data.experiments]
+    whole = [[Part(i, 0, len(one))] for i, one in enumerate(u)]
+    groups = copies(u)
+    for group in groups:
+        i, first, last = group[0]
+        moving = np.any(np.diff(u[i][first:last], axis=0) != 0, axis=1)
+        if len(group) > 1 and (last - first < count * PHASE or np.sum(moving) < count * MOVES):
+            return whole
+    return groups if len(groups) < sum(map(len, groups)) else whole
 
 
 def stretches(data: Data, most: int, count: int = 5) -> Data:

@@ -13,8 +13,9 @@ from optid.arrays import Array
 from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data.record import Data
+from optid.data.repeats import Part
 from optid.errors import RankError
-from optid.identify.blocks import Blocks, Part, joined
+from optid.identify.blocks import Blocks, joined
 from optid.statistics import Layout, Statistics, accumulate
 
 Places = NDArray[np.intp]

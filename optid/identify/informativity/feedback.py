@@ -13,11 +13,12 @@ from typing import Literal
 import numpy as np
 
 from optid.arrays import Array
+from optid.data.repeats import copies
 from optid.identify.informativity.lags import added, lagged, memory, powers, stacked
 from optid.identify.informativity.process import Process
 from optid.identify.informativity.signals import RecordSignals, delayed, respond
 
-LEVEL = 1e-3  # of the test of one input, shared by the outputs
+LEVEL = 2e-4  # of the test of one input, shared by the outputs
 LED = 0.9  # share of the innovations of one of several inputs that outputs must leave at most, if its future is silent
 SUPPORTED = 0.05  # of the future of one of several inputs, where its present has the sign of a controller
 LEADS, LAGS, SHAPED = 6, 12, 4  # future and past samples of an input; samples of its response
@@ -94,12 +95,19 @@ def _tested(signals: RecordSignals, c: int, o: int, process: Process) -> tuple[f
     if not columns or len(columns[3]) < 2 * columns[0].shape[1]:
         return 1.0, 1.0, True
     past, now, future, y = columns
-    ahead = added(y, np.hstack([past, now]), future)
-    present = added(y, past, now)
+    again = _repeats(signals, c)
+    ahead = added(y, np.hstack([past, now]), future, again)
+    present = added(y, past, now, again)
     slope = float(np.linalg.lstsq(np.hstack([past, now[:, :1]]), y, rcond=1e-10)[0][-1])
     response = process.responses[c]
     sign = float(response.b.sum()) * (-1.0 if np.count_nonzero(response.poles.real > 1) % 2 else 1.0)
     return ahead.p_value, present.p_value, slope * sign > 0
+
+
+def _repeats(signals: RecordSignals, c: int) -> float:
+    """Return the samples of a record over those within which input c makes new moves."""
+    new = sum(group[0].last - group[0].first for group in copies([u[:, None] for u in signals.inputs(c)]))
+    return signals.samples / new
 
 
 def setpoint(signals: RecordSignals, c: int) -> int | None:

@@ -23,8 +23,11 @@ class Added:
     columns: int
 
 
-def added(target: Array, base: Array, more: Array) -> Added:
-    """Test whether further columns (N, k) explain what a base (N, n) leaves of a target (N,)."""
+def added(target: Array, base: Array, more: Array, repeats: float = 1.0) -> Added:
+    """Test whether further columns (N, k) explain what a base (N, n) leaves of a target (N,).
+
+    Where the rows say the same several times, what they save counts once.
+    """
     q = _span(base)
     rest = target - q @ (q.T @ target)
     more = more / np.maximum(np.linalg.norm(more, axis=0), 1e-300)
@@ -38,7 +41,7 @@ def added(target: Array, base: Array, more: Array) -> Added:
     along = turned[:, distinct].T @ (new.T @ rest)
     saved, energy = float(np.sum(along**2 / size[distinct])), float(rest @ rest)
     kept = max(energy - saved, ROUNDING * float(target @ target), 1e-300)
-    ratio = saved / columns / (kept / spare)
+    ratio = saved / columns / (kept / spare) / repeats
     return Added(float(fdtrc(columns, spare, ratio)), saved / (saved + kept), columns)
 
 

@@ -12,28 +12,25 @@ from typing import Any
 
 import numpy as np
 
-from optid.arrays import Array
-from optid.bases import parse
 from optid.data.record import Data
 from optid.errors import OptidError
 from optid.identify.blocks import Blocks
 from optid.identify.informativity import Informativity, Process, informativity
 from optid.identify.lag_sums import LagSums, linear, scan
 from optid.identify.levels import LevelEvidence, level_evidence
+from optid.identify.search.determined import determined_bases
 from optid.identify.search.trial import CLEAR, FEEDBACK, INPUTS, KINDS, LATENT, LINEAR, Candidate, Trial, near
 
 Rung = Generator[list[Candidate], list[Trial], None]
 
-ONE_LEVEL = ("hammerstein_ss.sid", "lfr.exact")  # formulations with one constant for all experiments
+ONE_LEVEL = ("hammerstein_ss.sid",)  # formulations with one constant for all experiments, beside feedback and latent
 PATIENCE = 2  # successive orders without improvement after which a rung ends
 LARGEST, MOST_LATENT = 10, 8  # largest number of states, and that beside functions of latent signals
 MOST_CHANNELS = 3  # latent signals
 SAME_ORDER = 0.003  # relative difference of errors within which linear models say the same of the order
 RISE = 0.95  # ratio of the errors on the record above which one more latent signal, or a richer class, has not helped
-LINE = "linear"  # the basis of one function
 SMOOTH, FLEXIBLE, ENOUGH = "polynomial:3", "bspline:8", 1000
 """First basis of latent functions on short records, that on records of so many samples."""
-FEWEST = 0.3  # samples that must determine every function of a basis: the largest of a record determines the end
 FEW_MOVES = 8
 """Moves of an input below which order and dead time are chosen by the likelihood: blocks without moves say little."""
 FINEST = 0.01  # share of the error (100 % less the cross-validated fit) that counts as an improvement
@@ -78,9 +75,18 @@ class Ladder:
 
     def levelled(self, candidate: Candidate) -> Candidate:
         """Return a candidate with a level for every experiment, where the record has them and the method knows them."""
-        if self.levels is None or self.levels.offset is True or candidate.formulation in ONE_LEVEL:
+        if not self.levels_differ or candidate.kind in (FEEDBACK, LATENT) or candidate.formulation in ONE_LEVEL:
             return candidate
         return replace(candidate, arguments={**candidate.arguments, "offset": "each"})
+
+    @property
+    def levels_differ(self) -> bool:
+        """Whether every experiment has a level of its own."""
+        return self.levels is not None and self.levels.offset == "each"
+
+    def bases(self, word: str) -> Any:
+        """Return a basis for all inputs, with as many functions as the samples of each determine."""
+        return determined_bases(self.data, word, apart=self.levels_differ)
 
     @property
     def few_moves(self) -> bool:
@@ -146,33 +152,6 @@ class Ladder:
         least = min((100 - t.score for t in several), default=0.0)
         return min((int(t.candidate.arguments["nx"]) for t in several if 100 - t.score <= (1 + SAME_ORDER) * least),
                    default=2)
-
-
-def binary(data: Data) -> bool:
-    """Whether no input has more than two levels, between which static functions cannot be told apart."""
-    return all(np.unique(_sorted(data, c)).size <= 2 for c in range(data.m))
-
-
-def bases(data: Data, word: str) -> Any:
-    """Return a basis for all inputs, with as many functions as the samples of each determine."""
-    found = [_determined(word, _sorted(data, c)) for c in range(data.m)]
-    return found[0] if len(set(found)) == 1 else found
-
-
-def _determined(word: str, u: Array) -> str:
-    """Return a basis, or the largest of its family that sorted samples u (N,) determine; else a straight line.
-
-    Every combination of its functions must vary over the samples as much as one does that is one at `FEWEST` of them.
-    """
-    family, _, size = word.partition(":")
-    if np.unique(u).size <= 2:
-        return LINE
-    for count in range(int(size), 1, -1):
-        basis = parse(f"{family}:{count}").fitted(u[0], u[-1])
-        values = basis.values(u)
-        if np.linalg.svd(values - values.mean(axis=0), compute_uv=False)[-1] ** 2 >= FEWEST:
-            return f"{family}:{count}"
-    return LINE
 
 
 def climbed(candidates: Iterable[list[Candidate]]) -> Rung:
@@ -248,7 +227,7 @@ def _in_a_loop(ladder: Ladder) -> Rung:
 
 def input_functions(ladder: Ladder) -> Rung:
     """Static functions of the inputs before linear dynamics."""
-    words = [bases(ladder.data, word) for word in ("polynomial:3", "triangular:6")]
+    words = [ladder.bases(word) for word in ("polynomial:3", "triangular:6")]
     if not ladder.single:
         yield from _of_several_outputs(ladder, words)
         return
@@ -270,14 +249,14 @@ def input_functions(ladder: Ladder) -> Rung:
     if ladder.promising(INPUTS):
         yield from climbed([model(k, a["nk"], a["basis"])] for k in range(a["na"] + 1, 7))
     a = ladder.arguments(INPUTS)
-    yield [model(a["na"], a["nk"], bases(ladder.data, word))
+    yield [model(a["na"], a["nk"], ladder.bases(word))
            for word in ("polynomial:2", "polynomial:5", "triangular:4", "triangular:10")]
     a = ladder.arguments(INPUTS)
     near = [[max(k + step, 0) for k in a["nk"]] for step in (-1, 1)]
     low = [structure(INPUTS, "hammerstein_oe.exact", **_orders(p), basis=a["basis"]) for p in ladder.told.processes]
     yield [*low, *(model(a["na"], nk, a["basis"]) for nk in near if nk != a["nk"])]  # a better basis needs fewer lags
-    if (a := ladder.arguments(INPUTS, "hammerstein_oe.exact")) and a["basis"] == bases(ladder.data, "triangular:10"):
-        yield [model(a["na"], a["nk"], bases(ladder.data, f"triangular:{count}")) for count in (7, 8)]  # a knee
+    if (a := ladder.arguments(INPUTS, "hammerstein_oe.exact")) and a["basis"] == ladder.bases("triangular:10"):
+        yield [model(a["na"], a["nk"], ladder.bases(f"triangular:{count}")) for count in (7, 8)]  # a knee
 
 
 def _of_several_outputs(ladder: Ladder, words: Sequence[Any]) -> Rung:
@@ -328,7 +307,7 @@ def latent_signals(ladder: Ladder) -> Rung:
     orders = list(dict.fromkeys([2, 4, order]))  # functions hide the order from linear models
     output = [partial(structure, LATENT, "wiener_ss.exact"),
               *(partial(structure, LATENT, "hammerstein_wiener_ss.exact", basis=basis)
-                for basis in inner[1:] or [bases(ladder.data, "polynomial:3")])]
+                for basis in inner[1:] or [ladder.bases("polynomial:3")])]
     first = SMOOTH if ladder.data.n_samples < ENOUGH else FLEXIBLE
     yield [one(nx=k, output_basis=first) for one in output for k in orders]
     yield [model(k, 1, first, direct) for k in orders for direct in (False, True)]
@@ -393,9 +372,3 @@ def _levels_of(data: Data, nk: tuple[int, ...]) -> LevelEvidence | None:
         return level_evidence(data, nk=list(nk))
     except OptidError:  # too short for a regression: one level then
         return None
-
-
-def _sorted(data: Data, c: int) -> Array:
-    """Return the samples of an input in the order of their size, but those that are missing."""
-    u = np.concatenate([e.u[:, c] for e in data.experiments])
-    return np.sort(u[np.isfinite(u)])

@@ -17,9 +17,10 @@ from optid.data.reduction import available_cores
 from optid.errors import DataError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks, stretches
 from optid.identify.fitting import Fit, fit
+from optid.identify.search.determined import binary
 from optid.identify.search.effort import effort_of, units
 from optid.identify.search.kept import KeptTrials
-from optid.identify.search.ladder import RUNGS, Ladder, binary
+from optid.identify.search.ladder import RUNGS, Ladder
 from optid.identify.search.pool import Pool
 from optid.identify.search.trial import (
     ASKED,
@@ -34,6 +35,7 @@ from optid.identify.search.trial import (
     Candidate,
     Trial,
     continued,
+    leaves,
     spared,
     tried,
 )
@@ -363,7 +365,8 @@ def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, se
     candidate = chosen.candidate
     arguments = candidate.under(settings.pop("constraints"))
     found = fit(data, candidate.formulation, **settings, **arguments)
-    if 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation):
+    as_good = 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation)
+    if as_good and not leaves(candidate, found.model, blocks, horizon):
         return found
 
     def as_tried(record: Data, **more: Any) -> Fit:

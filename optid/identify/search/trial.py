@@ -35,6 +35,7 @@ CONTINUED: dict[str, dict[str, Any]] = {  # what a fit that goes on from a model
     "lfr.exact": {"tries": 0}, "ss.exact": {"block_rows": ()}, "hammerstein_ss.exact": {"block_rows": ()}}
 SUSPECT = 4.0  # ratio of the errors on a block to those of the whole fit above which a fit without it is repeated
 STEPS = 30  # iterations of state-space models in a trial
+AWAY = 0.5  # ranges of an output by which a model may leave it when the inputs come in other orders
 OUT_OF_TIME = "out of time"
 
 Key = tuple[str, tuple[tuple[str, Any], ...]]
@@ -196,6 +197,8 @@ def _steps(known: Trial, whole: Fit, fitted: Callable[..., Fit], blocks: Blocks,
                     estimation=pooled_fit(energies, measures))
     if rival is not None and (refusal := _no_better(known.candidate, energies, measures, rival)):
         yield replace(known, reason=refusal)
+    if leaves(known.candidate, whole.model, blocks, horizon):
+        yield replace(known, reason="its free run leaves the range of the outputs when the inputs come otherwise")
     order, refusal = (*blocks.moving[::2], *blocks.moving[1::2]), None  # every other one first
     known = replace(known, energy=np.zeros((0, blocks.data.l)), measure=np.zeros((0, blocks.data.l)), order=())
     for done, b in enumerate(order, start=1):
@@ -223,6 +226,11 @@ def _steps(known: Trial, whole: Fit, fitted: Callable[..., Fit], blocks: Blocks,
     if refusal is not None and not known.order and rival is not None and rival.order:
         yield replace(known, reason=f"it cannot be cross-validated: {refusal}")
     yield known
+
+
+def leaves(candidate: Candidate, model: Any, blocks: Blocks, horizon: int | None) -> bool:
+    """Whether free runs of a model with functions of outputs or latent signals leave what these were fitted to."""
+    return horizon is None and candidate.kind in (FEEDBACK, LATENT) and blocks.excursion(model) > AWAY
 
 
 def _no_better(candidate: Candidate, energies: Array, measures: Array, rival: Trial) -> str:
