@@ -11,9 +11,9 @@ end,
     minimise ‖r‖² + remainder    subject to    r = R (z - z0) + e0,  the gauge,  the user's constraints,
 
 where R (z - z0) + e0 are the errors to first order in the unknowns z, compressed. Named variables: ``a``, ``b``, ``mu``
-(not in linear models), ``offset``, ``c``, ``d``, ``x0`` ((n,), or (n, experiments)), and the affine expression
-``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ``, which is ``mu bᵀ`` at the iterate. With several inputs the per-channel names
-carry the input, as in ``mu[valve]``.
+(not in linear models), ``offset``, ``c``, ``d``, ``x0`` ((n,), or (n, experiments)), and the product ``Theta = mu bᵀ``,
+which steps take to first order about the iterate. With several inputs the per-channel names carry the input, as in
+``mu[valve]``.
 
 Output error and Box-Jenkins estimate an initial state of the plant per experiment; where an input is missing the record
 is cut. The first innovations of an ARMAX experiment, whose lags reach before it, count as zero (the conditional
@@ -24,7 +24,8 @@ present allow, C gets a small bias when gaps are many, a few hundredths with a t
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cvxpy as cp
@@ -33,24 +34,22 @@ import numpy as np
 from formulations.constraints.poles import asks_for_integrator
 from optid.arrays import LARGEST_INTEGER, check_integer, one_of
 from optid.bases import Bases
+from optid.core.leaves import Product
+from optid.core.problem import Problem
+from optid.core.terms import Errors
 from optid.data.channels import model_meta
 from optid.data.record import Data
 from optid.identify.arguments import enough_rows
-from optid.identify.gauges import FIXED, scale_fixed
+from optid.identify.gauges import FIXED
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.search import entry, search, starts_of
 from optid.identify.prediction_error.tangent_descent import refine
-from optid.identify.prediction_error.tangent_fit import TangentFit
+from optid.identify.prediction_error.tangent_fit import Places, TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
 from optid.models import HammersteinTF, Nonlinearity
-from optid.program.expressions import tangent_product
-from optid.program.program import Program
 from optid.program.units import outer_bases
-from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
-from optid.statistics.linearised import Linearised
-from optid.structures.least_squares import LinearStructure
 
 Array = np.ndarray
 Orders = int | Sequence[int]
@@ -162,65 +161,49 @@ def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc:
     free = replace(criterion, gauge="none" if gauge is None else "norm")
     best, others, figures = search(free, lambda part: starts_of(part, count, seed))
     enough_rows(best.at.rows, criterion.errors, criterion.unknowns.size, "lags")
-    fit = _Fit(name, criterion, tuple(constraints), best.x)
+    problem = _problem(name, criterion, criterion.normalised(best.x)).subject_to(*constraints)
+    fit = TangentFit(problem, criterion, partial(CompressedErrors, criterion))
     return (yield from refine(fit, best, figures, entry(fit, free, [best, *others])))
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit(TangentFit):
-    criterion: TransferErrors
-    optimum: Array  # without constraints, whose values have usual sizes
+def _problem(name: str, errors: TransferErrors, optimum: Array) -> Problem:
+    """Minimise ‖e‖² over the coefficients of A, B, C, D, the functions and the initial states."""
+    layout, units, places = errors.unknowns.layout, errors.units, Places.of(errors)
+    return Problem(
+        name,
+        start=places.values(optimum),
+        terms=(Errors(places.squares, places.value),),
+        leaves=tuple(Product(errors.key("mu", c), errors.key("b", c), errors.gauge)
+                     for c, free in enumerate(errors.unknowns.free) if free),
+        further=partial(_signals, errors), model=partial(transfer_model, errors),
+        facts={"iterate": True, "channels": layout.inputs, "gauge": errors.gauge, "units": units,
+               "bases": dict(zip(layout.inputs, outer_bases(layout.bases, units)))},
+        scale=errors.energy, unit=errors.unit, energy=errors.unit * errors.energy_of_record)
 
-    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
-        """State the programme of the step from z0."""
-        unknowns, units, gauge = self.criterion.unknowns, self.criterion.units, self.criterion.gauge
-        variables, values = self.places.variables(), self.places.values(z0)
-        r = cp.Variable(z0.size, name="residual")
-        z = self.places.stacked(variables)
 
-        compressed = CompressedErrors(self.criterion, at, z0)
-        objective = cp.sum_squares(r) + at.remainder
-        if damping:
-            sizes = np.sqrt(damping) * np.linalg.norm(compressed.problem.root, axis=0)
-            objective = objective + cp.sum_squares(cp.multiply(sizes, z - z0))
+def _signals(errors: TransferErrors, variables: Mapping[str, Any], _: Any) -> dict[str, Any]:
+    """Return what constraints may also use: Theta of linear inputs, the constant, and the initial states in the record.
 
-        residual = compressed.problem.root @ z - compressed.problem.target
-        structural: dict[str, tuple[Any, ...]] = {"residual": (r == residual,)}
-        named: dict[str, Any] = {"offset": cp.Constant(np.zeros(1)), **variables}
-        fixed = []
-        for c, free in enumerate(unknowns.free):
-            mu, b, theta = (self.criterion.key(word, c) for word in ("mu", "b", "Theta"))
-            if free:
-                named[theta] = tangent_product(variables[mu], variables[b], values[mu], values[b])
-                fixed.append(scale_fixed(gauge, variables[b], variables.get("a"), values[b]))
-            else:
-                named[theta] = cp.reshape(variables[b], (1, variables[b].size), order="F")
-        structural |= {"gauge": tuple(fixed)} if fixed else {}
-
-        if unknowns.levels:
-            states = variables["x0"] if variables["x0"].ndim == 2 else cp.reshape(
-                variables["x0"], (unknowns.memory, 1), order="F")
-            named |= {"offset": cp.reshape(cp.sum(states[-1]) / unknowns.experiments, (1,), order="F"),
-                      "x0": states[:-1]}
-        if unknowns.fading:
-            thetas = [named[self.criterion.key("Theta", c)] for c in range(unknowns.layout.m)]
-            named["x0"] = named["x0"] + self.criterion.levels_before(variables.get("a"), thetas)
-        else:
-            named.pop("x0", None)
-        view = View(named, iterate=True, channels=unknowns.layout.inputs, gauge=gauge, reference=values, units=units,
-                    bases=dict(zip(unknowns.layout.inputs, outer_bases(unknowns.layout.bases, units))))
-        usual = self.places.values(self.criterion.normalised(self.optimum))
-        program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
-                          {**usual, "residual": at.whole[1]}, self.recover, view, frozenset(structural),
-                          derived={"residual": residual}, scale=self.criterion.energy, compressed=compressed,
-                          structure=None if damping else LinearStructure(compressed.problem,
-                                                                               tuple(self.places.names)),
-                          unit=self.criterion.unit, step=True)
-        return program.subject_to(*self.constraints)
-
-    def recover(self, values: Mapping[str, Array]) -> HammersteinTF:
-        """Return the model of the values of the variables, in the units of the record."""
-        return transfer_model(self.criterion, values)
+    States that contain the levels of the channels are not shown.
+    """
+    unknowns, found = errors.unknowns, dict[str, Any]()
+    for c, free in enumerate(unknowns.free):
+        if not free:
+            b = variables[errors.key("b", c)]
+            found[errors.key("Theta", c)] = cp.reshape(b, (1, b.size), order="F")
+    if "offset" not in variables:
+        found["offset"] = cp.Constant(np.zeros(1))
+    states = variables.get("x0")
+    if unknowns.levels and states is not None:
+        states = states if states.ndim == 2 else cp.reshape(states, (unknowns.memory, 1), order="F")
+        found["offset"] = cp.reshape(cp.sum(states[-1]) / unknowns.experiments, (1,), order="F")
+        states = states[:-1]
+    if unknowns.fading:
+        thetas = [{**variables, **found}[errors.key("Theta", c)] for c in range(unknowns.layout.m)]
+        found["x0"] = states + errors.levels_before(variables.get("a"), thetas)
+    elif "x0" in variables:
+        found["x0"] = None
+    return found
 
 
 def transfer_model(criterion: TransferErrors, values: Mapping[str, Array], signed: bool = True) -> HammersteinTF:

@@ -24,7 +24,8 @@ Named variables: those of `formulations.state_space` (``A``, ``C``, ``mu``, ``b`
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
@@ -32,9 +33,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from formulations.latent_signals import latent_channels
-from formulations.state_space import StateSpaceFit, state_space_fit
+from formulations.state_space import state_space_fit, state_space_model
 from optid.bases import Bases, Polynomial, Trigonometric
 from optid.bases.basis import Basis, span
+from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import in_memory
@@ -42,16 +44,17 @@ from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.state_errors import WILD, StateErrors, weight_root
 from optid.identify.prediction_error.tangent_descent import NO_BOUND
+from optid.identify.prediction_error.tangent_fit import Places, with_signs
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import spectral_radius
+from optid.program.judging import measure_violation
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.statistics.linearised import Linearised
 
 Array = np.ndarray
 
@@ -139,8 +142,8 @@ def _shoot(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: 
            figures: Mapping[str, Any]) -> Procedure:
     """Solve the programme from the result of the descents, and judge the model by its run."""
     fit = StateShooting(plan.name, errors, constraints, plan.units)
-    x = fit.signed(best.x)
-    program = replace(fit.pose(x, errors.linearise(x), 0.0), settled=best.converged)
+    x = with_signs(errors, best.x, fit.excess if constraints else None)
+    program = replace(fit.pose(x), settled=best.converged)
     solution = yield program
     if not solution.has_point:
         return None
@@ -170,14 +173,35 @@ def _judged(errors: StateErrors, x: Array, solution: Solution) -> tuple[Status, 
     return Status.LOCAL, NO_BOUND.format(errors.errors)
 
 
-class StateShooting(StateSpaceFit):
+@dataclass(frozen=True, eq=False)
+class StateShooting:
     """The programme of a record, and the model of its values."""
 
-    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
+    name: str  # of the formulation
+    criterion: StateErrors
+    constraints: tuple[Any, ...]  # the user's
+    units: Transform  # from those of the programme to those of the record
+
+    @cached_property
+    def places(self) -> Places:
+        """The named unknowns in the order of their vector."""
+        return Places.of(self.criterion)
+
+    def recover(self, values: Mapping[str, Array]) -> HammersteinSS:
+        """Return the model of the values of the variables, in the units of the programme."""
+        return state_space_model(self.criterion, bool(self.constraints), values)
+
+    def excess(self, z0: Array) -> float:
+        """Return the largest relative violation of a constraint at the start z0."""
+        program = self.pose(z0)
+        program.assign(program.start)
+        return measure_violation(program)[0]
+
+    def pose(self, z0: Array) -> Program:
         """State the programme with the start z0."""
         errors, variables, units = self.criterion, self.places.variables(), self.units
         start = dict(self.places.values(z0))
-        compressed = CompressedStates(errors, at, z0, units, fixed=True)
+        compressed = CompressedStates(errors, errors.linearise(z0), z0, units, fixed=True)
         rows = np.pad(errors.gauge_rows(z0), ((0, 0), (0, z0.size - errors.unknowns.shared)))
         structural: dict[str, Any] = {}
         if len(rows := np.vstack([rows, compressed.free])):

@@ -17,14 +17,15 @@ that touches the true one there. Every iterate keeps them.
 
 Named variables: ``A``, ``C``, ``offset``, ``x0`` ((n,), or (n, experiments)), ``K`` with "prediction", per input ``mu``
 (not of a linear channel) and ``b`` (= [B_i; D_i]), per output fed back ``mu feedback`` and ``b feedback``, per latent
-signal ``mu latent``, ``b latent`` (= [Ez_i; Fz_i]) and ``z`` (= [Cz_i, Dz_i, constant]), and the affine expressions
-``Theta = mu b0ᵀ + mu0 bᵀ - mu0 b0ᵀ`` (P, n + l) about the iterate. With several channels the names carry the channel,
-as in ``mu[valve]``. Without feedback and latent signals the static curves (`shape.gain`, `shape.value_range`, ...) are
-constrained to first order about the iterate as well. Rules about poles read ``P`` (held) and ``Q = A P``.
+signal ``mu latent``, ``b latent`` (= [Ez_i; Fz_i]) and ``z`` (= [Cz_i, Dz_i, constant]), and the products
+``Theta = mu bᵀ`` (P, n + l); without feedback and latent signals also the static curves ``static`` (`shape.gain`,
+`shape.value_range`, ...). Steps take both to first order about the iterate. With several channels the names carry the
+channel, as in ``mu[valve]``. Rules about poles read ``P`` (held) and ``Q = A P``.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cvxpy as cp
@@ -34,31 +35,31 @@ from formulations.constraints.poles import NO_EQUATION, asks_for_integrator
 from formulations.subspace_procedure import identified
 from optid.arrays import check_integer, one_of
 from optid.bases import Bases
+from optid.core.leaves import Leaf, Product
+from optid.core.problem import Problem
+from optid.core.terms import Errors, Values
 from optid.data.channels import Transform
 from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import RankError, StructureError
-from optid.identify.arguments import check_offset, enough_rows, in_memory, outputs_present
+from optid.identify.arguments import check_offset, in_memory
 from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.latent_search import STAGES, first_samples
-from optid.identify.prediction_error.state_errors import STABLE, StateErrors
-from optid.identify.prediction_error.state_search import complete, entered, quietly, search_states
+from optid.identify.prediction_error.state_errors import StateErrors
+from optid.identify.prediction_error.state_search import complete, errors_and_starts, on_whole, quietly, search_states
+from optid.identify.prediction_error.static_curve import static_curve
 from optid.identify.prediction_error.tangent_descent import refine
-from optid.identify.prediction_error.tangent_fit import TangentFit
+from optid.identify.prediction_error.tangent_fit import Places, TangentFit
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import modal_weight
-from optid.program.expressions import tangent_product
-from optid.program.program import Program
 from optid.program.solution import Status
 from optid.program.units import energy_unit, in_units, inverse, outer_bases
-from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.statistics.linearised import Linearised
-from optid.statistics.state_unknowns import SIMULATORS, StateUnknowns
+from optid.statistics.state_unknowns import SIMULATORS
 
 Array = np.ndarray
 
@@ -128,85 +129,47 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
         constraints=constraints)
 
 
-@dataclass(frozen=True, eq=False)
-class StateSpaceFit(TangentFit):
-    """The programmes of a state-space model, and the model of their values."""
+def _problem(name: str, errors: StateErrors, units: Transform, x: Array, constraints: Sequence[Any]) -> Problem:
+    """Minimise ‖e‖² over A, [B; D] and f of every input, C, feedback, latent functions and initial states, from x."""
+    expansion, places = errors.unknowns.expansion, Places.of(errors)
+    start = places.values(x)
+    names = [tuple(errors.key(word, c) for word in ("mu", "b", "static")) for c in range(expansion.m)]
+    leaves: list[Leaf] = [Product(mu, b, gauge="") for mu, b, _ in names if mu in start]
+    if not expansion.feedback and not errors.unknowns.latent:
+        leaves += [static_curve(*three) for three in names]
+    latent = {f"z{i}": one for i, one in enumerate(errors.unknowns.latent, start=1)}
+    bases = dict(zip(expansion.input_names, outer_bases(expansion.inputs, units)))
+    return Problem(
+        name, start, terms=(Errors(places.squares, places.value),), leaves=tuple(leaves),
+        further=partial(_signals, errors), about=frozenset({"P", "Q"}),
+        model=partial(state_space_model, errors, bool(constraints)),
+        facts={"iterate": True, "gauge": "norm", "channels": expansion.input_names, "outputs": expansion.output_names,
+               "units": units, "bases": bases | {z: one.basis for z, one in latent.items()},
+               "spans": {z: one.vectors for z, one in latent.items()}},
+        builders=tuple(constraints), scale=errors.energy, energy=errors.energy_of_record)
 
-    criterion: StateErrors
-    units: Transform  # from those of the programme to those of the record
 
-    def pose(self, z0: Array, at: Linearised, damping: float) -> Program:
-        """State the programme of the step from z0."""
-        variables, values = self.places.variables(), self.places.values(z0)
-        r = cp.Variable(z0.size, name="residual")
-        step = self.places.stacked(variables) - z0
-        compressed = CompressedStates(self.criterion, at, z0, self.units)
+def _signals(errors: StateErrors, variables: Mapping[str, Any], x: Values) -> dict[str, Any]:
+    """Return what constraints may also use: P held and Q = A P, Theta of linear inputs, functions of latent signals."""
+    unknowns, weight = errors.unknowns, modal_weight(x["A"])
+    found = {"P": cp.Constant(weight), "Q": variables["A"] @ weight}
+    for c in range(unknowns.expansion.m):
+        if errors.key("mu", c) not in variables:
+            b = variables[errors.key("b", c)]
+            found[errors.key("Theta", c)] = cp.reshape(b, (1, b.size), order="F")
+    for i, one in enumerate(unknowns.latent):
+        if one.row is None:
+            found[f"mu latent[z{i + 1}]"] = one.vectors @ variables[errors.key("c", i)]
+    if unknowns.levels:
+        states = cp.reshape(variables["x0"], (unknowns.memory, unknowns.experiments), order="F")
+        found |= {"offset": cp.sum(states[unknowns.n :], axis=1) / unknowns.experiments, "x0": states[: unknowns.n]}
+    return found
 
-        matrix, errors = at.whole
-        objective = cp.sum_squares(r) + at.remainder
-        if len(compressed.free):  # else the answer lies anywhere along what changes no output to first order
-            objective = objective + cp.sum_squares(compressed.free @ step)
-        if damping:
-            sizes = np.sqrt(damping) * np.linalg.norm(matrix, axis=0)
-            objective = objective + cp.sum_squares(cp.multiply(sizes, step))
 
-        residual = matrix @ step + errors
-        structural = {"residual": (r == residual,)}
-        unknowns, units = self.criterion.unknowns, self.units
-        expansion = unknowns.expansion
-        latent = {f"z{i}": one for i, one in enumerate(unknowns.latent, start=1)}
-        functions = {f"mu latent[{z}]": one.vectors @ variables[self.criterion.key("c", i)]
-                     for i, (z, one) in enumerate(latent.items()) if one.row is None}
-        bases = dict(zip(expansion.input_names, outer_bases(expansion.inputs, units)))
-        regions = {}
-        if self.constraints:
-            weight = modal_weight(values["A"])
-            regions = {"P": cp.Constant(weight), "Q": variables["A"] @ weight}
-        named: dict[str, Any] = dict(variables)
-        if unknowns.levels:
-            states = cp.reshape(variables["x0"], (unknowns.memory, unknowns.experiments), order="F")
-            named |= {"offset": cp.sum(states[unknowns.n :], axis=1) / unknowns.experiments,
-                      "x0": states[: unknowns.n]}
-        view = View({**named, **self._products(variables, values), **functions, **regions}, iterate=True,
-                    gauge="norm", channels=expansion.input_names, outputs=expansion.output_names, reference=values,
-                    units=units, bases=bases | {z: one.basis for z, one in latent.items()},
-                    spans={z: one.vectors for z, one in latent.items()})
-        program = Program(self.name, cp.Minimize(objective), structural, {**variables, "residual": r},
-                          {**values, "residual": errors}, self.recover, view, frozenset(structural),
-                          derived={"residual": residual}, compressed=compressed, scale=self.criterion.energy,
-                          step=True)
-        return program.subject_to(*self.constraints)
-
-    def recover(self, values: Mapping[str, Array]) -> HammersteinSS:
-        """Return the model of the values of the variables, in the units of the programme."""
-        unknowns = self.criterion.unknowns
-        found = self.criterion.at(unknowns.unpack(self.places.pack(values)))
-        return found.regauge("norm") if any(unknowns.free) and not self.constraints else found
-
-    def _products(self, variables: Mapping[str, cp.Variable], values: Mapping[str, Array]) -> dict[str, cp.Expression]:
-        """Every Theta = mu bᵀ (P, n + l) to first order and, without feedback, the coefficients of the static curves.
-
-        These are ``static = mu (C (I - A)^-1 B + D)ᵀ`` (P, l).
-        """
-        expansion, n, found = self.criterion.unknowns.expansion, self.criterion.unknowns.n, {}
-        left = np.eye(n) - values["A"]
-        static = not expansion.feedback and not self.criterion.unknowns.latent and np.linalg.cond(left) <= 1e12
-        to_state = np.linalg.inv(left) if static else left
-        for c in range(expansion.m):
-            mu, b = self.criterion.key("mu", c), self.criterion.key("b", c)
-            vectors: dict[str, tuple[Any, Any]] = {"Theta": (variables[b], values[b])}
-            if static:
-                seen, rest = values["C"] @ to_state, to_state @ values[b][:n]
-                gain = seen @ variables[b][:n] + (variables["C"] - values["C"]) @ rest + (
-                    seen @ (variables["A"] - values["A"]) @ rest)
-                at = seen @ values[b][:n]
-                direct = values[b].size > n
-                vectors["static"] = (gain + variables[b][n:], at + values[b][n:]) if direct else (gain, at)
-            for word, (vector, at) in vectors.items():
-                found[self.criterion.key(word, c)] = (
-                    tangent_product(variables[mu], vector, values[mu], at) if mu in variables
-                    else cp.reshape(vector, (1, at.size), order="F"))
-        return found
+def state_space_model(errors: StateErrors, constrained: bool, values: Values) -> HammersteinSS:
+    """Return the model of the values of the unknowns, in the units of the problem."""
+    found = errors.at(errors.unknowns.unpack(Places.of(errors).pack(values)))
+    return found.regauge("norm") if any(errors.unknowns.free) and not constrained else found
 
 
 def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, stability: str,
@@ -258,11 +221,11 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
         nx = yield from _subspace_starts(first, given, block_rows is None, found, criterion == "prediction")
         if isinstance(nx, Evidence):
             return nx
-        errors, starts = _entered(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles),
+        errors, starts = errors_and_starts(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles),
                                   in_units(record, plan.units) if constants == "each" else None)
         errors, best, figures = search_states(errors, starts, weighting, int(iterations))
         if extend is not None:
-            errors, best = _on_whole(errors, best, with_whole_inputs(plan.data, 2 * nx + 1))
+            errors, best = on_whole(errors, best, with_whole_inputs(plan.data, 2 * nx + 1))
             errors, best, more = extend(errors, best, known)
             figures = {**figures, **more}
         evidence = yield from (finish or _refined)(plan, errors, tuple(constraints), best, {"order": nx, **figures})
@@ -273,22 +236,9 @@ def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, sta
 
 def _refined(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent, figures: Mapping[str, Any]
              ) -> Procedure:
-    programmes = StateSpaceFit(plan.name, errors, constraints, plan.units)
-    return (yield from refine(programmes, best, figures, programmes.signed(best.x)))
-
-
-def _on_whole(errors: StateErrors, best: Descent, data: Data) -> tuple[StateErrors, Descent]:
-    """Return the errors on the whole of a record whose first samples were fitted, and their optimum as a point of them.
-
-    Missing inputs may cut the rest into more stretches, whose states are fitted.
-    """
-    if data.n_experiments == errors.unknowns.experiments:
-        return replace(errors, data=data), best
-    whole = replace(errors, data=data, unknowns=replace(errors.unknowns, experiments=data.n_experiments))
-    x = entered(whole, errors.at(errors.unknowns.unpack(best.x)))
-    if x is None:
-        raise RankError("the model of the first samples has no finite run on the rest of the record")
-    return whole, replace(best, x=x)
+    problem = _problem(plan.name, errors, plan.units, best.x, constraints)
+    fit = TangentFit(problem, errors, lambda at, z0: CompressedStates(errors, at, z0, plan.units))
+    return (yield from refine(fit, best, figures, fit.signed(best.x)))
 
 
 def _block_rows(plan: Plan) -> list[int | None]:
@@ -325,25 +275,3 @@ def _subspace_starts(plan: Plan, block_rows: Sequence[int | None], imputes: bool
     if nx is None or not found:
         raise refusal or RankError("no subspace fit has a point to start from; use another order")
     return nx
-
-
-def _entered(plan: Plan, nx: int, found: dict[str, HammersteinSS], criterion: str, stability: str, checks: Any,
-             several: Data | None) -> tuple[StateErrors, dict[str, Array]]:
-    """Return the criterion, weighted by the variances of the outputs, and the starts as vectors of its unknowns.
-
-    Where every experiment has constants of its own, `several` is the record with its levels.
-    """
-    data, shifts = with_whole_inputs(plan.data if several is None else several, 2 * nx + 1), None
-    if several is not None:
-        data, shifts = levelled(data)
-    unknowns = StateUnknowns(nx, plan.expansion(), data.n_experiments, plan.direct(), criterion,
-                             plan.offset and shifts is None, levels=shifts is not None)
-    # similarity takes away the freedom of as many unknowns as A has entries
-    enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
-    variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
-    errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
-                         STABLE if stability == "stable" else np.inf, checks, shifts)
-    starts = {name: x for name, model in found.items() if (x := entered(errors, model)) is not None}
-    if not starts:
-        raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
-    return errors, starts

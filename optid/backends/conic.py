@@ -15,6 +15,7 @@ import scipy.sparse as sp
 from optid.backends.back_end import Answer, Settings
 from optid.backends.catalogue import WITHOUT_DUALS
 from optid.core.constraint import join_by_name
+from optid.core.leaves import Affine
 from optid.core.problem import Problem
 from optid.core.terms import Squares
 from optid.program.expressions import solve_quietly
@@ -153,7 +154,9 @@ def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[
 def _has_rows_alone(program: Program) -> bool:
     """Whether a programme states one term of squares without products, under rows: Clarabel needs no CVXPY for it."""
     problem: Problem | None = program.core
-    if problem is None or len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares) or problem.leaves:
+    if problem is None or len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares):
+        return False
+    if not all(isinstance(leaf, Affine) for leaf in problem.leaves):
         return False
     return all(one.cone in ("zero", "below") for one in problem.constraints())
 
@@ -162,7 +165,8 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     """Solve such a problem, in units in which the record accounts for every unknown."""
     (squares,) = problem.terms
     assert isinstance(squares, Squares)
-    places = problem.space.places
+    places, slope = problem.slices, problem.slope(problem.start)
+    level = problem.space.vector(problem.leaf_values(problem.start)) - slope @ problem.pack(problem.start)
     columns = np.concatenate([np.arange(places[name].start, places[name].stop) for name in squares.z])
     effect, reach = np.linalg.norm(squares.root, axis=0), float(np.sqrt(problem.scale))
     sizes = np.ones(problem.size)
@@ -172,11 +176,12 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     matrix = np.zeros((len(squares.root), problem.size))
     matrix[:, columns] = squares.root
     unit = max(float(np.max(np.abs(matrix * sizes))), np.finfo(float).tiny)
-    held = sorted(problem.constraints(), key=lambda one: one.cone != "zero")
-    units = [float(np.max(np.abs(one.rows) @ sizes + np.abs(one.right), initial=0.0)) or 1.0 for one in held]
+    held, units = sorted(problem.constraints(), key=lambda one: one.cone != "zero"), []
     sides: dict[str, list[Side]] = {"zero": [], "below": []}
-    for one, size in zip(held, units):
-        sides[one.cone].append((one.rows * sizes / size, one.right / size))
+    for one in held:
+        rows, right = one.rows @ slope, one.right - one.rows @ level
+        units.append(float(np.max(np.abs(rows) @ sizes + np.abs(right), initial=0.0)) or 1.0)
+        sides[one.cone].append((rows * sizes / units[-1], right / units[-1]))
     sharp = replace(settings, accuracy=min(settings.accuracy, SHARP))  # which costs an iteration or two
     found = solve_least_squares(matrix * sizes / unit, squares.target / unit, sides["zero"], sides["below"], sharp)
     if not found.values:

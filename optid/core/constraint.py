@@ -65,6 +65,20 @@ class Constraint:
         """What the rows were divided by (m,)."""
         return np.broadcast_to(self.limit.sizes, (len(self),))
 
+    def refuse_nonconvex(self, problem: str) -> None:
+        """Raise a `StructureError` where it is not convex in the leaves, as that of a convex problem must be."""
+        if self.cone == "other" and not self.limit.member.is_dcp():
+            raise StructureError(
+                f"constraint {self.name!r} is not convex, and {problem!r} is a convex formulation: "
+                f"{self.limit.member}. State it in the named variables of the relaxation or use an exact formulation.")
+
+    def leaves(self, space: LeafSpace) -> frozenset[str]:
+        """Return the names of the leaves that it speaks about."""
+        if self.cone != "other":
+            return frozenset(name for name, place in space.places.items() if self.rows[:, place].any())
+        names: dict[int, str] = {variable.id: name for name, variable in space.variables.items()}
+        return frozenset(names.get(variable.id, "an auxiliary variable") for variable in self.limit.member.variables())
+
     def residual(self, space: LeafSpace, y: Values) -> Array:
         """Return g (m,) at values of the leaves: vec(-M) of a matrix M that must be definite."""
         if self.cone != "other":
@@ -125,6 +139,16 @@ class Reference(dict[str, Array]):
         return super().get(key, default)
 
 
+class _NotingView(View):
+    """A view that notes which expressions a constraint asks for."""
+
+    asked: set[str]
+
+    def __getitem__(self, name: str) -> Any:
+        self.asked.add(name)
+        return super().__getitem__(name)
+
+
 @dataclass(frozen=True, eq=False)
 class ConstraintReader:
     """Reads builders in the words of one problem.
@@ -134,12 +158,14 @@ class ConstraintReader:
         space: its leaves.
         facts: keyword arguments of the `View`.
         convex: whether a constraint that is not convex is refused.
+        about: names of further expressions that depend on the point about which constraints are read.
     """
 
     problem: str
     space: LeafSpace
     facts: Mapping[str, Any]
     convex: bool
+    about: frozenset[str] = frozenset()
 
     def read(self, builders: Sequence[Any], about: Values, further: Mapping[str, Any], only: set[int] | None = None
              ) -> list[Constraint]:
@@ -155,15 +181,16 @@ class ConstraintReader:
             StructureError: an unknown variable, a name used twice, a constraint that is not convex but has to be.
         """
         reference = Reference(self.facts.get("reference", about))
-        view = View({**self.space.variables, **further}, **{**self.facts, "reference": reference})
+        shown = {name: one for name, one in {**self.space.variables, **further}.items() if one is not None}
+        view = _NotingView(shown, **{**self.facts, "reference": reference})
         found: list[Constraint] = []
         for number, builder in enumerate(builders):
             if only is not None and number not in only:
                 continue
-            reference.asked = False
+            reference.asked, view.asked = False, set()
             default = getattr(builder, "name", None) or f"constraint {number + 1}"
             built = named(builder(view) if callable(builder) else builder, default)
-            moving = reference.asked and "reference" not in self.facts
+            moving = reference.asked and "reference" not in self.facts or bool(view.asked & self.about)
             for name, limits in built.items():
                 if any(one.name == name and one.builder != number for one in found):
                     raise StructureError(f"there are two constraints named {name!r}; give each its own name")
@@ -171,6 +198,8 @@ class ConstraintReader:
                 # a straight line has no curvature
                 for position, limit in enumerate(limit for limit in limits if limit.member.size):
                     one = replace(self._rows(view, name, limit, moving, number), position=position, first=first)
+                    if self.convex:
+                        one.refuse_nonconvex(self.problem)
                     found.append(one)
                     first += len(one)
         return found
@@ -182,10 +211,6 @@ class ConstraintReader:
         if foreign:
             raise StructureError(f"constraint {name!r} uses {', '.join(foreign)}, which is not a variable of "
                                  f"{self.problem!r} ({', '.join(self.space.variables)})")
-        if self.convex and not member.is_dcp():
-            raise StructureError(
-                f"constraint {name!r} is not convex, and {self.problem!r} is a convex formulation: {member}. State it "
-                "in the named variables of the relaxation or use an exact formulation.")
         expression, cone = _in_cone(member)
         parts = None if expression is None else affine_parts(expression)
         if parts is None or any(variable.id not in leaves for variable in parts[0]):

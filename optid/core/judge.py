@@ -65,13 +65,7 @@ class RowsAtPoint:
     @property
     def excess(self) -> float:
         """How far it is violated, relative to its size."""
-        g, cone = self.residual, self.constraint.cone
-        if cone == "psd":
-            amount = max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
-        else:
-            amount = float(np.max(np.abs(g) if cone == "zero" else np.maximum(g, 0.0), initial=0.0))
-        # a row is measured in its own units, as is the size of its terms
-        return amount / self.size
+        return _excess(self.constraint, self.residual) / self.size
 
     def gradients(self) -> tuple[Array, Array]:
         """Return the slopes of what is active, and the multipliers that one unit of each stands for."""
@@ -127,6 +121,26 @@ def rows_at(problem: Problem, x: Values) -> list[RowsAtPoint]:
     y, slope = problem.leaf_values(x), problem.slope(x)
     return [RowsAtPoint(one, one.residual(problem.space, y), one.slope(problem.space, y) @ slope,
                 *sizes_of_terms(one, problem.space, y)) for one in held]
+
+
+def largest_excess(problem: Problem, x: Values, unknowns: frozenset[str] = frozenset()) -> float:
+    """Return how far the constraints of a problem are violated at a point, relative to their sizes.
+
+    All of them, or those that speak about the named unknowns alone.
+    """
+    y, worst = problem.leaf_values(x), 0.0
+    for one in problem.constraints(x):
+        if not unknowns or one.leaves(problem.space) <= unknowns:
+            amount = _excess(one, one.residual(problem.space, y)) / size_of_terms(one, problem.space, y)
+            worst = worst if amount <= worst else amount  # also nan
+    return worst if np.isfinite(worst) else float("inf")
+
+
+def _excess(one: Constraint, g: Array) -> float:
+    """Return the largest violation of a row, in its own units, or of a matrix."""
+    if one.cone == "psd":
+        return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
+    return float(np.max(np.abs(g) if one.cone == "zero" else np.maximum(g, 0.0), initial=0.0))
 
 
 def size_of_terms(one: Constraint, space: LeafSpace, y: Values) -> float:

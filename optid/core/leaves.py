@@ -21,7 +21,8 @@ class Product:
 
     Attributes:
         mu, b: names of the unknowns; b may be a matrix, whose columns follow one another.
-        gauge: "norm" (‖b‖ = 1), "gain" (sum of b = 1 + sum of a) or "b0" (first coefficient one).
+        gauge: "norm" (‖b‖ = 1), "gain" (sum of b = 1 + sum of a) or "b0" (first coefficient one); "" for none, where
+            the objective fixes it.
     """
 
     mu: str
@@ -90,7 +91,50 @@ class Quantity:
         return {name: part.T @ pull for name, part in self.slope(x).items()}
 
 
-Leaf = Product | Quantity
+@dataclass(frozen=True, eq=False)
+class Affine:
+    """A quantity to first order about a point.
+
+    Attributes:
+        name: its name.
+        at: its value there.
+        slopes: {unknown: derivative of the flat value by the flat unknown} there.
+        about: the point.
+    """
+
+    name: str
+    at: Array
+    slopes: Mapping[str, Array]
+    about: Values
+
+    @classmethod
+    def of(cls, leaf: "Leaf", x: Values) -> "Affine":
+        """Return a leaf to first order about a point."""
+        return cls(leaf.name, leaf.value(x), leaf.slope(x), x)
+
+    def value(self, x: Values) -> Array:
+        """Return the value."""
+        moved = sum((part @ flat(x[name] - self.about[name]) for name, part in self.slopes.items()),
+                    np.zeros(self.at.size))
+        return self.at + moved.reshape(self.at.shape, order="F")
+
+    def slope(self, x: Values) -> Mapping[str, Array]:
+        """Return the derivative, which is the same everywhere."""
+        return self.slopes
+
+    def chain(self, pull: Array, x: Values) -> dict[str, Array]:
+        """Return ``slopesᵀ pull``."""
+        return {name: part.T @ pull for name, part in self.slopes.items()}
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the quantity in CVXPY expressions of the unknowns."""
+        moved: cp.Expression = cp.Constant(np.zeros(self.at.size))
+        for name, part in self.slopes.items():
+            moved = moved + part @ (cp.vec(v[name], order="F") - flat(self.about[name]))
+        return self.at + cp.reshape(moved, self.at.shape, order="F")
+
+
+Leaf = Product | Quantity | Affine
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,6 +36,7 @@ def price_constraints(problem: Problem, x: Values, duals: Mapping[str, Array], o
         steps = [0.01 * row.size_in_words if limit.step is None else limit.step() for row, limit in zip(group, limits)]
         choose = None if exchange is None else partial(exchange, name)
         slope, chosen = slope_of(limits, steps, duals[name], choose) if name in duals else (np.nan, 0)
+        slope = slope if active or not np.isfinite(slope) else 0.0  # what a solver left on rows that hold nothing
         found.append(Price(
             name, active, sum(gap.size for gap in gaps),
             max(min(float(np.min(gap, initial=np.inf)) for gap in gaps), 0.0), problem.unit * slope,

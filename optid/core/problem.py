@@ -5,13 +5,15 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+import cvxpy as cp
 import numpy as np
 
 from optid.arrays import Array
 from optid.core.constraint import Constraint, ConstraintReader
-from optid.core.leaves import Leaf, LeafSpace, Product, slices_of
+from optid.core.leaves import Affine, Leaf, LeafSpace, Product, slices_of
 from optid.core.terms import Errors, Squares, Term, Values, flat
 
+GAUGE = "gauge"  # of the constraints that fix the scales of products to first order
 TRIALS = 5  # random points at which constraints are compared with those of the opposite signs
 
 
@@ -26,7 +28,8 @@ class Problem:
         leaves: what else terms and constraints speak about.
         model: values of the unknowns -> model.
         facts: keyword arguments of the `View` that builders get: channels, bases, outputs, units, reference, ....
-        further: (variables of the leaves, values of the unknowns) -> more expressions for it, such as Q = A P.
+        further: (variables of the leaves, values of the unknowns) -> more expressions for it, such as Q = A P, or None
+            for a leaf that it does not show.
         builders: of the constraints.
         scale: objective of the zero model, the yardstick of gaps.
         unit: what one unit of the objective is in units of the record.
@@ -34,6 +37,7 @@ class Problem:
         compressed: the compressed record, for intervals and figures.
         structural: names of constraints that belong to the formulation, and have no price.
         symmetric: unknowns that are symmetric matrices.
+        about: names of further expressions that depend on the values of the unknowns.
     """
 
     name: str
@@ -50,6 +54,7 @@ class Problem:
     compressed: Any = field(default=None, repr=False)
     structural: frozenset[str] = frozenset()
     symmetric: frozenset[str] = frozenset()
+    about: frozenset[str] = frozenset()
 
     def subject_to(self, *builders: Any) -> "Problem":
         """Return the problem with further constraints, which are read when they are first needed."""
@@ -59,6 +64,29 @@ class Problem:
         """Return the problem without the builders of named constraints."""
         dropped = {one.builder for one in self.constraints() if one.name in names}
         return replace(self, builders=tuple(b for k, b in enumerate(self.builders) if k not in dropped))
+
+    def tangent(self, x: Values, squares: Squares, compressed: Any) -> "Problem":
+        """Return the convex problem of a step from a point: squares in the unknowns, leaves and gauges to first order.
+
+        Its constraints are those of this problem, read about the point where they move; one that is not convex in the
+        leaves is a `StructureError`.
+        """
+        gauges = tuple(product.level(x) for product in self.products if product.gauge)
+
+        def gauge(view: Any) -> dict[str, Any]:
+            return {GAUGE: [level + sum(part @ (cp.vec(view.inner[name], order="F") - flat(x[name]))
+                                        for name, part in parts.items()) == 0 for level, parts in gauges]}
+
+        step = replace(
+            self, start=x, terms=(squares,), leaves=tuple(Affine.of(leaf, x) for leaf in self.leaves),
+            builders=(*self.builders, gauge) if gauges else self.builders, compressed=compressed,
+            structural=self.structural | {GAUGE} if gauges else self.structural)
+        vars(step)["space"] = self.space  # the same leaves of the same usual sizes, in which constraints are read
+        held = [replace(one, moving=False) for one in self.constraints(x)]
+        for one in held:
+            one.refuse_nonconvex(self.name)
+        vars(step)["_at_start"] = (*held, *(step._read(x, {len(self.builders)}) if gauges else ()))
+        return step
 
     # -- what it is made of
 
@@ -162,7 +190,7 @@ class Problem:
 
     def _read(self, x: Values, only: set[int] | None = None) -> list[Constraint]:
         further = {} if self.further is None else self.further(self.space.variables, x)
-        reader = ConstraintReader(self.name, self.space, self.facts, self.is_convex)
+        reader = ConstraintReader(self.name, self.space, self.facts, self.is_convex, self.about)
         return reader.read(self.builders, x, further, only)
 
     @cached_property

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import correlate
+from scipy.fft import next_fast_len
 
 from optid.arrays import Array
 
@@ -62,7 +62,8 @@ def _period(moves: Array) -> int:
     if not total or not lags.size:
         return n + 1
     before, after = energy[n - lags], total - energy[lags]
-    products = sum(np.asarray(correlate(x, x))[n - 1 + lags] for x in moves.T)
+    spectra = np.abs(np.fft.rfft(moves, next_fast_len(2 * n, real=True), axis=0)) ** 2
+    products = np.sum(np.fft.irfft(spectra, next_fast_len(2 * n, real=True), axis=0), axis=1)[lags]
     alike = products / np.sqrt(np.maximum(before * after, 1e-300))
     passed = np.maximum.accumulate(alike < APART)
     found = passed & (alike > ALIKE) & (np.minimum(before, after) > SHARED * total)

@@ -200,13 +200,14 @@ class Program:
             for member in group:
                 yield f"constraint {name!r}", member
 
-    def subject_to(self, *builders: Any, convex: bool | None = None) -> "Program":
+    def subject_to(self, *builders: Any, convex: bool | None = None, core: Any = None) -> "Program":
         """Return the programme with further constraints.
 
         Args:
             builders: callables of the `View` (such as those of ``formulations.constraints`` or a lambda that returns a
                 dictionary of CVXPY constraints), or such dictionaries.
             convex: True refuses constraints that are not convex; default: True when the programme is convex.
+            core: the problem of the core that has read them; by default that of this programme reads them.
 
         Raises:
             StructureError: unknown variable, name used twice, or a nonconvex constraint in a convex formulation.
@@ -214,13 +215,14 @@ class Program:
         if not builders:
             return self
         if not self.is_stated and self.core is not None:
-            return self._stated_later(builders)
+            return self.under(self.core.subject_to(*builders))
         convex_only = self.problem.is_dcp() if convex is None else convex
         known = set(self.variables.values())
         constraints, variables, limits = dict(self.constraints), dict(self.variables), dict(self.limits)
-        usual, core, sizes = self.usual_sizes, None, {}
-        if self.core is not None:
+        usual, sizes = self.usual_sizes, {}
+        if core is None and self.core is not None:
             core = self.core.subject_to(*builders)
+        if core is not None:
             sizes = {(one.name, one.position): one.limit.sizes for one in core.constraints() if one.cone in AFFINE}
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
@@ -256,15 +258,17 @@ class Program:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
         return replace(self, constraints=constraints, variables=variables, limits=limits, core=core)
 
-    def _stated_later(self, builders: tuple[Any, ...]) -> "Program":
-        """Return a deferred programme under constraints that its core has read; what is wrong with them is said now."""
-        core = self.core.subject_to(*builders)
+    def under(self, core: Any) -> "Program":
+        """Return a deferred programme under the constraints that a problem of the core has read.
+
+        What is wrong with them is said now, as a `StructureError`.
+        """
         if taken := self.structural & set(core.constraint_names):
             raise StructureError(f"there are two constraints named {min(taken)!r}; give each its own name")
 
         def statement() -> dict[str, Any]:
             _ = self.objective
-            whole = self.subject_to(*builders)
+            whole = self.subject_to(*core.builders, core=core)
             return {part: getattr(whole, part) for part in STATED}
 
         return self._copied(core=core, _statement=statement, _held={})

@@ -20,7 +20,7 @@ from optid.data.record import Data
 from optid.data.stretches import interpolated
 from optid.errors import DataWarning, OptidError, RankError
 from optid.identify.prediction_error.descent import Descent, agreement, best_of, descend, with_poles
-from optid.identify.prediction_error.tangent_fit import TangentFit, violation
+from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.prediction_error.transfer_errors import TransferErrors
 from optid.identify.subspace.projection import project, realise
 from optid.models.layout import Layout
@@ -110,11 +110,7 @@ def entry(fit: TangentFit, criterion: TransferErrors, found: Sequence[Descent]) 
         moves: list[Callable[[Array], Array]] = [first, *(partial(contained, limit=radius) for radius in PULLS)]
         for move in moves:
             pulled = move(x[at])
-            program = fit.pose(np.concatenate([pulled, x[at.stop :]]), one.at, 0.0)
-            a = program.variables.get("a")
-            others = [name for name, group in program.user_constraints.items()
-                      if a is not None and any({v.id for v in c.variables()} != {a.id} for c in group)]
-            if violation(program.without(*others, "residual", "gauge")) <= 1e-9:  # those on the poles alone hold
+            if fit.excess(np.concatenate([pulled, x[at.stop :]]), frozenset({"a"})) <= 1e-9:
                 again = one if np.array_equal(pulled, x[at]) else with_poles(criterion, x, pulled)
                 ends.append((again.value, again.x))
                 break

@@ -9,11 +9,15 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.certificate.hankel import simulation_bound
+from optid.data.levels import levelled
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning, StructureError
+from optid.data.stretches import with_whole_inputs
+from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.identify.arguments import enough_rows, outputs_present
 from optid.identify.noise import with_noise
 from optid.identify.prediction_error.descent import AGREE, STEPS, Descent, best_of, descend
-from optid.identify.prediction_error.state_errors import WILD, StateErrors
+from optid.identify.prediction_error.state_errors import STABLE, WILD, StateErrors
+from optid.identify.subspace.plan import Plan
 from optid.identify.validation.predictions import one_step, simulated, simulated_or_nan
 from optid.models import HammersteinSS, NoiseCovariances
 from optid.models.roots import spectral_radius
@@ -21,6 +25,7 @@ from optid.models.state_simulation import allowed_range
 from optid.models.state_space import balancing
 from optid.program.solution import Status
 from optid.solving.solve import Evidence, Procedure
+from optid.statistics.state_unknowns import StateUnknowns
 
 ROUNDS = 10  # updates of the weights at most
 SAME_WEIGHT = 1e-4
@@ -184,3 +189,39 @@ def quietly(procedure: Procedure) -> Procedure:
             except StopIteration as stop:
                 return stop.value
         answer = yield program
+
+
+def on_whole(errors: StateErrors, best: Descent, data: Data) -> tuple[StateErrors, Descent]:
+    """Return the errors on the whole of a record whose first samples were fitted, and their optimum as a point of them.
+
+    Missing inputs may cut the rest into more stretches, whose states are fitted.
+    """
+    if data.n_experiments == errors.unknowns.experiments:
+        return replace(errors, data=data), best
+    whole = replace(errors, data=data, unknowns=replace(errors.unknowns, experiments=data.n_experiments))
+    x = entered(whole, errors.at(errors.unknowns.unpack(best.x)))
+    if x is None:
+        raise RankError("the model of the first samples has no finite run on the rest of the record")
+    return whole, replace(best, x=x)
+
+
+def errors_and_starts(plan: Plan, nx: int, found: dict[str, HammersteinSS], criterion: str, stability: str, checks: Any,
+                      several: Data | None) -> tuple[StateErrors, dict[str, Array]]:
+    """Return the errors, weighted by the variances of the outputs, and the starts as vectors of its unknowns.
+
+    Where every experiment has constants of its own, `several` is the record with its levels.
+    """
+    data, shifts = with_whole_inputs(plan.data if several is None else several, 2 * nx + 1), None
+    if several is not None:
+        data, shifts = levelled(data)
+    unknowns = StateUnknowns(nx, plan.expansion(), data.n_experiments, plan.direct(), criterion,
+                             plan.offset and shifts is None, levels=shifts is not None)
+    # similarity takes away the freedom of as many unknowns as A has entries
+    enough_rows(outputs_present(data), "output samples", unknowns.size - nx**2, "states")
+    variances = np.nanvar(np.vstack([e.y for e in data.experiments]), axis=0)
+    errors = StateErrors(data, unknowns, np.diag(1 / np.where(variances > 0, variances, 1.0)),
+                         STABLE if stability == "stable" else np.inf, checks, shifts)
+    starts = {name: x for name, model in found.items() if (x := entered(errors, model)) is not None}
+    if not starts:
+        raise RankError("no start has a stable simulation that obeys the constraints on poles; use another order")
+    return errors, starts

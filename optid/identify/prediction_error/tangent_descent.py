@@ -18,7 +18,7 @@ from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, slowed
 from optid.identify.prediction_error.curvature import Curvature
 from optid.identify.prediction_error.descent import STEPS, Descent
-from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit, violation
+from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
@@ -119,7 +119,7 @@ def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], fig
             continue
         word = fit.criterion.dynamics
         part = fit.criterion.unknowns.parts(point)[word]
-        still = replace(fit, constraints=(*others, lambda view, at=part, word=word: {"poles": view[word] == at}))
+        still = fit.under((*others, lambda view, at=part, word=word: {"poles": view[word] == at}))
         end = yield from _constrained(_Iterate.of(still, point), figures, MIRRORED)
         there = None if end is None else _end_of(fit, end)
         if there is not None and there.outside <= INSIDE and there.at.value < least:
@@ -140,11 +140,9 @@ class _Iterate:
     def of(cls, fit: TangentFit, x: Array) -> "_Iterate":
         x = fit.criterion.normalised(x)
         at = fit.criterion.linearise(x)
-        program = fit.pose(x, at, 0.0)
-        outside = violation(program) if program.user_constraints else 0.0
-        amount = sum(float(np.sum(np.abs(np.asarray(member.violation()))))
-                     for group in program.user_constraints.values() for member in group)
-        return cls(fit, x, at, program, outside, amount if outside > NOWHERE else 0.0)
+        outside = fit.excess(x) if fit.constraints else 0.0
+        amount = fit.problem.violation(fit.places.values(x)) if outside > NOWHERE else 0.0
+        return cls(fit, x, at, fit.pose(x, at, 0.0), outside, amount)
 
     def moved(self, x: Array) -> "_Iterate | None":
         """Return the iterate at x, None where it is inadmissible, its run explodes or its gauge cannot be reached."""
@@ -182,7 +180,7 @@ class _Iterate:
     def evidence(self, status: Status, reason: str, figures: Mapping[str, Any]) -> Evidence:
         bound = Bound.none(NO_BOUND.format(self.fit.criterion.errors))
         values, value = self.fit.places.values(self.x), self.fit.criterion.unit * self.at.value
-        model, turns = self.fit.recover(values), self.fit.turns(self.x, self.at) if self.fit.constraints else np.ones(1)
+        model, turns = self.fit.recover(values), self.fit.turns(self.x) if self.fit.constraints else np.ones(1)
         model = model.turned(turns) if np.any(turns < 0) else model
         return Evidence(model, value, bound, status, reason, figures, values=values)
 

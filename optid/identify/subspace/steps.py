@@ -23,7 +23,8 @@ def subspace_steps(own: Mapping[str, str] | None = None, tangent: str = "") -> C
         products = has_products([given.get("basis", "linear"), given.get("feedback_basis")])
         split = "NLP rank-one" if products and given.get("split", "exact") == "exact" else (
             _convex(inner) if inner else "QP linear")
-        return {**(own or {}), **({tangent: _convex(rules)} if tangent else {}), "split": split, **MATRICES}
+        whole = {tangent: _convex(rules) if rules else "QP linear"} if tangent else {}
+        return {**(own or {}), **whole, "split": split, **MATRICES}
     return steps(declare)
 
 
