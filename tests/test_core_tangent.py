@@ -18,6 +18,7 @@ from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.static_curve import static_curve
 from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.prediction_error.transfer_errors import transfer_errors
+from optid.program.solution import Status
 
 pytestmark = pytest.mark.numerical
 
@@ -153,7 +154,8 @@ def test_a_constraint_that_is_not_convex_is_refused():
 
 def test_a_name_of_the_formulation_is_taken():
     with pytest.raises(StructureError, match="two constraints named 'gauge'"):
-        optid.fit(record(0), "hammerstein_oe.exact", na=2, nb=2, nk=1, constraints=[lambda v: {"gauge": v["a"][0] <= 0}])
+        optid.fit(record(0), "hammerstein_oe.exact", na=2, nb=2, nk=1,
+                  constraints=[lambda v: {"gauge": v["a"][0] <= 0}])
 
 
 def test_a_quantity_of_the_unknowns_is_a_leaf_like_any_other():
@@ -166,3 +168,28 @@ def test_a_quantity_of_the_unknowns_is_a_leaf_like_any_other():
     found = solve_with("clarabel", as_program(step, step=True), Settings(1e-10)).values
     change = float(2 * x["mu"] @ (found["mu"] - x["mu"]) + x["mu"] @ x["mu"])
     assert change <= 0.5 + 1e-7
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_step_under_a_matrix_is_that_of_the_programme_in_cvxpy(seed):
+    def definite(view):
+        a = view["a"]
+        return {"definite": cp.bmat([[1.0, a[0] / 2 + 0.3, 0.1], [a[0] / 2 + 0.3, 0.5, a[1]], [0.1, a[1], 0.4]]) >> 0}
+
+    fit, z0 = fit_of(seed, definite, lambda v: {"large": v["Theta"] <= 0.4})
+    at = fit.criterion.linearise(z0)
+    program, stated = fit.pose(z0, at, 0.0), fit.pose(z0, at, 0.0)
+    assert program.kind == "SDP" == stated.kind
+    rows = solve_with("clarabel", program, Settings(1e-10))
+    assert not program.is_stated and rows.status == Status.OPTIMAL
+    whole = solve_with("clarabel", stated, Settings(1e-10, options={"max_iter": 400}))
+    assert stated.is_stated and stated.kind == "SDP"
+    for name in fit.places.names:
+        np.testing.assert_allclose(rows.values[name], whole.values[name], rtol=1e-3, atol=1e-4)
+    for name in ("large", "definite"):
+        np.testing.assert_allclose(rows.duals[name], whole.duals[name], rtol=1e-2,
+                                   atol=1e-3 * np.abs(whole.duals[name]).max())
+    dual, matrix = rows.duals["definite"].reshape(3, 3), stated.constraints["definite"][0].args[0]
+    stated.assign({name: rows.values[name] for name in fit.places.names})
+    assert np.linalg.eigvalsh(dual)[0] > -1e-6 * np.abs(dual).max()
+    assert abs(np.sum(dual * matrix.value)) < 1e-5 * np.abs(dual).max()

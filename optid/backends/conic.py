@@ -23,6 +23,7 @@ from optid.program.program import Program
 from optid.program.solution import Status
 
 SHARP = 1e-11  # accuracy of small least squares
+CONES = ("zero", "below", "psd")  # of the constraints that a problem of the core has read, in the order of a solver
 Side = tuple[np.ndarray, np.ndarray]  # rows (r, n) and right-hand sides (r,)
 STATUS = {
     cp.OPTIMAL: Status.OPTIMAL,
@@ -121,44 +122,59 @@ def _has_no_point(problem: cp.Problem, name: str, options: dict[str, Any]) -> bo
 
 
 def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[Side], below: Sequence[Side],
-                        settings: Settings) -> Answer:
+                        settings: Settings, definite: Sequence[Side] = ()) -> Answer:
     """Minimise ``‖matrix x - target‖²`` subject to ``rows x = right`` and ``rows x <= right``, matrix (k, n).
 
-    The residuals are variables, so that the matrix is not squared.
+    The matrices ``right - rows x``, flat, of `definite` must be positive semidefinite. The residuals are variables, so
+    that the matrix is not squared.
 
     Returns:
         "x" (n,), where there is a usable point; "rows": multipliers of the equalities, then of the inequalities, for
-        ``L = f + multipliers' (rows x - right)``.
+        ``L = f + multipliers' (rows x - right)``, then of the matrices, flat.
     """
     clarabel: Any = import_module("clarabel")  # compiled, without types
     k, n = matrix.shape
+    triangles = [_triangle(len(side)) for _, side in definite]
+    sides = [*equal, *below, *((t @ part, t @ side) for t, (part, side) in zip(triangles, definite))]
     rows = np.vstack([np.hstack([matrix, -np.eye(k)]),
-                      *(np.hstack([part, np.zeros((len(part), k))]) for part, _ in (*equal, *below))])
-    right = np.concatenate([target, *(side for _, side in (*equal, *below))])
-    inequalities = sum(len(part) for part, _ in below)
-    cones = [clarabel.ZeroConeT(len(rows) - inequalities), clarabel.NonnegativeConeT(inequalities)]
+                      *(np.hstack([part, np.zeros((len(part), k))]) for part, _ in sides)])
+    right = np.concatenate([target, *(side for _, side in sides)])
+    counts = k + sum(len(part) for part, _ in equal), sum(len(part) for part, _ in below)
+    cones = [clarabel.ZeroConeT(counts[0]), *([clarabel.NonnegativeConeT(counts[1])] if counts[1] else []),
+             *(clarabel.PSDTriangleConeT(round(len(side) ** 0.5)) for _, side in definite)]
     options = clarabel.DefaultSettings()
     options.verbose = settings.verbose
     for key, value in tolerances("clarabel", settings).items():
         setattr(options, key, value)
     weights = sp.diags_array(np.concatenate([np.zeros(n), np.full(k, 2.0)]), format="csc")
-    found = clarabel.DefaultSolver(weights, np.zeros(n + k), sp.csc_array(rows), right,
-                                   cones if inequalities else cones[:1], options).solve()
+    found = clarabel.DefaultSolver(weights, np.zeros(n + k), sp.csc_array(rows), right, cones, options).solve()
     status = OF_CLARABEL.get(str(found.status), Status.FAILED)
     if status not in (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT):
         return Answer(status, str(found.status))
-    return Answer(status, str(found.status), {"x": np.asarray(found.x)[:n]}, {"rows": np.asarray(found.z)[k:]},
-                  int(found.iterations))
+    duals = np.split(np.asarray(found.z), np.cumsum([sum(counts), *(len(t) for t in triangles)])[:-1])
+    return Answer(status, str(found.status), {"x": np.asarray(found.x)[:n]}, {"rows": np.concatenate(
+        [duals[0][k:], *(t.T @ dual for t, dual in zip(triangles, duals[1:]))])}, int(found.iterations))
+
+
+def _triangle(size: int) -> np.ndarray:
+    """Return the map of a flat square matrix to the triangle of its symmetric part with the same inner product."""
+    n = round(size**0.5)
+    pairs = [(i, j) for j in range(n) for i in range(j + 1)]
+    found = np.zeros((len(pairs), size))
+    for row, (i, j) in enumerate(pairs):
+        for place in (i + n * j, j + n * i):
+            found[row, place] = 1.0 if i == j else np.sqrt(0.5)
+    return found
 
 
 def _has_rows_alone(program: Program) -> bool:
-    """Whether a programme states one term of squares without products, under rows: Clarabel needs no CVXPY for it."""
+    """Whether a programme states one term of squares without products, under rows and matrices: it needs no CVXPY."""
     problem: Problem | None = program.core
     if problem is None or len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares):
         return False
     if not all(isinstance(leaf, Affine) for leaf in problem.leaves):
         return False
-    return all(one.cone in ("zero", "below") for one in problem.constraints())
+    return problem.is_measured
 
 
 def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
@@ -176,14 +192,15 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
     matrix = np.zeros((len(squares.root), problem.size))
     matrix[:, columns] = squares.root
     unit = max(float(np.max(np.abs(matrix * sizes))), np.finfo(float).tiny)
-    held, units = sorted(problem.constraints(), key=lambda one: one.cone != "zero"), []
-    sides: dict[str, list[Side]] = {"zero": [], "below": []}
+    held, units = sorted(problem.constraints(), key=lambda one: CONES.index(one.cone)), []
+    sides: dict[str, list[Side]] = {cone: [] for cone in CONES}
     for one in held:
         rows, right = one.rows @ slope, one.right - one.rows @ level
         units.append(float(np.max(np.abs(rows) @ sizes + np.abs(right), initial=0.0)) or 1.0)
         sides[one.cone].append((rows * sizes / units[-1], right / units[-1]))
     sharp = replace(settings, accuracy=min(settings.accuracy, SHARP))  # which costs an iteration or two
-    found = solve_least_squares(matrix * sizes / unit, squares.target / unit, sides["zero"], sides["below"], sharp)
+    found = solve_least_squares(matrix * sizes / unit, squares.target / unit, sides["zero"], sides["below"], sharp,
+                                sides["psd"])
     if not found.values:
         return found
     x = problem.unpack(found.values["x"] * sizes)

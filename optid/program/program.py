@@ -171,9 +171,12 @@ class Program:
         Raises:
             StructureError: naming the part that is neither convex nor smooth.
         """
-        rows_alone = self.core is None or all(one.cone in AFFINE for one in self.core.constraints())
-        if self.structure is not None and self.structure.kind and not self.is_stated and rows_alone:
-            return self.structure.kind
+        cones = set() if self.core is None else {one.cone for one in self.core.constraints()}
+        if self.structure is not None and self.structure.kind and not self.is_stated:
+            if cones <= set(AFFINE):
+                return self.structure.kind
+            if self.structure.kind == "QP" and cones <= {*AFFINE, "psd"}:
+                return "SDP"
         if self.problem.is_dcp():
             return _convex_class(self.problem)
         for name, part in self._parts():
