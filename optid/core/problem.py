@@ -197,13 +197,21 @@ class Problem:
     def _at_start(self) -> tuple[Constraint, ...]:
         return tuple(self._read(self.start)) if self.builders else ()
 
+    @cached_property
+    def _read_about(self) -> dict[bytes, tuple[Constraint, ...]]:
+        return {}
+
     def constraints(self, x: Values | None = None) -> tuple[Constraint, ...]:
         """Return the constraints: as read at the start, or with those that move read at a point."""
         moving = {one.builder for one in self._at_start if one.moving}
         if x is None or not moving:
             return self._at_start
-        kept = (one for one in self._at_start if one.builder not in moving)
-        return tuple(sorted([*kept, *self._read(x, moving)], key=lambda one: one.builder))
+        point = self.pack(x).tobytes()
+        if point not in self._read_about:  # the last one alone is kept
+            kept = (one for one in self._at_start if one.builder not in moving)
+            self._read_about.clear()
+            self._read_about[point] = tuple(sorted([*kept, *self._read(x, moving)], key=lambda one: one.builder))
+        return self._read_about[point]
 
     @property
     def constraint_names(self) -> tuple[str, ...]:

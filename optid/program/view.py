@@ -136,7 +136,7 @@ class View(Mapping[str, cp.Expression]):
         Raises:
             StructureError: several outputs and none named, or no such output.
         """
-        if output is None and len(self.reference["C"]) == 1:
+        if output is None and len(self.outputs) == 1:
             return 0
         if output not in self.outputs:
             wrong = "needs output=" if output is None else f"names no output {output!r}"
@@ -158,7 +158,7 @@ class View(Mapping[str, cp.Expression]):
             return None
         if "C" not in self.reference:
             return np.ones(self[b].size) @ self[b]
-        if len(self.reference["C"]) > 1 or not (self.holds_matrices or self.key("static", channel) in self):
+        if len(self.outputs) > 1 or not (self.holds_matrices or self.key("static", channel) in self):
             return None
         if not self.holds_matrices:  # to first order, along the f where the descent stands
             return np.ravel(self.reference[mu]) @ self.static(channel)
