@@ -11,9 +11,7 @@ from optid.core.terms import Squares, Values
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.express import as_program
 from optid.models import HammersteinTF
-from optid.program.program import Program
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 
@@ -21,7 +19,7 @@ from optid.solving.steps import steps
 @steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequence[int] = 0,
         constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, prior: str = "none",
-        offset: bool | str = True) -> Program | Procedure:
+        offset: bool | str = True) -> Problem | Procedure:
     """Minimise ``‖Y - Phi_y a - Phi_u b - d‖²``.
 
     Named variables: ``a``, ``b``, ``offset``.
@@ -43,13 +41,13 @@ def arx(data: Data | Stream, *, na: int, nb: int | Sequence[int], nk: int | Sequ
         StructureError: impossible orders or nonconvex constraints.
         RankError: the record does not determine the parameters.
     """
-    return pose_with_loss(loss, data, lambda record: as_program(_problem(record, constraints)), convex=True,
+    return pose_with_loss(loss, data, lambda record: _problem(record, constraints), convex=True,
                           na=na, nb=nb, nk=nk, basis=Linear(), ridge=ridge, prior=prior, offset=offset)
 
 
 @steps(lambda given: {"arx": "QP" if given["constraints"] else "QP linear"})
 def fir(data: Data | Stream, *, nb: int | Sequence[int] = 50, nk: int | Sequence[int] = 0, prior: str = "dc",
-        constraints: Sequence[Any] = (), offset: bool | str = True) -> Program | Procedure:
+        constraints: Sequence[Any] = (), offset: bool | str = True) -> Problem | Procedure:
     """Minimise ``‖Y - Phi_u b - d‖² + penalty(b)``, b the impulse responses of all inputs.
 
     Named variables: ``b``, ``offset``. Arguments as in `arx`, as are the errors raised.

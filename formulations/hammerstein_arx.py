@@ -24,10 +24,10 @@ from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError, pose_with_loss
-from optid.identify.express import as_program
 from optid.identify.gauges import FIXED, in_gauge
 from optid.models import HammersteinTF
 from optid.program.program import Program
+from optid.solving.express import as_program
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 from optid.structures.bilinear import starts
@@ -159,7 +159,7 @@ def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
     one_of("gauge", gauge, FIXED)
     if svd not in ("whitened", "plain"):
         raise StructureError(f"svd must be 'whitened' or 'plain'; got {svd!r}")
-    return pose_with_loss(loss, data, lambda record: as_program(_relaxed(record, constraints, gauge, svd)), convex=True,
+    return pose_with_loss(loss, data, partial(_relaxed, builders=constraints, gauge=gauge, svd=svd), convex=True,
                           na=na, nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior,
                           offset=offset)
 

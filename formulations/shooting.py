@@ -31,10 +31,11 @@ from formulations.constraints.poles import asks_for_integrator
 from formulations.prediction_error import Orders, transfer_model
 from optid.arrays import one_of
 from optid.bases import Bases
+from optid.core.leaves import Product
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.arguments import check_offset
-from optid.identify.gauges import FIXED, scale_fixed, signs_are_fixed
+from optid.identify.gauges import FIXED, signs_are_fixed
 from optid.identify.prediction_error.search import arx_start, iterated
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
@@ -103,7 +104,7 @@ class _Shooting:
             residuals.append(self.variables[f"residual{label}"])
         if layout.na:
             structural["stability"] = self._stable()
-        structural["gauge"] = tuple(scale_fixed(gauge, self.variables[self.key("b", c)], self.variables.get("a"))
+        structural["gauge"] = tuple(Product(self.key("mu", c), self.key("b", c), gauge).condition(self.variables)
                                     for c in range(layout.m))
         start = self._start(derived)
         reference = {name: start[name] for name in ("a", "offset") if name in start}

@@ -12,8 +12,8 @@ from optid.core.problem import Problem
 from optid.core.terms import Errors, GroupNorms, Inner, Length, NuclearNorms, Squares
 from optid.errors import StructureError
 from optid.identify.equation_error import compress
-from optid.identify.express import as_program
 from optid.registry import named_constraint
+from optid.solving.express import as_program
 
 pytestmark = pytest.mark.numerical
 SHAPES = {"a": (2,), "Q": (3, 4), "c": ()}
@@ -260,3 +260,36 @@ def test_the_objective_of_a_programme_is_that_of_its_problem():
         program.assign(x)
         _ = program.objective
         assert float(np.asarray(program.objective.expr.value)) == pytest.approx(problem.value(x), rel=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_squares_join_into_one(seed):
+    rng = np.random.default_rng(seed)
+    y = leaves(seed)
+    first = Squares(rng.normal(size=(7, 14)), rng.normal(size=7), 0.3, ("Q", "a"))
+    second = Squares(rng.normal(size=(2, 3)), rng.normal(size=2), 0.1, ("a", "c"))
+    one = Squares.joined([first, second], {name: np.size(value) for name, value in y.items()})
+    assert one.z == ("Q", "a", "c") and np.allclose(one.root, np.triu(one.root))
+    for _ in range(3):
+        y = {name: value + rng.normal(size=np.shape(value)) for name, value in y.items()}
+        assert one.value(y) == pytest.approx(first.value(y) + second.value(y), rel=1e-10)
+
+
+def test_a_term_that_is_no_expression_is_named():
+    problem = Problem("a name", {"a": np.ones(2)}, (Errors(lambda y: None, lambda y: 0.0),))
+    with pytest.raises(StructureError, match="Errors, a term of 'a name', is no expression of its unknowns"):
+        as_program(problem)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_problem_of_several_terms_is_solved_and_judged(seed):
+    """A nuclear norm with squares: singular values of the answer are those of the squares, less a threshold."""
+    rng = np.random.default_rng(seed)
+    target = rng.normal(size=(3, 4))
+    squares = Squares(np.eye(12), target.ravel(order="F"), 0.0, ("Q",))
+    problem = Problem("denoised", {"Q": np.zeros((3, 4))}, (squares, NuclearNorms({"Q": 1.2})),
+                      scale=float(np.sum(target**2)))
+    solution = optid.solve(problem, accuracy=1e-9)
+    left, size, right = np.linalg.svd(target, full_matrices=False)
+    np.testing.assert_allclose(solution.values["Q"], left * np.maximum(size - 0.6, 0) @ right, atol=1e-4)
+    assert solution.objective == pytest.approx(problem.value(solution.values), rel=1e-9)

@@ -17,9 +17,9 @@ from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
 from optid.errors import DataWarning, StructureError
 from optid.identify.equation_error import compress
-from optid.identify.express import as_program
 from optid.program.prices import price_constraints as program_prices
 from optid.registry import named_constraint
+from optid.solving.express import as_program
 from optid.solving.solve import solve
 
 pytestmark = pytest.mark.numerical

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.optimize import nnls
+from scipy.optimize import minimize, nnls
 
 import optid
 from optid.backends import Answer, back_ends
@@ -61,3 +61,32 @@ def test_constraints_that_the_method_does_not_take_go_to_another(positive):
     bounded, free = optid.solve(program), optid.solve(positive.positive(record(), length=5))
     assert bounded.solver == "clarabel" and bounded.objective > free.objective
     assert np.max(bounded.values["b"]) <= 0.7 + 1e-7
+
+
+@pytest.mark.filterwarnings("ignore:18 outliers")
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("solver", ["clarabel", "scs"])
+def test_a_term_of_a_third_party_is_solved_and_judged(positive, seed, solver):
+    from optid_third_party import huber
+
+    data = record(seed)
+    y = np.array(data.y)
+    y[::17] += 40.0  # outliers
+    bad = optid.Data(data.u, y, dt=1.0)
+    fit = optid.fit(bad, huber.robust, length=5, threshold=0.3, solver=solver, accuracy=1e-9)
+    assert fit.solution.status.value in ("optimal", "locally optimal") and fit.solution.residuals.stationarity < 1e-5
+    x, problem = fit.solution.values, huber.robust(bad, length=5, threshold=0.3)
+    (term,) = problem.terms
+
+    def value(z):
+        return term.value({"b": z[:5], "offset": z[5:]})
+
+    found = minimize(value, np.concatenate([x["b"], x["offset"]]) + 0.1, method="BFGS", options={"gtol": 1e-9})
+    np.testing.assert_allclose(found.x[:5], x["b"], atol=1e-4)  # an independent route
+    assert fit.solution.objective == pytest.approx(found.fun, rel=1e-6)
+    np.testing.assert_allclose(x["b"], [0.0, 1.0, 0.5, -0.2, 0.1], atol=0.05)
+    held = optid.fit(bad, huber.robust, length=5, threshold=0.3, solver=solver, accuracy=1e-9,
+                     constraints=[lambda v: {"large": v["b"][1] <= 0.8}])
+    rate = (optid.fit(bad, huber.robust, length=5, threshold=0.3, solver=solver, accuracy=1e-9, constraints=[
+        lambda v: {"large": v["b"][1] <= 0.801}]).solution.objective - held.solution.objective) / 1e-3
+    assert held.prices[0].multiplier == pytest.approx(-rate, rel=0.02)

@@ -42,7 +42,7 @@ def certify_convex(program: Program, values: Values, duals: Values, objective: f
     None where it cannot be formed (no multipliers, an objective with kinks).
     """
     form = program.structure if isinstance(program.structure, LeastSquaresStructure) else None
-    if program.core is None or not program.core.is_measured:
+    if form is None or program.core is None or not program.core.is_measured:
         program.assign(values)
     if form is None:
         found, method = _tangent_bound(program, duals, objective), TANGENT

@@ -15,9 +15,9 @@ import numpy as np
 from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Squares
-from optid.identify.express import as_program
 from optid.program.program import Program
 from optid.program.view import View
+from optid.solving.express import as_program
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 from optid.structures.least_squares import LinearStructure
 from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem

@@ -7,6 +7,7 @@ affine; its values and slopes in the unknowns follow by the chain rule.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -58,6 +59,17 @@ class Product:
             return float(b[0]) - 1.0, {self.b: np.eye(b.size)[0]}
         a = flat(x.get("a", np.zeros(0)))
         return float(b.sum() - a.sum()) - 1.0, {self.b: np.ones(b.size), **({"a": -np.ones(a.size)} if a.size else {})}
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the product in CVXPY expressions of its factors."""
+        return cp.outer(v[self.mu], cp.vec(v[self.b], order="F"))
+
+    def condition(self, v: Mapping[str, cp.Expression]) -> Any:
+        """Return the gauge as a CVXPY constraint on expressions of the unknowns."""
+        b = cp.vec(v[self.b], order="F")
+        if self.gauge == "norm":
+            return cp.sum_squares(b) == 1
+        return b[0] == 1 if self.gauge == "b0" else cp.sum(b) == 1 + (cp.sum(v["a"]) if "a" in v else 0)
 
     def in_gauge(self, x: Values) -> dict[str, Array]:
         """Return the point with the same product in the gauge; as it is where that is not possible."""

@@ -56,6 +56,22 @@ class Squares:
         """Return the squares of a compressed record."""
         return cls(lifted.root, lifted.target, lifted.remainder, z, lifted)
 
+    @classmethod
+    def joined(cls, several: Sequence["Squares"], sizes: Mapping[str, int]) -> "Squares":
+        """Return the sum of squares of leaves of these sizes as one, its root upper triangular."""
+        z = tuple(dict.fromkeys(name for one in several for name in one.z))
+        edges = np.cumsum([0, *(sizes[name] for name in z)])
+        rows = []
+        for one in several:
+            wide = np.zeros((len(one.target), int(edges[-1]) + 1))
+            columns = [np.arange(edges[z.index(name)], edges[z.index(name) + 1]) for name in one.z]
+            wide[:, np.concatenate(columns)], wide[:, -1] = one.root, one.target
+            rows.append(wide)
+        wide = np.vstack([*rows, np.zeros((int(edges[-1]) + 1, int(edges[-1]) + 1))])
+        triangle = np.asarray(np.linalg.qr(wide, mode="r"))
+        remainder = float(triangle[-1, -1] ** 2) + sum(one.remainder for one in several)
+        return cls(triangle[:-1, :-1], triangle[:-1, -1], remainder, z)
+
     def residual(self, y: Values) -> Array:
         """Return ``root z - target`` (k,)."""
         return self.root @ stack(y, self.z) - self.target

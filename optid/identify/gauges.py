@@ -1,32 +1,14 @@
 """The scale between mu and b, which is not identifiable: how the formulations fix it."""
 
 from collections.abc import Sequence
-from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
-from optid.errors import StructureError
 from optid.models.gauges import GAUGES, gauge_factor
 from optid.program.program import Program
 
 FIXED = GAUGES[:-1]  # the gauges that fix the scale
 TRIALS = 5  # random points at which constraints are compared with those of the opposite signs
-
-
-def scale_fixed(gauge: str, b: cp.Variable, a: cp.Variable | None, reference: np.ndarray | None = None) -> Any:
-    """Return the constraint on the coefficients of B: norm one, unit static gain, or a first coefficient of one.
-
-    The gauge is one of `FIXED`, b (nb,) or (nb, l) of one input, a that of A, None without poles. The norm is fixed in
-    the tangent of a reference (nb,), if given. "gain" with several outputs is a `StructureError`.
-    """
-    if gauge == "norm":
-        return cp.sum_squares(b) == 1 if reference is None else reference @ b == float(reference @ reference)
-    if gauge == "b0":
-        return (b[0] if b.ndim == 1 else b[0, 0]) == 1
-    if b.ndim > 1:
-        raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
-    return cp.sum(b) == 1 + (cp.sum(a) if a is not None else 0)
 
 
 def in_gauge(gauge: str, mu: np.ndarray, b: np.ndarray, a: np.ndarray, channel: str) -> tuple[np.ndarray, np.ndarray]:

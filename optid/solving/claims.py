@@ -118,10 +118,11 @@ def _judged_in_core(problem: Problem, values: Values, duals: Values, base: Solut
          for name, start in problem.start.items()}
     with np.errstate(over="ignore", invalid="ignore"):
         found = judge_in_core(problem, x, duals)
-        (squares,) = (term for term in problem.terms if isinstance(term, Squares))
-        residual = squares.residual(problem.leaf_values(x))
-    structural = {"residual": -2.0 * residual, **({"gauge": found.gauge} if problem.products else {})}
-    return replace(base, values={**x, "residual": residual}, duals={**structural, **found.duals},
+        values, structural = dict(x), {"gauge": found.gauge} if problem.products else {}
+        if len(problem.terms) == 1 and isinstance(problem.terms[0], Squares):  # then it is a variable of its own
+            values["residual"] = problem.terms[0].residual(problem.leaf_values(x))
+            structural["residual"] = -2.0 * values["residual"]
+    return replace(base, values=values, duals={**structural, **found.duals},
                    objective=found.objective, residuals=found.residuals)
 
 

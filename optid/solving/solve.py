@@ -7,27 +7,29 @@ from typing import Any
 
 from optid.backends.back_end import BackEnd, Settings
 from optid.backends.choice import AUTO, choose, fallbacks, find
+from optid.core.problem import Problem
 from optid.errors import SolverRefused
 from optid.processes import LONGEST
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status, Times
 from optid.solving.answers import answer_of
 from optid.solving.claims import FALSE_CLAIM, verdict
+from optid.solving.express import programme_of
 from optid.solving.steps import Solvers
 
-Procedure = Generator[Program, Solution, Any]
+Procedure = Generator[Any, Solution, Any]  # of programmes or problems
 
 ENDLESS = LONGEST / 2  # seconds; a longer time limit, such as infinity, is none
 UNUSABLE = (Status.FAILED, Status.LIMIT)
 
 
-def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
+def solve(program: Program | Problem, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
           time_limit: float | None = None, isolate: bool | None = None, warm: bool = True, prove: bool = True,
           verbose: bool = False, **options: Any) -> Solution:
     """Solve one programme with one back end and judge the answer.
 
     Args:
-        program: what to solve.
+        program: what to solve, also a `optid.core.problem.Problem`.
         solver: the back end's word, "auto", or a `BackEnd` (or plain ``run`` function) of your own.
         accuracy: requested relative accuracy, translated for each solver.
         time_limit: seconds, infinity for none; implies a separate process, which is killed when it does not stop.
@@ -46,7 +48,7 @@ def solve(program: Program, solver: str | BackEnd | Callable = "auto", *, accura
         SolverMissing: not installed (with the pip line).
         SolverRefused: the solver cannot take this class of programme; the message names the nonconvex part.
     """
-    chosen = ""
+    chosen, program = "", programme_of(program)
     if solver == "auto":
         back_end, chosen = choose(program)
     elif isinstance(solver, str):
@@ -150,14 +152,14 @@ class Outcome:
     evidence: Evidence | None = None
 
 
-def run(problem: Program | Procedure, solver: Any = "auto", *, options: Mapping[str, Any] | None = None,
+def run(problem: Program | Problem | Procedure, solver: Any = "auto", *, options: Mapping[str, Any] | None = None,
         **settings: Any) -> Outcome:
     """Solve a programme, or drive a procedure that yields programmes and returns the model, with settings of `solve`.
 
     The time that a procedure itself takes, between its programmes, counts as building.
 
     Args:
-        problem: the programme, or the procedure.
+        problem: the programme, a problem of the core, or a procedure that yields either.
         solver: as for `solve`, or `Solvers`: of a procedure, steps that do not take the one word run as "auto".
         options: native options, for the programmes that a named solver solves.
         settings: others of `solve`.
@@ -178,18 +180,19 @@ def run(problem: Program | Procedure, solver: Any = "auto", *, options: Mapping[
         last[program.name] = program, solution
         return solution
 
+    problem = programme_of(problem)
     if isinstance(problem, Program):
         solution = solve_step(problem)
         model = problem.recover(solution.values) if solution.has_point else None
         return Outcome(model, solution, problem, tuple(steps), constrained=constrained)
     clock = time.perf_counter()
-    program = next(problem)
+    program = programme_of(next(problem))
     building = time.perf_counter() - clock
     while True:
         solution = solve_step(program)
         clock = time.perf_counter()
         try:
-            program = problem.send(solution)
+            program = programme_of(problem.send(solution))
             building += time.perf_counter() - clock
         except StopIteration as stop:
             found = stop.value

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from optid.errors import OptidError, StudyError
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
+from optid.solving.express import programme_of
 from optid.solving.solve import solve
 from optid.studies.definition.description import Study
 from optid.studies.definition.trial import posed
@@ -94,14 +95,14 @@ def _programmes(cell: Cell) -> list[tuple[Program, Solution]]:
     found: list[tuple[Program, Solution]] = []
     with warnings.catch_warnings(), suppress(StopIteration, OptidError, ArithmeticError, np.linalg.LinAlgError):
         warnings.simplefilter("ignore")  # the row of the cell has the reason of a failure
-        problem = posed(cell.formulation_name, load(cell).data, cell.constraints, cell.options)
-        program = problem if isinstance(problem, Program) else next(problem)
+        problem = programme_of(posed(cell.formulation_name, load(cell).data, cell.constraints, cell.options))
+        program = problem if isinstance(problem, Program) else programme_of(next(problem))
         while True:
             solution = solve(program, accuracy=ACCURACY, time_limit=cell.time_limit, prove=False)
             found.append((program, solution))
             if program is problem:
                 break
-            program = problem.send(solution)
+            program = programme_of(problem.send(solution))
     return found
 
 

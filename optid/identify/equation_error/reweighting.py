@@ -27,6 +27,7 @@ from optid.identify.record_checks import BY_RESIDUALS, EXAMINED, list_samples
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.units import in_units
+from optid.solving.express import programme_of
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics import Layout, residuals
 
@@ -86,7 +87,7 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
     whole = compress(data, **structure)
     record = data if whole.shifts is None else levelled(data)[0]
     used = _Rows(in_units(record, whole.units), whole.layout)
-    problem, base = whole, pose(whole)
+    problem, base = whole, programme_of(pose(whole))
     scale = base.scale  # the weights of a pass are no unit of the data
 
     def weighted(sizes: list[np.ndarray], start: Any) -> tuple[Program, list[np.ndarray]]:
@@ -94,12 +95,12 @@ def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure:
         weights = used.only(_weights(r, kind, width) for r in sizes)
         compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics,
                              between=problem.between)
-        return replace(pose(compressed), start=start, certify=None, scale=scale), weights
+        return replace(programme_of(pose(compressed)), start=start, certify=None, scale=scale), weights
 
     while True:
         if used.count:
             problem = compress(data, weights=used.only(np.ones(e.n_samples) for e in data.experiments), **structure)
-            base = pose(problem)
+            base = programme_of(pose(problem))
             scale = base.scale
         program, weights, spread, width = base, [], 0.0, 0.0
         for _ in range(SETTLING):  # the scale settles before the loss is fixed; afterwards the objective cannot rise

@@ -16,9 +16,9 @@ from optid.arrays import Array
 from optid.core.judge import largest_excess
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values, flat
-from optid.identify.express import as_program
 from optid.identify.prediction_error.descent import Criterion
 from optid.program.program import Program
+from optid.solving.express import as_program
 from optid.statistics.linearised import Linearised
 from optid.statistics.unknowns import Unknowns
 

@@ -13,6 +13,7 @@ from optid.program.solution import Status
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
 from optid.show.wording import short
+from optid.solving.express import programme_of
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.problems import Label, Problems
@@ -118,8 +119,8 @@ def _posed(entry: FormulationEntry, record: Data) -> Any:
     """Return the programme of a formulation on a record, or the first one of a procedure."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        problem = posed(entry.formulation, record, entry.constraints, entry.options)
-        return problem if hasattr(problem, "view") else next(problem)
+        problem = programme_of(posed(entry.formulation, record, entry.constraints, entry.options))
+        return problem if hasattr(problem, "view") else programme_of(next(problem))
 
 
 def posed(formulation: str, record: Data, constraints: Sequence[str], options: Mapping[str, Any]) -> Any:

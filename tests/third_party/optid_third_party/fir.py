@@ -2,17 +2,18 @@
 
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
-from optid import Data, HammersteinTF, Linear, Nonlinearity, Program
+from optid import Data, HammersteinTF, Linear, Nonlinearity
 from optid.bases import Basis
+from optid.core.problem import Problem
+from optid.core.terms import Squares
 from optid.errors import RankError, StructureError
-from optid.program.view import View
 
 
-def decaying(data: Data, *, length: int, decay: float = 0.8, weight: float = 1e-3, constraints: tuple = ()) -> Program:
+def decaying(data: Data, *, length: int, decay: float = 0.8, weight: float = 1e-3, constraints: tuple = ()) -> Problem:
     """Pose ``min ‖y - sum_j b_j u(t - j) - d‖² + weight yᵀy sum_j b_j² decay^-j`` for one input and one output.
 
     Args:
@@ -25,17 +26,11 @@ def decaying(data: Data, *, length: int, decay: float = 0.8, weight: float = 1e-
     if not (0 < decay < 1 and weight >= 0):
         raise StructureError("decay must lie between 0 and 1, weight must not be negative")
     root, scale = triangle(data, length)
-    b, offset = cp.Variable(length, name="b"), cp.Variable(1, name="offset")
-    residual = cp.Variable(len(root), name="residual")
-    error = root[:, -1] - root[:, :-1] @ cp.hstack([b, offset])
-    penalty = weight * scale * cp.sum_squares(cp.multiply(decay ** (-0.5 * np.arange(length)), b))
-
-    program = Program(
-        "fir.decaying", cp.Minimize(cp.sum_squares(residual) + penalty), {"residual": (residual == error,)},
-        {"b": b, "offset": offset, "residual": residual}, {}, partial(recover, data),
-        view_of(data, b, offset), frozenset({"residual"}),
-        derived={"residual": error}, scale=scale)
-    return program.subject_to(*constraints)
+    rough = np.diag(np.sqrt(weight * scale) * decay ** (-0.5 * np.arange(length)))
+    return Problem(
+        "fir.decaying", {"b": np.zeros(length), "offset": np.zeros(1)},
+        (Squares(root[:, :-1], root[:, -1], 0.0, ("b", "offset")), Squares(rough, np.zeros(length), 0.0, ("b",))),
+        model=partial(recover, data), facts=facts(data), builders=tuple(constraints), scale=scale, energy=scale)
 
 
 def triangle(data: Data, length: int) -> tuple[np.ndarray, float]:
@@ -55,10 +50,9 @@ def triangle(data: Data, length: int) -> tuple[np.ndarray, float]:
     return np.linalg.qr(rows, mode="r"), float(rows[:, -1] @ rows[:, -1])
 
 
-def view_of(data: Data, b: cp.Variable, offset: cp.Variable) -> View:
-    """Return what constraints may speak about."""
-    return View({"b": b, "offset": offset}, channels=data.inputs, bases={data.inputs[0]: line(data)},
-                outputs=data.outputs)
+def facts(data: Data) -> dict[str, Any]:
+    """Return what constraints may ask besides the unknowns."""
+    return {"channels": data.inputs, "bases": {data.inputs[0]: line(data)}, "outputs": data.outputs}
 
 
 def line(data: Data) -> Basis:

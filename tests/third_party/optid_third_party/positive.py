@@ -15,7 +15,8 @@ from optid import Bound, Data, Program
 from optid.backends import Answer, BackEnd, Settings
 from optid.program.solution import Status, relative_gap
 from optid.program.structure import Structure
-from optid_third_party.fir import recover, triangle, view_of
+from optid.program.view import View
+from optid_third_party.fir import facts, recover, triangle
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +44,8 @@ def positive(data: Data, *, length: int, constraints: tuple = ()) -> Program:
     b, offset = cp.Variable(length, name="b"), cp.Variable(1, name="offset")
     program = Program(
         "fir.positive", cp.Minimize(cp.sum_squares(root[:, :-1] @ cp.hstack([b, offset]) - root[:, -1])),
-        {"positive": (b >= 0,)}, {"b": b, "offset": offset}, {}, partial(recover, data), view_of(data, b, offset),
+        {"positive": (b >= 0,)}, {"b": b, "offset": offset}, {}, partial(recover, data),
+        View({"b": b, "offset": offset}, **facts(data)),
         frozenset({"positive"}), structure=PositiveLeastSquares(root[:, :-1], root[:, -1]), certify=certify,
         scale=scale)
     return program.subject_to(*constraints)

@@ -1,0 +1,90 @@
+"""A problem of the core as a programme in CVXPY, for the back ends, judgement and proofs of programmes."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from optid.certificate.lifting import MAX_SIZE, certify_rank_one
+from optid.core.problem import GAUGE, Problem
+from optid.core.terms import Squares, stacked_expression, sum_of
+from optid.errors import StructureError
+from optid.program.program import Program
+from optid.program.view import View
+from optid.structures.least_squares import LinearStructure, RankOneStructure
+
+
+def programme_of(problem: Any) -> Any:
+    """Return the programme of a problem of the core, anything else as it is."""
+    return as_program(problem) if isinstance(problem, Problem) else problem
+
+
+def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -> Program:
+    """Return the programme of a problem, with its constraints.
+
+    Where products stand in its squares, no semidefinite relaxation with more multipliers than `max_size` is tried for a
+    proof; for a step of a procedure that has evidence of its own none at all.
+
+    Raises:
+        StructureError: a term that is no expression, constraints that do not fit.
+    """
+    several = [term for term in problem.terms if isinstance(term, Squares)]
+    if len(several) < len(problem.terms) or len(several) > 1 and problem.products:
+        return _of_terms(problem, step)
+    if len(several) > 1:
+        sizes = {name: place.stop - place.start for name, place in problem.space.places.items()}
+        problem = replace(problem, terms=(Squares.joined(several, sizes),))
+    (squares,) = (term for term in problem.terms if isinstance(term, Squares))
+    products = {product.name: product for product in problem.products}
+
+    def statement() -> dict[str, Any]:
+        unknowns, leaves = _expressions(problem)
+        residual = squares.root @ stacked_expression(leaves, squares.z) - squares.target
+        r = cp.Variable(residual.size, name="residual")
+        gauge = {GAUGE: tuple(one.condition(unknowns) for one in products.values())} if products else {}
+        return {"objective": cp.Minimize(cp.sum_squares(r) + squares.remainder),
+                "constraints": {"residual": (r == residual,), **gauge}, "derived": {"residual": residual},
+                "variables": {**unknowns, "residual": r}, "view": _view(problem, leaves)}
+
+    linear, numbers = tuple(name for name in squares.z if name not in products), squares.lifted or squares
+    pairs = tuple((one.mu, one.b) for one in map(products.__getitem__, squares.z[len(linear) :]))
+    structure = RankOneStructure(numbers, linear, pairs, problem.products[0].gauge) if products else (
+        LinearStructure(numbers, linear))
+    made = Program.deferred(
+        problem.name, statement, start=problem.start, recover=problem.model, structure=structure,
+        structural=frozenset({"residual", GAUGE} if products or GAUGE in problem.structural else {"residual"}),
+        scale=problem.scale, unit=problem.unit, compressed=problem.compressed, step=step,
+        certify=partial(certify_rank_one, max_size=max_size) if products else None,
+        core=replace(problem, builders=()))
+    return made.under(problem) if problem.builders else made
+
+
+def _of_terms(problem: Problem, step: bool) -> Program:
+    """Return the programme of any terms that are expressions of the leaves."""
+    for term in problem.terms:
+        if not hasattr(term, "express"):
+            raise StructureError(f"{type(term).__name__}, a term of {problem.name!r}, is no expression of its "
+                                 "unknowns: state its squares near a point (Problem.tangent)")
+    unknowns, leaves = _expressions(problem)
+    gauge = {GAUGE: tuple(one.condition(unknowns) for one in problem.products)} if problem.products else {}
+    return Program(
+        problem.name, cp.Minimize(sum_of([term.express(leaves) for term in problem.terms])), gauge, unknowns,
+        problem.start, problem.model, _view(problem, leaves), frozenset(gauge), scale=problem.scale, unit=problem.unit,
+        compressed=problem.compressed, step=step, core=replace(problem, builders=())).subject_to(*problem.builders)
+
+
+def _expressions(problem: Problem) -> tuple[dict[str, cp.Variable], dict[str, Any]]:
+    """Return new variables of the unknowns, and the expressions of all leaves in them."""
+    unknowns = {name: cp.Variable(np.shape(value), name=name, symmetric=name in problem.symmetric)
+                for name, value in problem.start.items()}
+    leaves: dict[str, Any] = {one.name: one.express(unknowns) for one in problem.leaves if hasattr(one, "express")}
+    return unknowns, {**unknowns, **leaves}
+
+
+def _view(problem: Problem, leaves: Mapping[str, Any]) -> View:
+    further = {} if problem.further is None else problem.further(leaves, problem.start)
+    shown = {name: one for name, one in {**leaves, **further}.items() if one is not None}
+    return View(shown, **{"reference": problem.start, **problem.facts})
