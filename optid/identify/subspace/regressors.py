@@ -164,14 +164,15 @@ def adjoint_responses(inner: Array, outputs: Array, state: Array, parts: Iterabl
     sample; ``inner`` is F (n, n), ``outputs`` C (l, n).
     """
     (l, n), d = outputs.shape, state.shape[1]  # noqa: E741
-    powers = np.empty((BLOCK + 1, n, n))
+    powers, known, square = np.empty((BLOCK + 1, n, n)), 1, inner
     powers[0] = np.eye(n)
-    for k in range(BLOCK):
-        powers[k + 1] = powers[k] @ inner
-    toeplitz = np.zeros((BLOCK, l, n, BLOCK + 1))
-    for i in range(BLOCK):
-        toeplitz[i, :, :, i + 1 :] = np.einsum("oh,khi->oik", outputs, powers[: BLOCK - i])
-    toeplitz = toeplitz.reshape(BLOCK, -1)
+    while known <= BLOCK:  # twice as many each time
+        powers[known : 2 * known] = powers[: min(known, BLOCK + 1 - known)] @ square
+        known, square = 2 * known, square @ square
+    effects = np.zeros((l, n, 2 * BLOCK + 1))
+    effects[..., BLOCK + 1 :] = (outputs @ powers[:BLOCK]).transpose(1, 2, 0)
+    lags = BLOCK + np.arange(BLOCK + 1) - np.arange(BLOCK)[:, None]
+    toeplitz = effects[:, :, lags].transpose(2, 0, 1, 3).reshape(BLOCK, -1)
     free = powers[:BLOCK].transpose(1, 2, 0).reshape(n, -1)
     for part in parts:
         count = part.shape[1]
