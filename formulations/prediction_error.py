@@ -39,13 +39,10 @@ from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.channels import model_meta
 from optid.data.record import Data
-from optid.identify.arguments import enough_rows
 from optid.identify.gauges import FIXED
-from optid.identify.prediction_error.compressed_errors import CompressedErrors
-from optid.identify.prediction_error.search import entry, search, starts_of
-from optid.identify.prediction_error.tangent_descent import refine
-from optid.identify.prediction_error.tangent_fit import Places, TangentFit
+from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
+from optid.identify.prediction_error.transfer_fit import fit_transfer
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.units import outer_bases
 from optid.solving.solve import Procedure
@@ -153,17 +150,12 @@ def armax(data: Data, *, na: int, nb: Orders, nc: int, nk: Orders = 0, constrain
 
 def _procedure(name: str, data: Data, na: Any, nb: Any, nk: Any, basis: Any, nc: Any, nd: int | None,
                constraints: Sequence[Any], gauge: str | None, offset: Any, starts: Any, seed: int) -> Procedure:
-    """Search for the best optimum in a gauge that is always reached, and continue from there in the requested one."""
+    """Check the numbers, and fit."""
     count = check_integer(starts, "starts")
     check_integer(seed, "seed", 0, LARGEST_INTEGER)
-    criterion = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
-    criterion = replace(criterion, integrates=asks_for_integrator(constraints))
-    free = replace(criterion, gauge="none" if gauge is None else "norm")
-    best, others, figures = search(free, lambda part: starts_of(part, count, seed))
-    enough_rows(best.at.rows, criterion.errors, criterion.unknowns.size, "lags")
-    problem = _problem(name, criterion, criterion.normalised(best.x)).subject_to(*constraints)
-    fit = TangentFit(problem, criterion, partial(CompressedErrors, criterion))
-    return (yield from refine(fit, best, figures, entry(fit, free, [best, *others])))
+    errors = transfer_errors(data, na, nb, nk, basis, nc, nd, gauge, offset)
+    errors = replace(errors, integrates=asks_for_integrator(constraints))
+    return (yield from fit_transfer(errors, count, seed, lambda x: _problem(name, errors, x).subject_to(*constraints)))
 
 
 def _problem(name: str, errors: TransferErrors, optimum: Array) -> Problem:

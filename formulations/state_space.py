@@ -23,8 +23,7 @@ signal ``mu latent``, ``b latent`` (= [Ez_i; Fz_i]) and ``z`` (= [Cz_i, Dz_i, co
 channel, as in ``mu[valve]``. Rules about poles read ``P`` (held) and ``Q = A P``.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -33,38 +32,24 @@ import numpy as np
 
 from formulations.constraints.poles import NO_EQUATION, asks_for_integrator
 from formulations.subspace_procedure import identified
-from optid.arrays import check_integer, one_of
 from optid.bases import Bases
 from optid.core.leaves import Leaf, Product
 from optid.core.problem import Problem
 from optid.core.terms import Errors, Values
 from optid.data.channels import Transform
-from optid.data.levels import levelled
 from optid.data.record import Data
-from optid.data.stretches import with_whole_inputs
-from optid.errors import RankError, StructureError
-from optid.identify.arguments import check_offset, in_memory
-from optid.identify.prediction_error.compressed_errors import CompressedStates
-from optid.identify.prediction_error.descent import Descent
-from optid.identify.prediction_error.latent_search import STAGES, first_samples
+from optid.errors import StructureError
 from optid.identify.prediction_error.state_errors import StateErrors
-from optid.identify.prediction_error.state_search import complete, errors_and_starts, on_whole, quietly, search_states
+from optid.identify.prediction_error.state_fit import fit_states
 from optid.identify.prediction_error.static_curve import static_curve
-from optid.identify.prediction_error.tangent_descent import refine
-from optid.identify.prediction_error.tangent_fit import Places, TangentFit
-from optid.identify.subspace.plan import Plan, in_record_units, planned
+from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import modal_weight
-from optid.program.solution import Status
-from optid.program.units import energy_unit, in_units, inverse, outer_bases
-from optid.solving.solve import Evidence, Procedure
-from optid.statistics.state_unknowns import SIMULATORS
+from optid.program.units import outer_bases
+from optid.solving.solve import Procedure
 
 Array = np.ndarray
-
-WORDS = {"criterion": tuple(SIMULATORS), "stability": ("stable", "free"),
-         "weighting": ("auto", "scale", "variance", "determinant")}
 
 
 @subspace_steps(tangent="hammerstein_ss.exact")
@@ -172,106 +157,8 @@ def state_space_model(errors: StateErrors, constrained: bool, values: Values) ->
     return found.regauge("norm") if any(errors.unknowns.free) and not constrained else found
 
 
-def state_space_fit(name: str, data: Data, nx: int | str, *, criterion: str, stability: str,
-                    weighting: str, iterations: int, constraints: Sequence[Any], initial: Any, block_rows: Any,
-                    basis: Any = "linear", feedback_basis: Any = None, offset: Any = True, feedthrough: Any = True,
-                    extend: Callable[..., Any] | None = None, finish: Callable[..., Procedure] | None = None
-                    ) -> Procedure:
-    """Fit a model in the units of the samples, and return it in those of the record.
-
-    ``extend`` makes (errors, optimum, figures) of a model with more functions from (errors, optimum, initial models
-    with these functions), None for none.
-    ``finish`` is a procedure of (plan, errors, constraints, optimum, figures) that returns the evidence; None
-    solves the programmes in the tangent.
-    The other arguments are those of `hammerstein_ss`, as are the errors raised.
-    """
-    for what, word in {"criterion": criterion, "stability": stability, "weighting": weighting}.items():
-        one_of(what, word, WORDS[what])
+def state_space_fit(name: str, data: Data, nx: int | str, *, constraints: Sequence[Any], **settings: Any) -> Procedure:
+    """Fit a model in the units of the samples, and return it in those of the record; see `fit_states`."""
     if asks_for_integrator(constraints):
         raise StructureError(NO_EQUATION)
-    check_integer(iterations, "iterations", 1 if finish is None else 0)
-    record = in_memory(data, f"{criterion} errors")
-    constants = check_offset(offset, record)
-    if constants == "each":
-        if feedback_basis is not None or extend is not None or finish is not None:
-            raise StructureError(f"{name} with feedback, latent functions or states as variables has one constant for "
-                                 "all experiments: offset='each' is for 'ss.exact' and 'hammerstein_ss.exact' without "
-                                 "feedback, and for transfer functions")
-        data = levelled(record)[0]
-    instruments = "inputs+past" if feedback_basis is None else "simulated"
-    if feedback_basis is not None and criterion == "prediction":
-        instruments = "simulated+past"
-    poles = tuple(rule for rule in constraints if getattr(rule, "about", frozenset()) == frozenset({"poles"}))
-    for rule in poles:
-        if getattr(rule, "verify", None) is None:
-            raise StructureError(f"constraint {rule.name!r} cannot judge a model, which the steps of this fit need; "
-                                 "use it with hammerstein_ss.asivid")
-    plan = planned(name, data, nx=nx, block_rows=None, basis=basis, feedback_basis=feedback_basis,
-                   offset=bool(constants), instruments=instruments, feedthrough=feedthrough, stability="free",
-                   iterations=2 * (feedback_basis is not None), constraints=poles)
-    models = [initial] if isinstance(initial, HammersteinSS) else list(initial)
-    models = [model.with_transform(inverse(plan.units)) for model in models]
-    known = [model for model in models if model.latent]  # with functions that `extend` adds to the others
-    found = {f"start {i}": model for i, model in enumerate(models, start=1) if not model.latent}
-
-    def run() -> Procedure:
-        # what functions of latent signals are added to needs no more than a first part of a long record
-        first = plan if extend is None else replace(plan, data=first_samples(plan.data, STAGES[0]))
-        given = _block_rows(first) if block_rows is None else [int(rows) for rows in np.atleast_1d(block_rows)]
-        nx = yield from _subspace_starts(first, given, block_rows is None, found, criterion == "prediction")
-        if isinstance(nx, Evidence):
-            return nx
-        errors, starts = errors_and_starts(first, nx, found, criterion, stability, tuple(rule.verify for rule in poles),
-                                  in_units(record, plan.units) if constants == "each" else None)
-        errors, best, figures = search_states(errors, starts, weighting, int(iterations))
-        if extend is not None:
-            errors, best = on_whole(errors, best, with_whole_inputs(plan.data, 2 * nx + 1))
-            errors, best, more = extend(errors, best, known)
-            figures = {**figures, **more}
-        evidence = yield from (finish or _refined)(plan, errors, tuple(constraints), best, {"order": nx, **figures})
-        return None if evidence is None else complete(evidence, errors, energy_unit(plan.units))
-
-    return in_record_units(run(), plan)
-
-
-def _refined(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent, figures: Mapping[str, Any]
-             ) -> Procedure:
-    problem = _problem(plan.name, errors, plan.units, best.x, constraints)
-    fit = TangentFit(problem, errors, lambda at, z0: CompressedStates(errors, at, z0, plan.units))
-    return (yield from refine(fit, best, figures, fit.signed(best.x)))
-
-
-def _block_rows(plan: Plan) -> list[int | None]:
-    """Three numbers of block rows: what the subspace fit would choose, and multiples of what the order needs."""
-    if plan.order is None:
-        return [None]
-    least = plan.order // plan.data.l + 2
-    shortest = min(e.n_samples for e in plan.data.experiments)
-    most = max(shortest // (4 * (plan.data.m + plan.data.l + 1)), least)
-    return list(dict.fromkeys([None, min(2 * least, most), min(4 * least, most)]))
-
-
-def _subspace_starts(plan: Plan, block_rows: Sequence[int | None], imputes: bool, found: dict[str, HammersteinSS],
-                     predicts: bool) -> Procedure:
-    """Add the models of subspace fits to those found, and return the order; or that no poles satisfy the constraints.
-
-    Raises:
-        RankError: no fit has a point, and no other start is known.
-    """
-    refusal, nx = None, plan.order
-    for rows in block_rows:
-        try:
-            start = replace(plan, nx=plan.nx if nx is None else nx, block_rows=rows, imputes=imputes)
-            evidence = yield from quietly(identified(start))
-        except (RankError, StructureError, np.linalg.LinAlgError) as error:
-            refusal = refusal or error
-            continue
-        if evidence.status is Status.INFEASIBLE:
-            return evidence
-        if evidence.model is not None:
-            nx = nx or int(evidence.figures["order"])
-            model = evidence.extended()[0] if predicts else evidence.model  # K counts there
-            found[f"{evidence.figures['block rows']} block rows"] = model
-    if nx is None or not found:
-        raise refusal or RankError("no subspace fit has a point to start from; use another order")
-    return nx
+    return fit_states(name, data, nx, constraints=constraints, pose=_problem, subspace=identified, **settings)

@@ -268,7 +268,7 @@ def test_squares_join_into_one(seed):
     y = leaves(seed)
     first = Squares(rng.normal(size=(7, 14)), rng.normal(size=7), 0.3, ("Q", "a"))
     second = Squares(rng.normal(size=(2, 3)), rng.normal(size=2), 0.1, ("a", "c"))
-    one = Squares.joined([first, second], {name: np.size(value) for name, value in y.items()})
+    one = Squares.of_sum([first, second], {name: np.size(value) for name, value in y.items()})
     assert one.z == ("Q", "a", "c") and np.allclose(one.root, np.triu(one.root))
     for _ in range(3):
         y = {name: value + rng.normal(size=np.shape(value)) for name, value in y.items()}

@@ -57,7 +57,7 @@ class Squares:
         return cls(lifted.root, lifted.target, lifted.remainder, z, lifted)
 
     @classmethod
-    def joined(cls, several: Sequence["Squares"], sizes: Mapping[str, int]) -> "Squares":
+    def of_sum(cls, several: Sequence["Squares"], sizes: Mapping[str, int]) -> "Squares":
         """Return the sum of squares of leaves of these sizes as one, its root upper triangular."""
         z = tuple(dict.fromkeys(name for one in several for name in one.z))
         edges = np.cumsum([0, *(sizes[name] for name in z)])

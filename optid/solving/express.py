@@ -36,7 +36,7 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
         return _of_terms(problem, step)
     if len(several) > 1:
         sizes = {name: place.stop - place.start for name, place in problem.space.places.items()}
-        problem = replace(problem, terms=(Squares.joined(several, sizes),))
+        problem = replace(problem, terms=(Squares.of_sum(several, sizes),))
     (squares,) = (term for term in problem.terms if isinstance(term, Squares))
     products = {product.name: product for product in problem.products}
 
