@@ -20,6 +20,7 @@ from optid.cli.terminal import spread
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
 from optid.registry import CONSTRAINTS, FORMULATIONS, registered
+from optid.solving.express import programme_of
 from optid.solving.solve import solve
 
 
@@ -286,13 +287,13 @@ def test_a_formulation_documents_the_variables_it_poses(name):
     function = registered(FORMULATIONS)[name].load()
     parameters = inspect.signature(function).parameters
     assert list(found.signature.parameters) == list(parameters)
-    problem = function(data, **{key: value for key, value in offered.items() if key in parameters})
+    problem = programme_of(function(data, **{key: value for key, value in offered.items() if key in parameters}))
     if hasattr(problem, "view"):
         view = problem.view
     elif "shooting" in name or "ss.exact" in name or "lfr" in name:  # behind the steps that find the start
         view = last_programme(problem).view
     else:
-        view = next(problem).view
+        view = programme_of(next(problem)).view
     assert set(found.variables) == set(view) - ({*plant.states, *plant.parameters} if name == "physical" else set())
     assert set(found.arguments()) >= set(found.options)
 

@@ -16,6 +16,7 @@ from optid.certificate.convex import certify_convex
 from optid.errors import DataWarning
 from optid.program.solution import Status
 from optid.registry import formulation
+from optid.solving.express import programme_of
 from optid.solving.solve import solve
 
 CONVEX = {
@@ -29,8 +30,8 @@ CONVEX = {
 
 def posed(name, data=None, constrained=True):
     word, arguments, constraints = CONVEX[name]
-    return formulation(word)[1](record() if data is None else data, constraints=constraints if constrained else (),
-                                **arguments)
+    return programme_of(formulation(word)[1](record() if data is None else data,
+                                             constraints=constraints if constrained else (), **arguments))
 
 
 def careless(share, inner="clarabel", duals=True):

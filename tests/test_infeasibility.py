@@ -10,6 +10,7 @@ import optid
 from formulations.constraints import shape
 from optid.certificate.infeasibility import conflicting_subset, explain, satisfiable
 from optid.errors import InfeasibleError, UnboundedError
+from optid.solving.express import programme_of
 
 SETS = {
     "slope and gain": ([shape.slope(low=2, high=3), shape.gain(1.0, at=0.1), shape.coefficients("a", high=3)],
@@ -37,7 +38,7 @@ SETS = {
 def program_of(rules, form="hammerstein_arx.exact"):
     from optid.registry import formulation
 
-    return formulation(form)[1](record(), na=2, nb=2, basis=BASIS, constraints=rules)
+    return programme_of(formulation(form)[1](record(), na=2, nb=2, basis=BASIS, constraints=rules))
 
 
 @pytest.mark.sampled(4)

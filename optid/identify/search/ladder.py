@@ -346,13 +346,19 @@ def _larger(ladder: Ladder, model: Callable[..., Candidate]) -> Rung:
 
 
 def _output_functions(ladder: Ladder) -> Rung:
-    """Other functions, and then orders, of the better of Wiener and Hammerstein-Wiener models."""
+    """Other functions, of the outputs and then of the inputs, and then orders, of Wiener and Hammerstein-Wiener models.
+
+    The better of the two is followed.
+    """
     words = ("wiener_ss.exact", "hammerstein_wiener_ss.exact")
     if leading := ladder.leading(LATENT, *words):
         model = partial(structure, LATENT, leading.candidate.formulation)
         a = leading.candidate.arguments
         if ladder.follows(LATENT, *words):
             yield [model(**{**a, "output_basis": word}) for word in (SMOOTH, "polynomial:5", "bspline:4", FLEXIBLE)]
+            a = ladder.arguments(LATENT, leading.candidate.formulation)
+            inner = [ladder.bases(word) for word in (FLEXIBLE, "triangular:10", "polynomial:5")] if "basis" in a else []
+            yield [model(**{**a, "basis": word}) for word in inner if word != a["basis"]]
         if ladder.promising(LATENT, *words):
             a = ladder.arguments(LATENT, leading.candidate.formulation)
             yield from climbed([model(**{**a, "nx": n})] for n in range(a["nx"] + 1, MOST_LATENT + 1))

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from optid.arrays import LARGEST, check_integer, is_number, one_of, shown
 from optid.backends.back_end import Settings
 from optid.data.record import Data, not_a_record
 from optid.data.reduction import available_cores
-from optid.errors import DataError, RankError, SolverFailed, StructureError
+from optid.errors import DataError, OptidError, RankError, SolverFailed, StructureError
 from optid.identify.blocks import Blocks, stretches
 from optid.identify.fitting import Fit, fit
 from optid.identify.search.determined import binary
@@ -364,10 +364,11 @@ def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, se
     """Fit a structure to the whole record with all its starts; as on trial where that follows the record better."""
     candidate = chosen.candidate
     arguments = candidate.under(settings.pop("constraints"))
-    found = fit(data, candidate.formulation, **settings, **arguments)
-    as_good = 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation)
-    if as_good and not leaves(candidate, found.model, blocks, horizon):
-        return found
+    with suppress(OptidError):  # its starts may all leave their range, where the fewer ones of the trial did not
+        found = fit(data, candidate.formulation, **settings, **arguments)
+        as_good = 100 - blocks.fit(found.model, horizon) <= (1 + EQUAL) * (100 - chosen.estimation)
+        if as_good and not leaves(candidate, found.model, blocks, horizon):
+            return found
 
     def as_tried(record: Data, **more: Any) -> Fit:
         return fit(record, candidate.formulation, **settings, **{**spared(candidate), **arguments, **more})
