@@ -55,7 +55,7 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
         LinearStructure(numbers, linear))
     made = Program.deferred(
         problem.name, statement, start=problem.start, recover=problem.model, structure=structure,
-        structural=frozenset({"residual", GAUGE} if products or GAUGE in problem.structural else {"residual"}),
+        structural=problem.structural | {"residual"} | ({GAUGE} if products else set()),
         scale=problem.scale, unit=problem.unit, compressed=problem.compressed, step=step,
         certify=partial(certify_rank_one, max_size=max_size) if products else None,
         core=replace(problem, builders=()))
@@ -70,10 +70,11 @@ def _of_terms(problem: Problem, step: bool) -> Program:
                                  "unknowns: state its squares near a point (Problem.tangent)")
     unknowns, leaves = _expressions(problem)
     gauge = {GAUGE: tuple(one.condition(unknowns) for one in problem.products)} if problem.products else {}
-    return Program(
+    program = Program(
         problem.name, cp.Minimize(sum_of([term.express(leaves) for term in problem.terms])), gauge, unknowns,
-        problem.start, problem.model, _view(problem, leaves), frozenset(gauge), scale=problem.scale, unit=problem.unit,
-        compressed=problem.compressed, step=step, core=replace(problem, builders=())).subject_to(*problem.builders)
+        problem.start, problem.model, _view(problem, leaves), problem.structural | gauge.keys(), scale=problem.scale,
+        unit=problem.unit, compressed=problem.compressed, step=step, core=replace(problem, builders=()))
+    return program.subject_to(*problem.builders)
 
 
 def _expressions(problem: Problem) -> tuple[dict[str, cp.Variable], dict[str, Any]]:
