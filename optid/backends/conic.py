@@ -134,8 +134,7 @@ def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[
     """
     clarabel: Any = import_module("clarabel")  # compiled, without types
     k, n = matrix.shape
-    triangles = [_triangle(len(side)) for _, side in definite]
-    sides = [*equal, *below, *((t @ part, t @ side) for t, (part, side) in zip(triangles, definite))]
+    sides = [*equal, *below, *((_to_triangle(part), _to_triangle(side)) for part, side in definite)]
     rows = np.vstack([np.hstack([matrix, -np.eye(k)]),
                       *(np.hstack([part, np.zeros((len(part), k))]) for part, _ in sides)])
     right = np.concatenate([target, *(side for _, side in sides)])
@@ -151,20 +150,33 @@ def solve_least_squares(matrix: np.ndarray, target: np.ndarray, equal: Sequence[
     status = OF_CLARABEL.get(str(found.status), Status.FAILED)
     if status not in (Status.OPTIMAL, Status.INACCURATE, Status.LIMIT):
         return Answer(status, str(found.status))
-    duals = np.split(np.asarray(found.z), np.cumsum([sum(counts), *(len(t) for t in triangles)])[:-1])
-    return Answer(status, str(found.status), {"x": np.asarray(found.x)[:n]}, {"rows": np.concatenate(
-        [duals[0][k:], *(t.T @ dual for t, dual in zip(triangles, duals[1:]))])}, int(found.iterations))
+    edges = np.cumsum([sum(counts), *(len(part) for part, _ in sides[len(equal) + len(below) :])])[:-1]
+    plain, *triangles = np.split(np.asarray(found.z), edges)
+    matrices = [_from_triangle(part, len(side)) for part, (_, side) in zip(triangles, definite)]
+    return Answer(status, str(found.status), {"x": np.asarray(found.x)[:n]},
+                  {"rows": np.concatenate([plain[k:], *matrices])}, int(found.iterations))
 
 
-def _triangle(size: int) -> np.ndarray:
-    """Return the map of a flat square matrix to the triangle of its symmetric part with the same inner product."""
-    n = round(size**0.5)
-    pairs = [(i, j) for j in range(n) for i in range(j + 1)]
-    found = np.zeros((len(pairs), size))
-    for row, (i, j) in enumerate(pairs):
-        for place in (i + n * j, j + n * i):
-            found[row, place] = 1.0 if i == j else np.sqrt(0.5)
+def _to_triangle(rows: np.ndarray) -> np.ndarray:
+    """Return the triangles of the symmetric parts of flat square matrices (n², k), with the same inner products."""
+    i, j, n = _places(len(rows))
+    weights = np.where(i == j, 0.5, np.sqrt(0.5)).reshape(-1, *[1] * (rows.ndim - 1))
+    return weights * (rows[i + n * j] + rows[j + n * i])
+
+
+def _from_triangle(part: np.ndarray, size: int) -> np.ndarray:
+    """Return the flat symmetric matrix (n²,) of a triangle."""
+    i, j, n = _places(size)
+    found = np.empty(size)
+    found[i + n * j] = found[j + n * i] = np.where(i == j, 1.0, np.sqrt(0.5)) * part
     return found
+
+
+def _places(size: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return rows and columns of the upper triangle of a square matrix with so many entries, column by column."""
+    n = round(size**0.5)
+    j, i = np.tril_indices(n)
+    return i, j, n
 
 
 def _has_rows_alone(program: Program) -> bool:

@@ -110,9 +110,10 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     Every structure is fitted to the record without one block at a time and simulated over the block left out; the
     initial state is estimated from the block and as many samples around it. Classes of models are tried
     from the simple to the rich; a richer one is chosen only where the pooled fit improves and the median over the
-    blocks of the log ratio of error energies exceeds 0.2. A model whose simulation diverges in a block
-    is never chosen. The trials, and with them the model, depend on the record and the arguments alone, not on the
-    machine or the number of processes. An interrupt (Ctrl-C) ends the search with the best so far.
+    blocks of the log ratio of error energies exceeds 0.2. A model whose simulation diverges in a block is never chosen,
+    nor one with feedback or functions of latent signals that leaves the range of the outputs by half of it when the
+    inputs come in other orders. The trials, and with them the model, depend on the record and the arguments alone, not
+    on the machine or the number of processes. An interrupt (Ctrl-C) ends the search with the best so far.
 
     Args:
         data: the record.
