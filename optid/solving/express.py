@@ -9,6 +9,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.certificate.lifting import MAX_SIZE, certify_rank_one
+from optid.core.leaves import Affine, Product
 from optid.core.problem import GAUGE, Problem
 from optid.core.terms import Squares, stacked_expression, sum_of
 from optid.errors import StructureError
@@ -49,10 +50,10 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
                 "constraints": {"residual": (r == residual,), **gauge}, "derived": {"residual": residual},
                 "variables": {**unknowns, "residual": r}, "view": _view(problem, leaves)}
 
-    linear, numbers = tuple(name for name in squares.z if name not in products), squares.lifted or squares
+    linear, numbers = tuple(name for name in squares.z if name not in products), squares.lifted
     pairs = tuple((one.mu, one.b) for one in map(products.__getitem__, squares.z[len(linear) :]))
-    structure = RankOneStructure(numbers, linear, pairs, problem.products[0].gauge) if products else (
-        LinearStructure(numbers, linear))
+    structure = RankOneStructure(numbers, linear, pairs, problem.products[0].gauge) if products and numbers else (
+        LinearStructure(numbers or squares, linear))
     made = Program.deferred(
         problem.name, statement, start=problem.start, recover=problem.model, structure=structure,
         structural=problem.structural | {"residual"} | ({GAUGE} if products else set()),
@@ -64,14 +65,15 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
 
 def _of_terms(problem: Problem, step: bool) -> Program:
     """Return the programme of any terms that are expressions of the leaves."""
-    for term in problem.terms:
+    terms: list[Any] = list(problem.terms)
+    for term in terms:
         if not hasattr(term, "express"):
             raise StructureError(f"{type(term).__name__}, a term of {problem.name!r}, is no expression of its "
                                  "unknowns: state its squares near a point (Problem.tangent)")
     unknowns, leaves = _expressions(problem)
     gauge = {GAUGE: tuple(one.condition(unknowns) for one in problem.products)} if problem.products else {}
     program = Program(
-        problem.name, cp.Minimize(sum_of([term.express(leaves) for term in problem.terms])), gauge, unknowns,
+        problem.name, cp.Minimize(sum_of([term.express(leaves) for term in terms])), gauge, unknowns,
         problem.start, problem.model, _view(problem, leaves), problem.structural | gauge.keys(), scale=problem.scale,
         unit=problem.unit, compressed=problem.compressed, step=step, core=replace(problem, builders=()))
     return program.subject_to(*problem.builders)
@@ -81,7 +83,8 @@ def _expressions(problem: Problem) -> tuple[dict[str, cp.Variable], dict[str, An
     """Return new variables of the unknowns, and the expressions of all leaves in them."""
     unknowns = {name: cp.Variable(np.shape(value), name=name, symmetric=name in problem.symmetric)
                 for name, value in problem.start.items()}
-    leaves: dict[str, Any] = {one.name: one.express(unknowns) for one in problem.leaves if hasattr(one, "express")}
+    leaves: dict[str, Any] = {one.name: one.express(unknowns) for one in problem.leaves
+                              if isinstance(one, Product | Affine)}
     return unknowns, {**unknowns, **leaves}
 
 

@@ -23,13 +23,13 @@ ENDLESS = LONGEST / 2  # seconds; a longer time limit, such as infinity, is none
 UNUSABLE = (Status.FAILED, Status.LIMIT)
 
 
-def solve(program: Program | Problem, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
+def solve(problem: Program | Problem, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
           time_limit: float | None = None, isolate: bool | None = None, warm: bool = True, prove: bool = True,
           verbose: bool = False, **options: Any) -> Solution:
     """Solve one programme with one back end and judge the answer.
 
     Args:
-        program: what to solve, also a `optid.core.problem.Problem`.
+        problem: the programme, or a `optid.core.problem.Problem`.
         solver: the back end's word, "auto", or a `BackEnd` (or plain ``run`` function) of your own.
         accuracy: requested relative accuracy, translated for each solver.
         time_limit: seconds, infinity for none; implies a separate process, which is killed when it does not stop.
@@ -48,7 +48,8 @@ def solve(program: Program | Problem, solver: str | BackEnd | Callable = "auto",
         SolverMissing: not installed (with the pip line).
         SolverRefused: the solver cannot take this class of programme; the message names the nonconvex part.
     """
-    chosen, program = "", programme_of(program)
+    program: Program = programme_of(problem)
+    chosen = ""
     if solver == "auto":
         back_end, chosen = choose(program)
     elif isinstance(solver, str):
@@ -180,11 +181,11 @@ def run(problem: Program | Problem | Procedure, solver: Any = "auto", *, options
         last[program.name] = program, solution
         return solution
 
-    problem = programme_of(problem)
-    if isinstance(problem, Program):
-        solution = solve_step(problem)
-        model = problem.recover(solution.values) if solution.has_point else None
-        return Outcome(model, solution, problem, tuple(steps), constrained=constrained)
+    if isinstance(problem, Program | Problem):
+        program: Program = programme_of(problem)
+        solution = solve_step(program)
+        model = program.recover(solution.values) if solution.has_point else None
+        return Outcome(model, solution, program, tuple(steps), constrained=constrained)
     clock = time.perf_counter()
     program = programme_of(next(problem))
     building = time.perf_counter() - clock

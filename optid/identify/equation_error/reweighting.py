@@ -58,14 +58,14 @@ def parse_loss(loss: str) -> tuple[str, float]:
     return kind, threshold
 
 
-def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError], Program], *, convex: bool,
-                   **structure: Any) -> Program | Procedure:
-    """Return the plain programme for squares, a procedure of reweighted programmes for the other losses.
+def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError], Any], *, convex: bool,
+                   **structure: Any) -> Any:
+    """Return the plain problem for squares, a procedure of reweighted programmes for the other losses.
 
     Args:
         loss: see `parse_loss`.
         data: the record.
-        pose: states the programme of a compressed record.
+        pose: states the problem, or the programme, of a compressed record.
         convex: whether a dual bound exists.
         structure: of `compress`.
     """
@@ -82,7 +82,7 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
     return _reweighted(data, pose, structure, kind, threshold, convex)
 
 
-def _reweighted(data: Data, pose: Callable[[EquationError], Program], structure: dict[str, Any], kind: str,
+def _reweighted(data: Data, pose: Callable[[EquationError], Any], structure: dict[str, Any], kind: str,
                 threshold: float, convex: bool) -> Procedure:
     whole = compress(data, **structure)
     record = data if whole.shifts is None else levelled(data)[0]
