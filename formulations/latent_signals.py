@@ -43,8 +43,8 @@ def lfr(data: Data, *, nx: int | str, channels: int = 1, latent_basis: Any = "po
         tries: int = 2, constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the error of a model with functions of latent signals.
 
-    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``b latent``, ``mu``, ``mu latent``, ``mu latent[z1]``,
-    ``offset``, ``x0``, ``z``. Other arguments as in `formulations.state_space.hammerstein_ss`.
+    Named variables: ``A``, ``C``, ``P``, ``Q``, ``Theta``, ``b``, ``b latent``, ``mu``, ``mu latent``,
+    ``mu latent[z1]``, ``offset``, ``x0``, ``z``. Other arguments as in `formulations.state_space.hammerstein_ss`.
 
     Args:
         channels: number of latent signals.
@@ -87,8 +87,8 @@ def wiener_ss(data: Data, *, nx: int | str, output_basis: Any = "polynomial:3",
               constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Wiener model.
 
-    Named variables: ``A``, ``Theta``, ``b``, ``mu latent``, ``mu latent[z1]``, ``offset``, ``x0``, ``z``. Other
-    arguments as in `formulations.state_space.hammerstein_ss`, as are the errors raised.
+    Named variables: ``A``, ``P``, ``Q``, ``Theta``, ``b``, ``mu latent``, ``mu latent[z1]``, ``offset``, ``x0``, ``z``.
+    Other arguments as in `formulations.state_space.hammerstein_ss`, as are the errors raised.
 
     Args:
         output_basis: basis of every h, on z in [-1, 1].
@@ -107,8 +107,8 @@ def hammerstein_wiener_ss(data: Data, *, nx: int | str, basis: Bases = "polynomi
                           constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation error of a Hammerstein-Wiener model whose inputs act on the outputs a sample later.
 
-    Named variables: ``A``, ``Theta``, ``b``, ``mu``, ``mu latent``, ``mu latent[z1]``, ``offset``, ``x0``, ``z``. Other
-    arguments as in `formulations.state_space.hammerstein_ss`, as are the errors raised.
+    Named variables: ``A``, ``P``, ``Q``, ``Theta``, ``b``, ``mu``, ``mu latent``, ``mu latent[z1]``, ``offset``,
+    ``x0``, ``z``. Other arguments as in `formulations.state_space.hammerstein_ss`, as are the errors raised.
 
     Args:
         output_basis: basis of every h, on z in [-1, 1].

@@ -63,7 +63,7 @@ def hammerstein_ss(data: Data, *, nx: int | str, basis: Bases = "polynomial:3", 
     Every input acts through one nonlinearity (rank one). The feedback functions are taken in coordinates without a
     part that is linear in the outputs of the record, which A would repeat.
 
-    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``mu``, ``offset``, ``static``, ``x0``.
+    Named variables: ``A``, ``C``, ``P``, ``Q``, ``Theta``, ``b``, ``mu``, ``offset``, ``static``, ``x0``.
 
     Args:
         data: the record. Samples may be missing: it is cut where inputs are, see `optid.data.stretches`.
@@ -105,8 +105,8 @@ def ss(data: Data, *, nx: int | str, criterion: str = "simulation", block_rows: 
        constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation or prediction error of a linear state-space model.
 
-    Named variables: ``A``, ``C``, ``Theta``, ``b``, ``offset``, ``static``, ``x0``. Arguments as in `hammerstein_ss`,
-    as are the errors raised.
+    Named variables: ``A``, ``C``, ``P``, ``Q``, ``Theta``, ``b``, ``offset``, ``static``, ``x0``. Arguments as in
+    `hammerstein_ss`, as are the errors raised.
     """
     return state_space_fit(
         "ss.exact", data, nx, criterion=criterion, block_rows=block_rows, weighting=weighting,
