@@ -42,12 +42,9 @@ def test_another_back_end_solves_the_programmes_and_that_is_said_once(monkeypatc
 
 
 @pytest.mark.filterwarnings("ignore:the expanded regressor is poorly excited")
-@pytest.mark.filterwarnings("ignore:clarabel stopped with status")
 def test_a_level_with_many_lags():
     fit = optid.fit(level(), "oe.exact", na=6, nb=6, constraints=["stable:0.999"])
-    assert fit.simulation_fit[0] > 95 and fit.solution.objective == pytest.approx(0.19712823845, rel=1e-9)
-    if fit.solution.status is not Status.LOCAL:
-        pytest.xfail("the optimum is reached, but the programme of nearly dependent unknowns does not confirm it")
+    assert fit.solution.status is Status.LOCAL and fit.simulation_fit[0] > 95
 
 
 def test_a_solver_that_was_asked_for_is_not_replaced(monkeypatch):

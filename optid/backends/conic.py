@@ -211,11 +211,18 @@ def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:
         units.append(float(np.max(np.abs(rows) @ sizes + np.abs(right), initial=0.0)) or 1.0)
         sides[one.cone].append((rows * sizes / units[-1], right / units[-1]))
     sharp = replace(settings, accuracy=min(settings.accuracy, SHARP))  # which costs an iteration or two
-    found = solve_least_squares(matrix * sizes / unit, squares.target / unit, sides["zero"], sides["below"], sharp,
-                                sides["psd"])
+    scaled, target = matrix * sizes / unit, squares.target / unit
+    own, root = np.linalg.qr(scaled)  # in its units nearly dependent unknowns cost no digits
+    small = np.abs(np.diag(root))
+    turn = np.linalg.inv(root) if len(small) == problem.size and np.min(small) > 1e-12 * np.max(small) else None
+    if turn is not None:
+        scaled, target = np.eye(problem.size), own.T @ target
+        sides = {cone: [(rows @ turn, right) for rows, right in several] for cone, several in sides.items()}
+    found = solve_least_squares(scaled, target, sides["zero"], sides["below"], sharp, sides["psd"])
     if not found.values:
         return found
-    x = problem.unpack(found.values["x"] * sizes)
+    x = found.values["x"] if turn is None else turn @ found.values["x"]
+    x = problem.unpack(x * sizes)
     edges = np.cumsum([0, *map(len, held)])
     parts = [unit**2 * found.duals["rows"][a:b] / size for a, b, size in zip(edges, edges[1:], units)]
     residual = squares.residual(problem.leaf_values(x))
