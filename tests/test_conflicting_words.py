@@ -27,7 +27,7 @@ def record(seed):
         # a slow pole turns the static gain
         (2, "range:low=-2,high=2", 81.323901), (12, "monotone:decreasing", 62.124550))),
     pytest.param(3, "monotone:decreasing", 63.778834, marks=[pytest.mark.slow, pytest.mark.xfail(
-        reason="descents from all signs end at 65.305766, 2.4 % above the least error known")])])
+        strict=True, reason="descents from all signs end at 65.305766, 2.4 % above the least error known")])])
 def test_words_that_the_record_contradicts_are_fitted_to_their_optimum(seed, word, least):
     fit = optid.fit(record(seed), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=[word])
     assert fit.solution.status is Status.LOCAL

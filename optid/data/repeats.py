@@ -62,8 +62,9 @@ def _period(moves: Array) -> int:
     if not total or not lags.size:
         return n + 1
     before, after = energy[n - lags], total - energy[lags]
-    spectra = np.abs(np.fft.rfft(moves, next_fast_len(2 * n, real=True), axis=0)) ** 2
-    products = np.sum(np.fft.irfft(spectra, next_fast_len(2 * n, real=True), axis=0), axis=1)[lags]
+    padded = next_fast_len(2 * n, real=True)
+    spectra = np.abs(np.fft.rfft(moves, padded, axis=0)) ** 2
+    products = np.sum(np.fft.irfft(spectra, padded, axis=0), axis=1)[lags]
     alike = products / np.sqrt(np.maximum(before * after, 1e-300))
     passed = np.maximum.accumulate(alike < APART)
     found = passed & (alike > ALIKE) & (np.minimum(before, after) > SHARED * total)

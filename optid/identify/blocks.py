@@ -21,6 +21,7 @@ from optid.errors import DataError, OptidError, RankError
 
 SHORTEST = 10  # samples of a part of an experiment: the output of shorter ones is mostly that of the initial state
 PHASE, MOVES = 50, 4  # samples and moves of inputs in a block of what is repeated; shorter repetitions are kept whole
+SEVERAL = 100  # experiments, each compared with all others, beyond which they are folds as they are
 NEAR = 0.15  # an experiment that ends this near to the border of two blocks, as a share of their length, moves it
 LEAD, LEAST = 0.33, 30  # share of a block that the initial state of unstable models is fitted to; samples at least
 PIECES = 20  # stretches of a record at most: every one costs time of its own
@@ -150,8 +151,7 @@ class Blocks:
         """
         try:
             part = between_gaps(joined(self.data, self.parts[block]), 2).raw()
-            states = [model.initial_state(part.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
-                      for i, n in enumerate(e.n_samples for e in part.experiments)]
+            states = [_leading_state(model, part, i) for i in range(part.n_experiments)]
             runs = as_list(model.simulate(part, x0=states if len(states) > 1 else states[0]))
         except OptidError:
             return True
@@ -171,7 +171,7 @@ class Blocks:
         for i, e in enumerate(whole.experiments):
             n = e.n_samples
             try:
-                state = model.initial_state(whole.select(experiments=i).window(0, min(max(round(LEAD * n), LEAST), n)))
+                state = _leading_state(model, whole, i)
                 run = model.simulate(np.concatenate([e.u, e.u[::-1], np.roll(e.u, n // 2, axis=0)]), x0=state)[n:]
             except OptidError:
                 return np.inf
@@ -185,10 +185,18 @@ class Blocks:
         return pooled_fit(*map(np.array, zip(*(self.errors(model, b, horizon) for b in range(len(self))))))
 
 
+def _leading_state(model: Any, data: Data, experiment: int) -> Array:
+    """Return the state at the first sample of an experiment, fitted to its beginning."""
+    n = data.experiments[experiment].n_samples
+    return model.initial_state(data.select(experiments=experiment).window(0, min(max(round(LEAD * n), LEAST), n)))
+
+
 def _repeated(data: Data, count: int) -> list[list[Part]]:
     """Return the experiments, one list each, or where long sequences of moves come again all copies of each."""
     u = [e.u for e in data.experiments]
     whole = [[Part(i, 0, len(one))] for i, one in enumerate(u)]
+    if len(u) > SEVERAL:
+        return whole
     groups = copies(u)
     for group in groups:
         i, first, last = group[0]

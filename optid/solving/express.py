@@ -33,7 +33,8 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
         StructureError: a term that is no expression, constraints that do not fit.
     """
     several = [term for term in problem.terms if isinstance(term, Squares)]
-    if len(several) < len(problem.terms) or len(several) > 1 and problem.products:
+    factorised = len(several) == 1 and several[0].lifted is not None
+    if len(several) < len(problem.terms) or problem.products and not factorised:
         return _of_terms(problem, step)
     if len(several) > 1:
         sizes = {name: place.stop - place.start for name, place in problem.space.places.items()}
