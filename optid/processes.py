@@ -20,6 +20,7 @@ from typing import Any
 
 from optid.child import BEGUN
 from optid.packing import pack
+from optid.threads import THREADS
 
 LONGEST = 2e6  # seconds; the system calls for waiting take no longer times
 BOOT = """
@@ -240,7 +241,7 @@ def _above_standard(descriptor: int) -> int:
 
 
 def _start(handle: int, lifeline: int) -> "subprocess.Popen[Any]":
-    """Start the interpreter with a connection; an interrupt at the terminal does not reach it."""
+    """Start the interpreter with a connection and one thread; an interrupt at the terminal does not reach it."""
     if sys.platform == "win32":
         os.set_handle_inheritable(handle, True)
         more: dict[str, Any] = {"startupinfo": subprocess.STARTUPINFO(lpAttributeList={"handle_list": [handle]}),
@@ -251,7 +252,7 @@ def _start(handle: int, lifeline: int) -> "subprocess.Popen[Any]":
     streams = {name: None if _identity(number) else subprocess.DEVNULL for name, number in standard.items()}
     # -P: without it a file of the working folder could hide a module of the standard library
     return subprocess.Popen([os.fsdecode(get_executable() or ""), "-P", "-c", BOOT, str(handle), *map(str, sys.path)],
-                            stdin=lifeline, **streams, **more)
+                            stdin=lifeline, env={**dict.fromkeys(THREADS, "1"), **os.environ}, **streams, **more)
 
 
 @atexit.register

@@ -40,6 +40,7 @@ from optid.progress import log
 from optid.registry import Rendered, annotations, check_arguments, defaults, formulation, named_constraint
 from optid.solving.solve import Outcome, Procedure, run
 from optid.solving.steps import Solvers, choose_solvers
+from optid.threads import one_thread
 
 
 @dataclass(frozen=True, repr=False)
@@ -295,6 +296,7 @@ def _kept(constraint: Any) -> Any:
     return constraint
 
 
+@one_thread
 def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hammerstein_arx.exact", *,
         solver: Any = "auto", accuracy: float = 1e-8, time_limit: float | None = None, isolate: bool | None = None,
         prove: bool = True, constraints: Sequence[Any] = (), solver_options: Mapping[str, Any] | None = None,
@@ -348,6 +350,7 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
                      started)
 
 
+@one_thread
 def resolve(fit: Fit, parameters: Mapping[str, float], *, solver: Any = "auto", accuracy: float = 1e-8,
             raises: bool = True) -> Fit:
     """Solve the programme of a fit again with other parameter values, such as ``weight``, starting from its solution.

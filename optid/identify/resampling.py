@@ -23,6 +23,7 @@ from optid.models import HammersteinTF
 from optid.models.functions import free_parameters
 from optid.models.recursions import autoregression
 from optid.progress import track
+from optid.threads import one_thread
 
 FAILED = 0.1  # share of refits without a point above which a warning is given
 
@@ -41,6 +42,7 @@ class Bootstrap:
     failed: int
 
 
+@one_thread
 def bootstrap(fit: Fit, runs: int = 200, seed: int = 0, level: float = 0.95, solver: str = "auto") -> Bootstrap:
     """Refit to records simulated with resampled residuals.
 

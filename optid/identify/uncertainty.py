@@ -20,6 +20,7 @@ from optid.errors import DataError, StructureError
 from optid.identify.intervals import DRAWS
 from optid.identify.tangent import Quantity, Tangent, linearise
 from optid.models.state_simulation import prepared, visited
+from optid.threads import one_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +206,7 @@ class Uncertainty:
         return [(name, *row) for name, row in zip(names, rows)]
 
 
+@one_thread
 def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0) -> Uncertainty:
     """Linearise a fit and return its standard errors, intervals and bands.
 

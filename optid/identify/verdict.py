@@ -22,6 +22,7 @@ from optid.identify.validation.checks import NOT_TESTED, record_structure, share
 from optid.identify.validation.predictions import fit_percent, one_step_or_nan, simulated_or_nan
 from optid.identify.validation.systematic import systematic
 from optid.models.functions import has_feedback, step_length
+from optid.threads import one_thread
 
 GOOD, FAIR, POOR, USELESS = "good", "fair", "poor", "useless"
 UNKNOWN = "not available"  # how a value begins that is not
@@ -77,6 +78,7 @@ class Verdict:
             f"{part.name} {part.value}: {part.outcome}" for part in self.parts)
 
 
+@one_thread
 def verdict(model: Any, data: Data, cross_validated: Sequence[float] | None = None, pooled: float | None = None,
             known: Any = None) -> Verdict:
     """Judge a model on a record.

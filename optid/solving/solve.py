@@ -16,6 +16,7 @@ from optid.solving.answers import answer_of
 from optid.solving.claims import FALSE_CLAIM, verdict
 from optid.solving.express import programme_of
 from optid.solving.steps import Solvers
+from optid.threads import one_thread
 
 Procedure = Generator[Any, Solution, Any]  # of programmes or problems
 
@@ -23,6 +24,7 @@ ENDLESS = LONGEST / 2  # seconds; a longer time limit, such as infinity, is none
 UNUSABLE = (Status.FAILED, Status.LIMIT)
 
 
+@one_thread
 def solve(problem: Program | Problem, solver: str | BackEnd | Callable = "auto", *, accuracy: float = 1e-8,
           time_limit: float | None = None, isolate: bool | None = None, warm: bool = True, prove: bool = True,
           verbose: bool = False, **options: Any) -> Solution:

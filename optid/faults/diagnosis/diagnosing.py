@@ -28,6 +28,7 @@ from optid.faults.ranges import outside
 from optid.faults.screening import check_channels
 from optid.faults.search.calibration import Thresholds
 from optid.faults.signatures import Dictionary, dictionary
+from optid.threads import one_thread
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -36,6 +37,7 @@ KINDS = "bias", "loss", "spike"
 """Kinds of faults of the default dictionary."""
 
 
+@one_thread
 def diagnose(
     model: Any, data: Any, faults: Dictionary | None = None, *, false_alarm: float = 0.01, max_faults: int = 1,
     method: str = "exact", model_uncertainty: Any = None, coverage: float = 0.95, robust: bool = False,

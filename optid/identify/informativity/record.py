@@ -13,6 +13,7 @@ from optid.identify.informativity.feedback import TIED, Loop, loop, outside, set
 from optid.identify.informativity.process import Process, processes
 from optid.identify.informativity.signals import RecordSignals
 from optid.registry import Rendered
+from optid.threads import one_thread
 
 PAIRS = 16  # inputs times outputs up to which a record is examined
 SAME = 0.03  # difference of a gain from one, and of two levels over the spread, below which they are equal
@@ -77,6 +78,7 @@ class Informativity(Rendered):
         return all(one.visible for one in tested)
 
 
+@one_thread
 def informativity(data: Data) -> Informativity:
     """Examine a record, once: excitation, feedback, effects of the inputs, dead times and low-order dynamics.
 

@@ -17,6 +17,7 @@ from optid.identify.order.states import StateCriteria, state_criteria
 from optid.registry import Rendered
 from optid.statistics.expansion import Expansion, check_channels, expand
 from optid.statistics.hankel import hankel_statistics
+from optid.threads import one_thread
 
 FEWEST, PER_ROW = 2, 1.5  # block rows at least; windows per row of the longest windows that are wanted
 
@@ -46,6 +47,7 @@ class OrderStudy(Rendered):
     findings: tuple[str, ...] = ()
 
 
+@one_thread
 def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBases = None,
           block_rows: int | None = None, nx: int | None = None, na: int = 8, nb: int = 6, nk: int = 8,
           holdout: float = 0.3, level: float | None = None) -> OrderStudy:

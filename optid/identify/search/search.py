@@ -43,6 +43,7 @@ from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
 from optid.progress import Meter, log
 from optid.registry import Rendered, named_constraint
+from optid.threads import one_thread
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
 Runs = Callable[[Sequence[Candidate], Trial | None], list[Trial | None]]
@@ -101,6 +102,7 @@ class Identification(Rendered):
         return self.fit.verdict
 
 
+@one_thread
 def identify(data: Data, *, effort: str | float = "normal", budget: float | None = None, horizon: int | None = None,
              blocks: int = 4, classes: Sequence[str] = KINDS, constraints: Sequence[Any] = (), solver: Any = "auto",
              accuracy: float = 1e-8, workers: int | None = None, trials: str | Path | None = None,
@@ -304,6 +306,7 @@ def _run(pool: Pool, kept: KeptTrials, left: Callable[[], float], told: Callable
     return [next(rest) if trial is None else trial for trial in known]
 
 
+@one_thread
 def _attempt(blocks: Blocks, settings: Mapping[str, Any], rules: Sequence[Any], horizon: int | None,
              task: tuple[Candidate, Trial | None], seconds: float) -> Trial:
     """Try a candidate against a rival, for so many CPU seconds at most."""

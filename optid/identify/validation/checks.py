@@ -29,6 +29,7 @@ from optid.identify.validation.predictions import (
 from optid.identify.validation.structure import Structure, structure_test
 from optid.models.functions import StaticFunction, has_feedback, static_functions
 from optid.registry import Rendered
+from optid.threads import one_thread
 
 LAGS = 25
 KINDS = {"nonlinearities": "input", "feedback": "output", "latent": "latent signal"}  # arguments of static functions
@@ -99,6 +100,7 @@ class Validation(Rendered):
         return all(test.passed for test in self.tests) and (self.structure is None or self.structure.passed)
 
 
+@one_thread
 def validate(model: Any, data: Data, x0: Any = "fit", lags: int = LAGS, horizon: int = 1) -> Validation:
     """Compare a model with a record, preferably one it was not estimated from.
 

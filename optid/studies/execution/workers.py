@@ -29,11 +29,11 @@ from optid.studies.execution.cell import lost_row, prepare, run_cell, without_wa
 from optid.studies.execution.worker import RETIRED, last_words, run, start
 from optid.studies.grid import Cell
 from optid.studies.storage.rows import CRASHED, ERROR, MEMORY_LIMIT, TIME_LIMIT, complete
+from optid.threads import THREADS
 
 TICK = 0.2  # seconds between checks of the standard error of the workers
 TALK = 10_000_000  # bytes of it that are kept on the disk
 STILLBORN = 3  # successive pools whose workers end before they are ready, until that is an error
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
 Row = dict[str, Any]
 

@@ -1,0 +1,32 @@
+"""One thread for linear algebra: the matrices here are small, and threads would mostly wait for each other.
+
+On a processor that has other work, threads that wait actively make a fit ten times slower; and the last digits of a
+result would depend on their number.
+"""
+
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""Variables of the environment that a fresh interpreter takes the number of its threads from."""
+
+Arguments, Result = ParamSpec("Arguments"), TypeVar("Result")
+
+
+def one_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Run a function with one thread for linear algebra; afterwards there are as many as before."""
+    @wraps(function)
+    def alone(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
+        with _libraries().limit(limits=1):
+            return function(*arguments, **options)
+
+    return alone
+
+
+@cache
+def _libraries() -> Any:
+    import scipy.linalg  # noqa: F401  # its library must be loaded to be found
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
