@@ -14,7 +14,8 @@ from optid.threads import THREADS, one_thread
 
 def threads() -> set[int]:
     """Those of the libraries of NumPy and SciPy, which are loaded; solvers may load their own at any time."""
-    return {one["num_threads"] for one in threadpool_info() if "py.libs" in one["filepath"]}
+    return {one["num_threads"] for one in threadpool_info()
+            if os.path.basename(os.path.dirname(one["filepath"])) in ("numpy.libs", "scipy.libs")}
 
 
 pytestmark = pytest.mark.skipif(not threads(), reason="the libraries of NumPy and SciPy are not those of their wheels")
