@@ -11,23 +11,19 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from optid.arrays import check_weight, one_of
 from optid.bases.basis import Basis
-from optid.certificate.lifting import certify_nuclear
 from optid.core.leaves import Product
 from optid.core.problem import Problem
-from optid.core.terms import Squares, Values
+from optid.core.terms import NuclearNorms, Squares, Values
 from optid.data.record import Data
 from optid.data.streams import Stream
 from optid.errors import StructureError
 from optid.identify.equation_error import EquationError, pose_with_loss
 from optid.identify.gauges import FIXED, in_gauge
 from optid.models import HammersteinTF
-from optid.program.program import Program
-from optid.solving.express import as_program
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 from optid.structures.bilinear import starts
@@ -38,7 +34,7 @@ from optid.structures.lifted_regression import leading_pairs
 def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
           nk: int | Sequence[int] = 0, constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0,
           curvature: float = 0.0, prior: str = "none", gauge: str = "norm", offset: bool | str = True
-          ) -> Program | Procedure:
+          ) -> Problem | Procedure:
     """Minimise the bilinear least squares ``‖Y - Phi_y a - Phi_eta vec(mu bᵀ) - d‖²``.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``.
@@ -64,20 +60,12 @@ def exact(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis
         RankError: the record does not determine the parameters.
     """
     one_of("gauge", gauge, FIXED)
-    return pose_with_loss(loss, data, partial(_programme, builders=constraints, gauge=gauge), convex=False, na=na,
+    return pose_with_loss(loss, data, partial(_factored, builders=constraints, gauge=gauge), convex=False, na=na,
                           nb=nb, nk=nk, basis=basis, ridge=ridge, curvature=curvature, prior=prior,
                           offset=offset)
 
 
-def _programme(record: EquationError, builders: Sequence[Any], gauge: str) -> Program:
-    problem = _problem(record, builders, gauge)
-    program = as_program(problem)
-    if gauge == "norm" and problem.fixes_signs:
-        return program.beginning(problem.signed_start(), partial(_factored_model, record, gauge, True))
-    return program
-
-
-def _problem(record: EquationError, builders: Sequence[Any], gauge: str) -> Problem:
+def _factored(record: EquationError, builders: Sequence[Any], gauge: str) -> Problem:
     if gauge == "gain" and record.layout.l > 1:
         raise StructureError("gauge 'gain' is defined for one output; use 'norm' or 'b0'")
     products = tuple(Product(mu, b, gauge) for mu, b in zip(record.keys("mu"), record.keys("b")))
@@ -86,9 +74,12 @@ def _problem(record: EquationError, builders: Sequence[Any], gauge: str) -> Prob
     z = (*linear, *(one.name for one in products))
     objective = Squares.of(record.problem, z)  # ‖R [a; offset; vec mu bᵀ] - s‖²
 
-    return Problem("hammerstein_arx.exact", _start(record, products), (objective,), products,
-                   partial(_factored_model, record, gauge, False), record.facts(gauge), builders=tuple(builders),
-                   **record.common())
+    problem = Problem("hammerstein_arx.exact", _start(record, products), (objective,), products,
+                      partial(_factored_model, record, gauge, False), record.facts(gauge), builders=tuple(builders),
+                      **record.common())
+    if gauge == "norm" and problem.fixes_signs:
+        return problem.beginning(problem.signed_start(), partial(_factored_model, record, gauge, True))
+    return problem
 
 
 def _factored_model(record: EquationError, gauge: str, signed: bool, x: Values) -> HammersteinTF:
@@ -113,7 +104,7 @@ def _start(record: EquationError, products: Sequence[Product]) -> dict[str, np.n
 def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Basis | str | Sequence[Basis | str],
             nk: int | Sequence[int] = 0, weight: float = 0.0, constraints: Sequence[Any] = (), loss: str = "squares",
             ridge: float = 0.0, curvature: float = 0.0, prior: str = "none", gauge: str = "norm",
-            offset: bool | str = True) -> Program | Procedure:
+            offset: bool | str = True) -> Problem | Procedure:
     """Minimise ``‖Y - Phi_y a - Phi_eta vec Theta - d‖² + 2 weight sum_c ‖Theta_c‖_*``.
 
     The penalty is the convex envelope of the ridge ``weight (‖mu‖² + ‖b‖²)`` on the factors (Falck et al. 2010); it
@@ -144,7 +135,7 @@ def nuclear(data: Data | Stream, *, na: int, nb: int | Sequence[int], basis: Bas
 def overparametrised(data: Data | Stream, *, na: int, nb: int | Sequence[int],
                      basis: Basis | str | Sequence[Basis | str], nk: int | Sequence[int] = 0, svd: str = "whitened",
                      constraints: Sequence[Any] = (), loss: str = "squares", ridge: float = 0.0, curvature: float = 0.0,
-                     prior: str = "none", gauge: str = "norm", offset: bool | str = True) -> Program | Procedure:
+                     prior: str = "none", gauge: str = "norm", offset: bool | str = True) -> Problem | Procedure:
     """Minimise the least squares in Theta and split off the rank-one factor afterwards (Algorithm 3.1).
 
     Named variables: ``Theta``, ``a``, ``offset``. Other arguments as in `nuclear`.
@@ -175,24 +166,18 @@ def _relaxed(record: EquationError, builders: Sequence[Any], gauge: str, svd: st
                    **record.common())
 
 
-def _penalised(problem: EquationError, builders: Sequence[Any], gauge: str, weight: float) -> Program:
-    linear = problem.linear_variables()  # a, offset
-    theta = {key: cp.Variable(shape, name=key) for key, shape in zip(problem.keys("Theta"), problem.problem.blocks)}
-    tau = cp.Parameter(nonneg=True, name="weight", value=weight)
-    heights = problem.units.y_scale[0] / np.array(problem.units.u_scale)  # of Theta in the units of the record
-    residual = problem.residual(linear, theta.values())
-    r = cp.Variable(residual.size, name="residual")
+def _penalised(record: EquationError, builders: Sequence[Any], gauge: str, weight: float) -> Problem:
+    thetas = {name: np.zeros(shape) for name, shape in zip(record.keys("Theta"), record.problem.blocks)}
+    start = {**record.linear_zeros(), **thetas}
+    heights = record.units.y_scale[0] / np.array(record.units.u_scale)  # of Theta in the units of the record
 
-    norms = sum(height * cp.normNuc(one) for height, one in zip(heights, theta.values()))
-    objective = cp.Minimize(cp.sum_squares(r) + problem.problem.remainder + 2 / problem.unit * tau * norms)
-    constraints = {"residual": (r == residual,)}
+    objective = (Squares.of(record.problem, tuple(start)),  # ‖R [a; offset; vec Theta] - s‖²
+                 NuclearNorms(dict(zip(thetas, 2 * weight * heights / record.unit))))
 
-    return Program(
-        "hammerstein_arx.nuclear", objective, constraints, {**linear, **theta, "residual": r}, {},
-        partial(_rank_one_model, problem, gauge, "whitened"), problem.view({**linear, **theta}),
-        structural=frozenset(constraints), derived={"residual": residual}, scale=problem.problem.scale,
-        unit=problem.unit, compressed=problem, parameters={"weight": tau},
-        certify=partial(certify_nuclear, problem.problem, heights / problem.unit)).subject_to(*builders)
+    return Problem("hammerstein_arx.nuclear", start, objective, (),
+                   partial(_rank_one_model, record, gauge, "whitened"), record.facts(), builders=tuple(builders),
+                   weights={"weight": weight}, posed=partial(_penalised, record, builders, gauge),
+                   **record.common())
 
 
 def _rank_one_model(problem: EquationError, gauge: str, svd: str, values: Values) -> HammersteinTF:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import optid
-from formulations.hammerstein_arx import _problem
+from formulations.hammerstein_arx import _factored
 from optid.core.constraint import symmetric_part
 from optid.core.leaves import Product, Quantity
 from optid.core.problem import Problem
@@ -131,7 +131,7 @@ def record(seed=0, n=120, m=1):
 
 def exact_problem(seed, words=(), m=1):
     compressed = compress(record(seed, m=m), na=2, nb=2, nk=1, basis="triangular:6")
-    return _problem(compressed, tuple(named_constraint(w) if isinstance(w, str) else w for w in words), "norm")
+    return _factored(compressed, tuple(named_constraint(w) if isinstance(w, str) else w for w in words), "norm")
 
 
 @pytest.mark.parametrize("m", [1, 2])
@@ -252,7 +252,7 @@ def test_any_other_quantity_is_a_leaf():
     assert low.residual(problem.space, problem.leaf_values(x)) * low.sizes == pytest.approx([-1.75, 0.25])
 
 
-def test_the_objective_of_a_programme_is_that_of_its_problem():
+def test_the_objective_of_a_programme_is_that_of_its_factored():
     for m in (1, 2):
         problem = exact_problem(1, m=m)
         program = as_program(problem)

@@ -207,7 +207,7 @@ def test_resolve_along_a_path_of_weights():
     again = optid.resolve(fit, {"weight": 20.0})
     direct = optid.fit(record(), "hammerstein_arx.nuclear", na=2, nb=2, basis=BASIS, weight=20.0)
     assert again.solution.objective == pytest.approx(direct.solution.objective, rel=1e-7)
-    refuses(StructureError, "no parameter 'wieght'.*weight", optid.resolve, fit, {"wieght": 1.0})
+    refuses(StructureError, "no weight 'wieght'.*weight", optid.resolve, fit, {"wieght": 1.0})
 
 
 @pytest.mark.parametrize("change, error, words", [

@@ -14,7 +14,7 @@ from cvxpy.constraints.constraint import Constraint
 from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import Linear
 from optid.core.problem import Problem
-from optid.core.terms import Squares
+from optid.core.terms import NuclearNorms, Squares
 from optid.program.expressions import affine_parts, side_by_side
 from optid.program.limits import EQUALITIES, INEQUALITIES
 from optid.program.program import Program, Values
@@ -195,37 +195,35 @@ def _lift_factor(lifted: Lifted, form: LeastSquaresStructure, i: int, of_mu: boo
     return True
 
 
-def certify_nuclear(problem: RankOne, heights: np.ndarray, program: Program, values: Values, duals: Values
-                    ) -> tuple[Bound, None]:
+def certify_nuclear(problem: RankOne, z: tuple[str, ...], norms: NuclearNorms, program: Program, values: Values,
+                    duals: Values) -> tuple[Bound, None]:
     """Bound ``‖R z - s‖² + remainder + 2 sum tau_c ‖Theta_c‖_*`` under linear constraints by its own dual.
 
-    The tau_c are the heights (inputs,) times the programme's parameter "weight". For any nu with
+    z names the variables, the last ones Theta; the norms have the weights 2 tau_c. For any nu with
     ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau_c`` the value
     ``remainder - nuᵀ s - ‖nu‖²/4 - lambdaᵀ f`` is a lower bound; nu is the residual at the point, projected and scaled.
     """
-    taus = heights * float(np.asarray(program.parameters["weight"].value))
-    form = LeastSquaresStructure(problem, tuple(name for name in program.variables if name != "residual"))
+    taus = np.array([norms.weights[name] for name in z[-len(problem.blocks) :]]) / 2
+    form = LeastSquaresStructure(problem, z)
     lifted = lift(program, form)
     if lifted.refused:
         return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear"), None
     for name in program.user_constraints:
         if name not in duals:
             return Bound.none(f"no proof: the solver gave no multiplier of {name!r}"), None
-    z = form.flat(values)
-    nu = 2.0 * (problem.root @ z - problem.target)
+    point = form.flat(values)
+    nu = 2.0 * (problem.root @ point - problem.target)
     lam = np.concatenate([np.zeros(0), *(duals[name] for name in program.user_constraints)])
     lam = np.where(lifted.linear.equality, lam, np.maximum(lam, 0.0))
     pull, cost = lifted.linear.rows.T @ lam, float(lam @ lifted.linear.right)
-    free = len(z) if not np.any(taus) else problem.linear
+    free = len(point) if not np.any(taus) else problem.linear
     nu = nu - np.linalg.lstsq(problem.root[:, :free].T, problem.root[:, :free].T @ nu + pull[:free], rcond=None)[0]
     parts = [(problem.root[:, where].T @ nu + pull[where]).reshape(q, p)
              for where, (p, q) in zip(problem.slices, problem.blocks)]
     shrink = min([1.0, *(2.0 * tau / max(float(np.linalg.norm(part, 2)), 1e-300) for part, tau in zip(parts, taus))]
                  ) if np.any(taus) else 1.0
     bound = problem.remainder - shrink * float(nu @ problem.target) - shrink**2 * float(nu @ nu) / 4 - shrink * cost
-    matrices = [values[name] for name in form.linear if name.startswith("Theta")]
-    value = problem.value(z) + 2.0 * sum(tau * float(np.linalg.norm(matrix, "nuc"))
-                                         for tau, matrix in zip(taus, matrices))
+    value = problem.value(point) + norms.value(values)
     gap = relative_gap(value, bound, problem.scale)
     proved = gap <= 1e-6
     kind = "the penalised convex problem, not the rank-one problem behind it"

@@ -22,6 +22,7 @@ from optid.program.structure import relative_gradient, variable_size
 from optid.structures.multipliers import fit_multipliers
 
 UNCONFIRMED = 1e-7  # stationarity above which multipliers fitted to the point are tried as well
+NOTHING = 1e-7  # share of the objective below which a part that has almost vanished counts as zero
 ANGLES = 24  # directions in a plane of null vectors of a matrix constraint
 
 
@@ -229,7 +230,8 @@ class LagrangianAtPoint:
             part = flat((part.reshape(shape, order="F") + part.reshape(shape, order="F").T) / 2)
         for term in self.problem.terms:
             if isinstance(term, NuclearNorms | GroupNorms) and name in term.weights:
-                nearest = flat(term.nearest(name, self.x[name], part.reshape(shape, order="F")))
+                rest = NOTHING * self.yardstick
+                nearest = flat(term.nearest(name, self.x[name], part.reshape(shape, order="F"), rest))
                 part, terms = part + nearest, terms + np.abs(nearest)
         return part, terms
 

@@ -38,6 +38,8 @@ class Problem:
         structural: names of constraints that belong to the formulation, and have no price.
         symmetric: unknowns that are symmetric matrices.
         about: names of further expressions that depend on the values of the unknowns.
+        weights: of penalties, which `under_weights` changes.
+        posed: states the problem with given weights, as keywords.
     """
 
     name: str
@@ -55,6 +57,19 @@ class Problem:
     structural: frozenset[str] = frozenset()
     symmetric: frozenset[str] = frozenset()
     about: frozenset[str] = frozenset()
+    weights: Mapping[str, float] = field(default_factory=dict)
+    posed: Callable[..., "Problem"] | None = field(default=None, repr=False)
+
+    def under_weights(self, **weights: float) -> "Problem":
+        """Return the problem with other weights of its penalties."""
+        assert self.posed is not None, "it has none"
+        return replace(self.posed(**{**self.weights, **weights}), builders=self.builders)
+
+    def beginning(self, start: Values, model: Callable[[Values], Any] | None = None) -> "Problem":
+        """Return the problem with another start, and another model of its values; constraints are as they were read."""
+        made = replace(self, start=start, model=model or self.model)
+        vars(made).update({name: one for name, one in vars(self).items() if name in ("space", "_at_start")})
+        return made
 
     def subject_to(self, *builders: Any) -> "Problem":
         """Return the problem with further constraints, which are read when they are first needed."""
@@ -257,8 +272,12 @@ class Problem:
 
     @cached_property
     def is_measured(self) -> bool:
-        """Whether every constraint is read into rows or a matrix, so that CVXPY is not needed to measure it."""
-        return all(one.cone != "other" for one in self._at_start)
+        """Whether CVXPY is not needed to measure a point.
+
+        Every constraint is read into rows or a matrix, and every term has a gradient or nearest subgradients.
+        """
+        return all(one.cone != "other" for one in self._at_start) and all(
+            hasattr(term, "pull") or hasattr(term, "nearest") for term in self.terms)
 
     def violation(self, x: Values, constraints: tuple[Constraint, ...] | None = None) -> float:
         """Return the sum of the violations at a point, of rows divided by their sizes."""

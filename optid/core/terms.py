@@ -150,15 +150,19 @@ class NuclearNorms:
         """Return the value at values of the leaves."""
         return float(sum(t * np.sum(np.linalg.svd(y[name], compute_uv=False)) for name, t in self.weights.items()))
 
-    def nearest(self, name: str, value: Array, pull: Array) -> Array:
-        """Return the subgradient at a value of a leaf that is nearest to minus a pull, both in the leaf's shape."""
+    def nearest(self, name: str, value: Array, pull: Array, rest: float = 0.0) -> Array:
+        """Return the subgradient at a value of a leaf that is nearest to minus a pull, both in the leaf's shape.
+
+        What changes the objective by no more than the rest counts as zero.
+        """
         weight = self.weights[name]
         u, s, vt = np.linalg.svd(value, full_matrices=False)
-        rank = int(np.sum(s > RANK * max(float(s[0]), TINY)))
+        force = weight + float(np.linalg.norm(pull, 2))
+        rank = int(np.sum((s > RANK * max(float(s[0]), TINY)) & (s * force > rest)))
         u, vt = u[:, :rank], vt[:rank]
-        rest = -pull - u @ (u.T @ -pull)
-        rest = rest - rest @ vt.T @ vt
-        left, size, right = np.linalg.svd(rest, full_matrices=False)
+        beside = -pull - u @ (u.T @ -pull)
+        beside = beside - beside @ vt.T @ vt
+        left, size, right = np.linalg.svd(beside, full_matrices=False)
         return weight * u @ vt + (left * np.minimum(size, weight)) @ right
 
     def excess(self, name: str, part: Array) -> float:
@@ -180,12 +184,15 @@ class GroupNorms:
         """Return the value at values of the leaves."""
         return float(sum(np.sum(t * np.linalg.norm(y[name], axis=-1)) for name, t in self.weights.items()))
 
-    def nearest(self, name: str, value: Array, pull: Array) -> Array:
-        """Return the subgradient at a value of a leaf that is nearest to minus a pull, both in the leaf's shape."""
+    def nearest(self, name: str, value: Array, pull: Array, rest: float = 0.0) -> Array:
+        """Return the subgradient at a value of a leaf that is nearest to minus a pull, both in the leaf's shape.
+
+        What changes the objective by no more than the rest counts as zero.
+        """
         weight = np.reshape(self.weights[name], (-1, 1))
         size, most = (np.linalg.norm(x, axis=-1, keepdims=True) for x in (value, pull))
         inside = -pull * np.minimum(1.0, weight / np.maximum(most, TINY))
-        there = size > EMPTY * max(float(size.max()), TINY)
+        there = (size > EMPTY * max(float(size.max()), TINY)) & (size * (weight + most) > rest)
         return np.where(there, weight * value / np.maximum(size, TINY), inside)
 
     def excess(self, name: str, part: Array) -> float:

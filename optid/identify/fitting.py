@@ -351,21 +351,21 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
 
 
 @one_thread
-def resolve(fit: Fit, parameters: Mapping[str, float], *, solver: Any = "auto", accuracy: float = 1e-8,
+def resolve(fit: Fit, weights: Mapping[str, float], *, solver: Any = "auto", accuracy: float = 1e-8,
             raises: bool = True) -> Fit:
-    """Solve the programme of a fit again with other parameter values, such as ``weight``, starting from its solution.
+    """Solve the problem of a fit again with other weights of its penalties, starting from its solution.
 
-    An unknown parameter is a `StructureError`. The other arguments are as in `fit`.
+    An unknown weight is a `StructureError`. The other arguments are as in `fit`.
     """
     started = time.perf_counter()
-    program = fit.program
-    for name, value in parameters.items():
-        if name not in program.parameters:
-            raise StructureError(f"programme {program.name!r} has no parameter {name!r}. "
-                                 f"{nearest(name, program.parameters)}")
-        program.parameters[name].value = np.asarray(value, dtype=float)
-    program.assign(fit.solution.values)
-    return _finished(fit.data, fit.formulation, {**fit.arguments, **parameters}, [], program, Solvers(solver),
+    problem = fit.program.core
+    known = {} if problem is None else problem.weights
+    for name in weights:
+        if name not in known:
+            raise StructureError(f"problem {fit.program.name!r} has no weight {name!r}. {nearest(name, known)}")
+    again = problem.under_weights(**{name: float(value) for name, value in weights.items()})
+    again = again.beginning({name: fit.solution.values[name] for name in again.start})
+    return _finished(fit.data, fit.formulation, {**fit.arguments, **weights}, [], again, Solvers(solver),
                      {"accuracy": accuracy, "solver": solver}, raises, started)
 
 

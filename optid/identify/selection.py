@@ -50,8 +50,8 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
          holdout: float = 0.3, **arguments: Any) -> Path:
     """Fit along a grid of weights of one penalty.
 
-    A penalty that is a parameter of the programme (the nuclear norm) is solved again from the solution before, without
-    compressing or compiling anything twice.
+    A penalty that is a weight of the problem (the nuclear norm) is solved again from the solution before, without
+    compressing the record twice.
 
     Args:
         data: the record.
@@ -72,7 +72,7 @@ def path(data: Data, formulation: str, *, penalty: str, weights: Sequence[float]
     grid = default_weights(train) if weights is None else np.sort(np.asarray(weights, dtype=float))
     fits, scores = [], []
     for weight in track(grid, f"path of {penalty}", len(grid)):
-        if fits and penalty in fits[-1].program.parameters:
+        if fits and fits[-1].program.core is not None and penalty in fits[-1].program.core.weights:
             one = resolve(fits[-1], {penalty: float(weight)}, solver=arguments.get("solver", "auto"))
         else:
             one = fit(train, formulation, **{**arguments, penalty: float(weight)})

@@ -196,8 +196,7 @@ def _refuse(fit: Any) -> None:
     if loss != "squares":
         raise StructureError(f"loss {loss!r} is not least squares, so that its standard errors do not follow from the "
                              "statistics; use optid.bootstrap")
-    weight = fit.program.parameters.get("weight")
-    if weight is not None and np.any(np.asarray(weight.value) > 0):
+    if fit.program.core is not None and fit.program.core.weights.get("weight", 0.0) > 0:
         raise StructureError("the nuclear norm shrinks Theta by an amount that no interval accounts for; refit with "
                              "'hammerstein_arx.exact', or use optid.bootstrap for the scatter about the shrunk value")
 

@@ -98,7 +98,8 @@ def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -
     Where the solver's multipliers do not make it stationary, those count that come nearest to it.
     """
     duals = _usable(program, answer.duals)
-    if program.core is not None and program.user_constraints and program.core.is_measured:
+    if program.core is not None and program.core.is_measured and (
+            program.user_constraints or program.structure is None):
         return _judged_in_core(program.core, answer.values, duals, base)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
         values, objective, residuals = judge(program, answer.values, duals)

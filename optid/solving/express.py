@@ -8,14 +8,15 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.certificate.lifting import MAX_SIZE, certify_rank_one
+from optid.certificate.lifting import MAX_SIZE, certify_nuclear, certify_rank_one
 from optid.core.leaves import Affine, Product
 from optid.core.problem import GAUGE, Problem
-from optid.core.terms import Squares, stacked_expression, sum_of
+from optid.core.terms import NuclearNorms, Squares, stacked_expression, sum_of
 from optid.errors import StructureError
 from optid.program.program import Program
 from optid.program.view import View
 from optid.structures.least_squares import LinearStructure, RankOneStructure
+from optid.structures.rank_one import RankOne
 
 
 def programme_of(problem: Any) -> Any:
@@ -76,8 +77,17 @@ def _of_terms(problem: Problem, step: bool) -> Program:
     program = Program(
         problem.name, cp.Minimize(sum_of([term.express(leaves) for term in terms])), gauge, unknowns,
         problem.start, problem.model, _view(problem, leaves), problem.structural | gauge.keys(), scale=problem.scale,
-        unit=problem.unit, compressed=problem.compressed, step=step, core=replace(problem, builders=()))
+        unit=problem.unit, compressed=problem.compressed, step=step, core=replace(problem, builders=()),
+        certify=_proof(problem))
     return program.subject_to(*problem.builders)
+
+
+def _proof(problem: Problem) -> Any:
+    """Return the certificate of a special form of terms, None where there is none."""
+    match problem.terms:
+        case (Squares(lifted=RankOne() as numbers, z=z), NuclearNorms() as norms) if z == tuple(problem.start):
+            return partial(certify_nuclear, numbers, z, norms)
+    return None
 
 
 def _expressions(problem: Problem) -> tuple[dict[str, cp.Variable], dict[str, Any]]:

@@ -4,12 +4,11 @@
 ``Theta_c = mu_c vec(b_c)ᵀ``; one pass over the record leaves a triangular system of the size of z.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
@@ -24,9 +23,7 @@ from optid.errors import StructureError
 from optid.identify.arguments import Offset, check_offset, per_channel
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.compressed import Spread, white_spread
-from optid.program.expressions import flat
 from optid.program.units import energy_unit, in_units, inner_bases, own_units
-from optid.program.view import View
 from optid.statistics import ExperimentMeans, Layout, Statistics, accumulate, collect, collect_by_experiment
 from optid.statistics.experiments import OF_EXPERIMENTS, UNEQUAL, by_experiment, equal_levels, rows_factor
 from optid.structures.lifted_regression import lifted_problem, positions
@@ -60,21 +57,10 @@ class EquationError:
         """Names of a per-channel variable: plain with one input, ``name[input]`` with several."""
         return [name] if self.layout.m == 1 else [f"{name}[{channel}]" for channel in self.layout.inputs]
 
-    def linear_variables(self) -> dict[str, cp.Variable]:
-        """Return new CVXPY variables ``a`` ((na,) or (l, na l) = [A_1 .. A_na]) and ``offset`` (l,)."""
-        ny, na = self.layout.l, self.layout.na
-        a = {"a": cp.Variable(na if ny == 1 else (ny, na * ny), name="a")} if na else {}
-        return {**a, "offset": cp.Variable(ny, name="offset")}
-
     def b_shape(self, channel: int) -> tuple[int, ...]:
         """Shape of b: (nb,) with one output, (nb, l) with several."""
         nb, ny = self.layout.nb[channel], self.layout.l
         return (nb,) if ny == 1 else (nb, ny)
-
-    def residual(self, linear: Mapping[str, cp.Expression], thetas: Iterable[cp.Expression]) -> cp.Expression:
-        """Return ``R z - s`` for given linear variables and matrices Theta_c (P_c, nb_c l)."""
-        z = cp.hstack([flat(part) for part in (*linear.values(), *thetas)])
-        return self.problem.root @ z - self.problem.target
 
     def facts(self, gauge: str = "") -> dict[str, Any]:
         """Return what constraints may ask besides named expressions: keyword arguments of a `View`."""
@@ -82,10 +68,6 @@ class EquationError:
         return {"channels": inputs, "bases": dict(zip(inputs, self.bases)), "gauge": gauge, "units": self.units,
                 "reference": self.linear_part(full[: self.problem.linear]),
                 "delays": dict(zip(inputs, self.layout.nk))}
-
-    def view(self, expressions: Mapping[str, cp.Expression], gauge: str = "") -> View:
-        """Return the expressions that constraints may use."""
-        return View(expressions, **self.facts(gauge))
 
     def common(self) -> dict[str, Any]:
         """Return what every `optid.core.problem.Problem` of the record has: scale, unit, energy, the record itself."""
