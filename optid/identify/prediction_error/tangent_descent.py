@@ -195,7 +195,8 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
     slow = None if about_poles(here.fit.constraints) else slowed(here.fit.criterion, here.x)
-    for start in (*here.fit.mirrored(here.x), *([] if slow is None else [slow])):
+    slow_ones = [] if slow is None else [slow, *here.fit.mirrored(slow, [(-1, -1)])]
+    for start in (*here.fit.mirrored(here.x), *slow_ones):
         end = yield from _constrained(_Iterate.of(here.fit, start), figures, MIRRORED)
         if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
             continue

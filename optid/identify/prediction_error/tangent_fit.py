@@ -138,14 +138,14 @@ class TangentFit:
         """Return x with the signs of mu and b that the constraints ask for."""
         return with_signs(self.criterion, x, self.excess if self.constraints else None)
 
-    def mirrored(self, x: Array) -> Iterator[Array]:
-        """Yield x with the three other pairs of signs of mu and b of every input.
+    def mirrored(self, x: Array, pairs: Sequence[tuple[int, int]] = ((-1, -1), (1, -1), (-1, 1))) -> Iterator[Array]:
+        """Yield x with other pairs of signs of mu and b of every input.
 
         What a word says of f may be nearer to one of them, and its optimum to another: f may be convex either way.
         """
         at = self.criterion.unknowns.slices
         for mu, b in self.criterion.unknowns.products if self.criterion.gauge == "norm" else ():
-            for mu_sign, b_sign in ((-1, -1), (1, -1), (-1, 1)) if mu.startswith("mu") else ():
+            for mu_sign, b_sign in pairs if mu.startswith("mu") else ():
                 turned = np.array(x)
                 turned[at[mu]] *= mu_sign
                 turned[at[b]] *= b_sign
