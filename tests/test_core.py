@@ -7,11 +7,13 @@ import pytest
 import optid
 from formulations.hammerstein_arx import _factored
 from optid.core.constraint import symmetric_part
+from optid.core.judge import judge
 from optid.core.leaves import Product, Quantity
 from optid.core.problem import Problem
-from optid.core.terms import Errors, GroupNorms, Inner, Length, NuclearNorms, Squares
+from optid.core.terms import Errors, GroupNorms, Inner, Length, NuclearNorms, Squares, flat
 from optid.errors import StructureError
 from optid.identify.equation_error import compress
+from optid.program.solution import Status
 from optid.registry import named_constraint
 from optid.solving.express import as_program
 
@@ -293,3 +295,21 @@ def test_a_problem_of_several_terms_is_solved_and_judged(seed):
     left, size, right = np.linalg.svd(target, full_matrices=False)
     np.testing.assert_allclose(solution.values["Q"], left * np.maximum(size - 0.6, 0) @ right, atol=1e-4)
     assert solution.objective == pytest.approx(problem.value(solution.values), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_short_length_is_judged_by_the_best_of_its_directions(seed):
+    """A residual of 1e-6 has a direction of few digits; a symmetric unknown has one multiplier for two entries."""
+    rng = np.random.default_rng(seed)
+    p, root = rng.normal(size=(3, 3)), rng.normal(size=(12, 9))
+    p = p @ p.T + np.eye(3)
+    target = root @ flat(p) + 1e-6 * rng.normal(size=12)
+    problem = Problem(
+        "short", {"P": np.eye(3)}, (Length(root, target, ("P",)),), symmetric=frozenset({"P"}), scale=10.0,
+        builders=(lambda v: {"definite": [v["P"] - 1.1 * np.eye(3) >> 0], "trace": [cp.trace(v["P"]) == np.trace(p)]},))
+    found = optid.solve(problem, "clarabel", prove=False)
+    assert found.status is Status.LOCAL, found.reason
+    x = {"P": found.values["P"]}
+    assert judge(problem, x, found.duals).residuals.stationarity < 1e-6
+    x = {"P": x["P"] + 0.01 * (root[:3].T @ root[:3])[:3, :3]}
+    assert judge(problem, {"P": (x["P"] + x["P"].T) / 2}, found.duals).residuals.stationarity > 1e-3

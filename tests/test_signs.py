@@ -13,6 +13,7 @@ from optid.models import HammersteinSS, HammersteinTF, Nonlinearity
 from optid.models.gauges import plant_sign
 from optid.program.solution import Status
 from optid.registry import formulation, named_constraint
+from optid.solving.express import as_program
 
 
 def polynomial_of(poles):
@@ -117,8 +118,9 @@ def test_constraints_fix_the_signs_of_f_and_b_only_where_they_tell_them_apart(wo
     for k in range(1, 200):
         y[k] = 0.5 * y[k - 1] + np.tanh(u[k - 1]) + 0.01 * rng.normal()
     pose = formulation("hammerstein_arx.exact")[1]
-    program = pose(optid.Data(u, y, 1.0), na=1, nb=2, basis="polynomial:3", constraints=(named_constraint(word),))
-    assert signs_are_fixed(program, [("mu", "b")]) is fixed
+    problem = pose(optid.Data(u, y, 1.0), na=1, nb=2, basis="polynomial:3", constraints=(named_constraint(word),))
+    assert problem.fixes_signs is fixed
+    assert signs_are_fixed(as_program(problem), [("mu", "b")]) is fixed  # as programmes of states tell it
 
 
 @pytest.mark.sampled(1)

@@ -14,7 +14,7 @@ from optid.arrays import Array
 from optid.core.constraint import Constraint, symmetric_part
 from optid.core.leaves import LeafSpace
 from optid.core.problem import Problem
-from optid.core.terms import GroupNorms, NuclearNorms, Values, flat
+from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
 from optid.program.judging import term_size
 from optid.program.prices import ACTIVE
 from optid.program.solution import Residuals
@@ -200,6 +200,8 @@ class LagrangianAtPoint:
         for weight, (gauge, _) in zip(self.gauge_multipliers(rows, duals), gauges(problem, self.x)):
             total += weight * gauge
             terms += abs(weight) * np.abs(gauge)
+        total = self._symmetric(total)
+        total = total + self._eased(total)
         worst = 0.0
         for name, place in problem.slices.items():
             part, effort = self._free_part(name, total[place], terms[place])
@@ -223,11 +225,29 @@ class LagrangianAtPoint:
         rates = [(float(total @ along), float(gauge @ along)) for gauge, along in gauges(self.problem, self.x)]
         return np.array([-pull / rate if rate else 0.0 for pull, rate in rates])
 
+    def _eased(self, total: Array) -> Array:
+        """Return what other subgradients of short lengths of unknowns take off a gradient (unknowns,)."""
+        found = np.zeros(self.problem.size)
+        for term in self.problem.terms:
+            if isinstance(term, Length) and set(term.z) <= self.problem.slices.keys():
+                slope = np.zeros((len(term.target), self.problem.size))
+                places = [np.arange(self.problem.size)[self.problem.slices[name]] for name in term.z]
+                slope[:, np.concatenate(places)] = term.root
+                found += term.eased(self.x, self._symmetric(slope), self._symmetric(total), NOTHING * self.yardstick)
+        return found
+
+    def _symmetric(self, slope: Array) -> Array:
+        """Return slopes (..., unknowns) by symmetric unknowns in which both of two equal entries have the mean."""
+        found = np.array(slope)
+        for name in self.problem.symmetric:
+            place, shape = self.problem.slices[name], np.shape(self.x[name])
+            turned = np.arange(np.size(self.x[name])).reshape(shape).ravel(order="F")
+            found[..., place] = (slope[..., place] + slope[..., place][..., turned]) / 2
+        return found
+
     def _free_part(self, name: str, part: Array, terms: Array) -> tuple[Array, Array]:
         """Return the gradient by an unknown with the nearest subgradient of terms with kinks, and its magnitudes."""
         shape = np.shape(self.x[name])
-        if name in self.problem.symmetric:
-            part = flat((part.reshape(shape, order="F") + part.reshape(shape, order="F").T) / 2)
         for term in self.problem.terms:
             if isinstance(term, NuclearNorms | GroupNorms) and name in term.weights:
                 rest = NOTHING * self.yardstick

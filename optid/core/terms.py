@@ -115,6 +115,20 @@ class Length:
         return Pull(size, {name: g / (2 * max(size, TINY)) for name, g in squares.gradient.items()},
                     {name: g / (2 * max(size, TINY)) for name, g in squares.magnitudes.items()})
 
+    def eased(self, y: Values, slope: Array, pull: Array, rest: float) -> Array:
+        """Return what another subgradient adds to the gradient (unknowns,), so that less is left of a pull.
+
+        The direction of a short residual is known no better than its entries, and all directions w within the unit
+        ball with ``length - wᵀ residual`` of no more than the rest count as its gradient; the slope is that of the
+        residual (k, unknowns).
+        """
+        r = self.root @ stack(y, self.z) - self.target
+        size = float(np.linalg.norm(r))
+        w = r / max(size, TINY)
+        turned = w - np.linalg.lstsq(slope.T, pull, rcond=None)[0]
+        turned /= max(1.0, float(np.linalg.norm(turned)))
+        return slope.T @ (turned - w) if size - float(turned @ r) <= rest else np.zeros(len(pull))
+
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
         return cp.norm(self.root @ stacked_expression(v, self.z) - self.target)

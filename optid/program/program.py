@@ -254,7 +254,7 @@ class Program:
                             f"constraint {name!r} is not convex, and {self.name!r} is a convex formulation: {member}. "
                             "State it in the named variables of the relaxation or use an exact formulation."
                         )
-                if self.view.units is not None:
+                if self.view.units is not None or core is not None:
                     constraints[name], limits[name] = zip(*(limit.posed(usual, sizes.get((name, k)))
                                                             for k, limit in enumerate(group)))
                 else:

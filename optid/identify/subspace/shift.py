@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
+from optid.core.problem import Problem
 from optid.errors import StructureError
 from optid.identify.arguments import violations
-from optid.program.program import Program
 from optid.program.solution import Solution, Status
 
 DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
@@ -83,10 +83,10 @@ class ShiftStep:
         return self.basis @ a @ self.change
 
 
-# the programmes of the step: (step, rules) -> fit in P and Q = A P, its residual weighted by P, or, given (P, A)
+# the problems of the step: (step, rules) -> fit in P and Q = A P, its residual weighted by P, or, given (P, A)
 # besides, in A alone from that A, its residual unweighted; (step, A, rules) -> the largest margin of P
-Programmes = tuple[Callable[..., Program], Callable[..., Program]]
-Shifting = Generator[Program, Solution, Shift]
+Programmes = tuple[Callable[..., Problem], Callable[..., Problem]]
+Shifting = Generator[Problem, Solution, Shift]
 
 
 def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: Programmes) -> Shifting:
@@ -136,7 +136,7 @@ def constrained_shift(up: Array, down: Array, rules: Sequence[Any], programmes: 
 
 
 def _deflated(up: Array, down: Array, free: Array, bound: float, rules: Sequence[Any], programmes: Programmes
-              ) -> Generator[Program, Solution, Shift | None]:
+              ) -> Generator[Problem, Solution, Shift | None]:
     """Solve the step block by block of the real Schur form A = Z T Z': poles that satisfy the rules, then a few each.
 
     The columns of ``(up A - down) Z`` of a block are ``up_1 X + up_2 S - down_2``, with X free: without the range of
