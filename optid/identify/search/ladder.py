@@ -149,6 +149,7 @@ class Ladder:
         """Return the number of states of the best linear model: the smallest whose errors are hardly larger."""
         several = [t for t in self.trials.values() if t.candidate.kind == LINEAR and np.isfinite(t.score)
                    and t.candidate.formulation in ("ss.exact", "hammerstein_ss.sid")]
+        several = [t for t in several if "criterion" not in t.candidate.arguments] or several  # states of the noise
         least = min((100 - t.score for t in several), default=0.0)
         return min((int(t.candidate.arguments["nx"]) for t in several if 100 - t.score <= (1 + SAME_ORDER) * least),
                    default=2)
@@ -183,12 +184,17 @@ def linear_models(ladder: Ladder) -> Rung:
         n = int(ladder.arguments(LINEAR, "hammerstein_ss.sid").get("nx", 2))
         yield [model("ss.exact", nx=k) for k in dict.fromkeys([n, 2])]
         yield from climbed([model("ss.exact", nx=k)] for k in range(n + 1, min(n + 3, LARGEST) + 1))
+        # free runs leave coloured errors whose weight a noise model would lower
+        yield from climbed([model("ss.exact", nx=k, criterion="prediction")] for k in range(2, LARGEST + 1))
         return
     yield from climbed([model("oe.exact", na=n, nb=n, nk=list(ladder.delays[-1]))] for n in range(1, 8))
     if a := ladder.arguments(LINEAR, "oe.exact"):  # fewer zeros, and other delays
         n = a["na"]
         yield [*(model("oe.exact", na=n, nb=nb, nk=list(a["nk"])) for nb in dict.fromkeys([1, max(n - 1, 1), n + 2])),
                *(model("oe.exact", na=n, nb=n + 1, nk=list(nk)) for nk in ladder.delays[:-1])]
+    if a := ladder.arguments(LINEAR, "oe.exact"):
+        yield [model("bj.exact", na=n, nb=a["nb"], nk=a["nk"], nc=1, nd=1)
+               for n in dict.fromkeys([max(a["na"] - 1, 1), a["na"], a["na"] + 1])]
 
 
 def low_order(ladder: Ladder) -> Iterator[Candidate]:
@@ -270,6 +276,9 @@ def _of_several_outputs(ladder: Ladder, words: Sequence[Any]) -> Rung:
     yield [states(nx=k, basis=a["basis"]) for k in dict.fromkeys([a["nx"], order, 2])]
     if a := ladder.arguments(INPUTS, "hammerstein_ss.exact"):
         yield from climbed([states(nx=k, basis=a["basis"])] for k in range(a["nx"] + 1, LARGEST + 1))
+        linear = ladder.arguments(LINEAR)
+        if linear.get("criterion") == "prediction":
+            yield [states(nx=linear["nx"], basis=a["basis"], criterion="prediction")]
 
 
 def feedback(ladder: Ladder) -> Rung:
