@@ -27,10 +27,11 @@ from pathlib import Path
 import numpy as np
 
 import optid
-from formulations.nuclear_subspace import nuclear_programme
+from formulations.nuclear_subspace import low_rank
 from optid.backends import Settings, find
 from optid.identify.subspace.low_rank import held_out_fit, order_scores, structure
 from optid.identify.subspace.plan import Plan
+from optid.solving.express import as_program
 from optid.solving.solve import solve
 
 
@@ -64,12 +65,11 @@ def nuclear_scores(train: optid.Data, test: optid.Data, form: str, rows: int, we
     plan = Plan("subspace.nuclear", train, nx, rows, "linear", None, form)
     clock = time.process_time()
     structured = structure(plan)
-    program = nuclear_programme(structured, 1.0)
+    problem = low_rank(structured, 1.0)
     found, seconds = {}, time.process_time() - clock
     for weight in weights:
-        program.parameters["weight"].value = structured.penalty(weight)
         clock = time.process_time()
-        solution = solve(program, "admm", accuracy=1e-7)
+        solution = solve(problem.under_weights(weight=structured.penalty(weight)), "admm", accuracy=1e-7)
         seconds += time.process_time() - clock
         for n, score in order_scores(structured, solution.values, test).items():
             found[float(weight), n] = score
@@ -78,10 +78,10 @@ def nuclear_scores(train: optid.Data, test: optid.Data, form: str, rows: int, we
 
 def race(structured, weight: float, solvers: list[str], accuracy: float, repeats: int) -> None:
     """Solve one programme by the ADMM and as an SDP."""
-    program = nuclear_programme(structured, structured.penalty(weight))
+    program = as_program(low_rank(structured, structured.penalty(weight)))
     times = []
     for _ in range(repeats):
-        fresh = nuclear_programme(structured, structured.penalty(weight))
+        fresh = as_program(low_rank(structured, structured.penalty(weight)))
         # the Gram matrix is decomposed anew: it belongs to the time of one solve
         for name in ("gram", "groups", "index", "known", "data"):
             fresh.structure.problem.__dict__.pop(name, None)
@@ -96,7 +96,7 @@ def race(structured, weight: float, solvers: list[str], accuracy: float, repeats
     print(f"    {'admm':10s} {min(times):9.4f} s  objective {own.objective:.8g}  bound {own.bound.value:.8g}  "
           f"{answer.iterations} iterations, {own.status}")
     for solver in solvers:
-        fresh = nuclear_programme(structured, structured.penalty(weight))
+        fresh = as_program(low_rank(structured, structured.penalty(weight)))
         clock = time.process_time()
         fresh.problem.get_problem_data(solver.upper())
         compiled = time.process_time() - clock

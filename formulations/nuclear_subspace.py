@@ -15,28 +15,26 @@ The dual bound of every programme is computed in closed form from a feasible dua
 off the matrix; everything else is done by the steps of the other subspace methods.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from formulations.subspace_procedure import identified
 from optid.arrays import LARGEST, one_of, shown
 from optid.bases import Bases, FeedbackBases
+from optid.core.low_rank import LowRank
+from optid.core.problem import Problem
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.subspace.low_rank import Structured, choose_weight, structure
 from optid.identify.subspace.plan import Plan, in_record_units, planned
 from optid.identify.subspace.steps import subspace_steps
-from optid.program.program import Program
-from optid.program.solution import Bound, Solution, Status, relative_gap
+from optid.program.solution import Solution, Status
 from optid.program.units import energy_unit
-from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem, Predictor
 
 FORMS = ("predictor", "projection", "instruments")
 # weights tried by default, each the inverse of a noise variance relative to the variance of the outputs
@@ -99,12 +97,12 @@ def _weights(weight: float | str | Sequence[float], noise: float | None) -> tupl
 def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold_out: float) -> Procedure:
     trials, weight = {}, weights[0]
     if len(weights) > 1:
-        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, partial(nuclear_programme, penalty=1.0))
+        weight, nx, trials = yield from choose_weight(plan, weights, hold_out, partial(low_rank, weight=1.0))
         plan = replace(plan, nx=nx)
     structured = structure(plan)
     if noise is not None:
         weight = float(np.mean(structured.scale)) ** 2 / noise**2 * energy_unit(plan.units)
-    solution: Solution = yield nuclear_programme(structured, structured.penalty(weight))
+    solution: Solution = yield low_rank(structured, structured.penalty(weight))
     if not solution.has_point:
         return Evidence.pointless(solution.status, solution.reason)
     _, sizes = parts = structured.decomposed(solution.values)
@@ -128,64 +126,17 @@ def _procedure(plan: Plan, weights: tuple[float, ...], noise: float | None, hold
     return evidence
 
 
-def nuclear_programme(structured: Structured, penalty: float) -> Program:
-    """Build the convex programme for a penalty lambda.
+def low_rank(structured: Structured, weight: float) -> Problem:
+    """State the convex problem for a weight lambda.
 
     Named variables: ``yhat`` (samples, l), outputs of mean zero and unit variance, and, in predictor form, ``T``, one
     column per output. The expression ``output`` is yhat in units of the data.
     """
-    problem = structured.problem
-    yhat = cp.Variable(problem.y.shape, name="yhat")
-    flat = cp.vec(yhat, order="C")
-    matrix: Any = cp.reshape(flat[problem.index.ravel(order="F")], problem.index.shape, order="F")
-    matrix = matrix if problem.left is None else problem.left @ matrix
-    matrix = matrix if problem.right is None else matrix @ problem.right
-    start: dict[str, np.ndarray] = {"yhat": problem.data}
-    variables: dict[str, cp.Variable] = {"yhat": yhat}
-    if problem.predictor is not None:
-        variables["T"] = cp.Variable((problem.parameters, problem.l), name="T")
-        matrix = matrix - _explained(problem, problem.predictor, variables["T"])
-        start["T"] = problem.explained(problem.hankel(problem.data))
-    known = np.flatnonzero(problem.known.ravel())
-    misfit = flat[known] - problem.data.ravel()[known]
-    inner = cp.Variable(problem.shape, name="X")
-    residual = cp.Variable(known.size, name="residual")
-    weight = cp.Parameter(nonneg=True, name="weight", value=penalty)
-    constraints = {"structure": (inner == matrix,), "residual": (residual == misfit,)}
-    view = View({"yhat": yhat, "output": cp.multiply(yhat, np.tile(structured.scale, (len(problem.y), 1)))
-                 + np.tile(structured.centre, (len(problem.y), 1))}, units=structured.windows.plan.units)
-    return Program(
-        "low rank", cp.Minimize(cp.normNuc(inner) + weight * cp.sum_squares(residual)), constraints,
-        {**variables, "X": inner, "residual": residual}, start, structured.decomposed, view,
-        structural=frozenset(constraints), parameters={"weight": weight},
-        derived={"X": matrix, "residual": misfit}, structure=NuclearNormStructure(problem),
-        certify=partial(certify, problem), scale=penalty * float(np.sum(problem.data**2)))
+    matrix = LowRank(structured.problem)  # W1 (H(yhat) - T_u H(eta) - ...) W2
+    misfit = matrix.misfit(weight)  # lambda ‖yhat - y‖²
 
-
-def _explained(problem: NuclearProblem, predictor: Predictor, theta: cp.Variable) -> Any:
-    """``T(theta) Phi`` plus constants as an expression: one regression matrix serves all outputs."""
-    regressors = np.stack([predictor.apply(column[:, None]).ravel() for column in np.eye(predictor.size)], axis=1)
-    l, (rows, j) = problem.l, (problem.rows, len(problem.starts))  # noqa: E741
-    flat = cp.vec(regressors @ theta, order="C")  # by block row, window, output
-    where = (np.arange(rows)[:, None, None] * j + np.arange(j)[None, None, :]) * l + np.arange(l)[None, :, None]
-    return cp.reshape(flat[where.reshape(rows * l, j).ravel(order="F")], (rows * l, j), order="F")
-
-
-def certify(problem: NuclearProblem, program: Program, values: Mapping[str, np.ndarray],
-            duals: Mapping[str, np.ndarray]) -> tuple[Bound, None]:
-    """Return the dual bound, recomputed from a feasible dual point near the multipliers, or near the subgradient."""
-    if program.user_constraints:
-        return Bound.none("the dual bound is that of the programme without constraints"), None
-    penalty = float(np.asarray(program.parameters["weight"].value))
-    program.assign({name: values[name] for name in values if name not in program.derived})
-    objective = float(np.asarray(program.objective.expr.value))
-    candidates = []
-    if "structure" in duals:
-        candidates.append(-np.reshape(duals["structure"], problem.shape, order="F"))
-    left, _, right = np.linalg.svd(np.asarray(program.variables["X"].value), full_matrices=False)
-    candidates.append(left @ right)
-    bounds = [problem.dual(candidate, penalty) for candidate in candidates]
-    value, point = max(bounds, key=lambda pair: pair[0])
-    gap = relative_gap(objective, value, program.scale)
-    return Bound(value, gap < 1e-6, "nuclear dual", f"feasible dual point, relative gap {gap:.1e}",
-                 multipliers=point), None
+    return Problem(
+        "low rank", matrix.start(), (matrix, misfit), (), structured.decomposed,
+        {"units": structured.windows.plan.units}, structured.in_units,
+        scale=weight * float(np.sum(structured.problem.data**2)),
+        weights={"weight": weight}, posed=partial(low_rank, structured))

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 import optid
-from formulations.nuclear_subspace import certify, nuclear_programme
+from formulations.nuclear_subspace import low_rank
 from optid.backends import Answer, find
 from optid.backends.choice import choose
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
 from optid.identify.subspace.low_rank import held_out_fit, structure
 from optid.identify.subspace.plan import Plan
 from optid.program.solution import Status
+from optid.solving.express import as_program
 from optid.solving.solve import solve
 from optid.structures.nuclear_norm import NuclearNormStructure
 
@@ -74,7 +75,7 @@ def test_the_missing_outputs_are_estimated():
     measured = np.where(gone, np.nan, y)
     plan = Plan("subspace.nuclear", optid.Data(u=u, y=measured, dt=1.0), 2, 6, "linear", None, "projection")
     structured = structure(plan)
-    solution = solve(nuclear_programme(structured, structured.penalty(300.0)))
+    solution = solve(low_rank(structured, structured.penalty(300.0)))
     estimated = solution.values["yhat"] * structured.scale + structured.centre
     assert np.max(np.abs(estimated - clean)[gone]) < 0.25 and np.std(clean[gone]) > 0.5
     fit = optid.fit(plan.data, "subspace.nuclear", form="projection", nx=2, block_rows=6, weight=300.0)
@@ -118,10 +119,10 @@ def test_every_back_end_ends_at_the_same_objective(form, missing):
         y[[7, 20], 0] = np.nan
     plan = Plan("subspace.nuclear", optid.Data(u=u, y=y, dt=1.0), 2, 4, "linear", None, form)
     structured = structure(plan)
-    own = solve(nuclear_programme(structured, structured.penalty(20.0)), "admm")
+    own = solve(low_rank(structured, structured.penalty(20.0)), "admm")
     assert own.status is Status.OPTIMAL and own.proof and own.gap < 1e-6
     for solver, accuracy in (("clarabel", 1e-8), ("scs", 1e-6)):
-        other = solve(nuclear_programme(structured, structured.penalty(20.0)), solver, accuracy=accuracy)
+        other = solve(low_rank(structured, structured.penalty(20.0)), solver, accuracy=accuracy)
         assert other.objective == pytest.approx(own.objective, rel=1e-4)
         assert own.bound.value <= other.objective * (1 + 1e-6)
         assert other.bound.value == pytest.approx(own.bound.value, rel=1e-3)
@@ -130,7 +131,7 @@ def test_every_back_end_ends_at_the_same_objective(form, missing):
 def programme(**arguments):
     plan = Plan("subspace.nuclear", data(count=50, noise=0.2), 2, 4, "linear", None, "projection")
     structured = structure(plan)
-    return structured, nuclear_programme(structured, structured.penalty(20.0), **arguments)
+    return structured, as_program(low_rank(structured, structured.penalty(20.0), **arguments))
 
 
 def test_the_bound_is_recomputed_whatever_a_solver_says():
@@ -139,7 +140,7 @@ def test_the_bound_is_recomputed_whatever_a_solver_says():
     rng = np.random.default_rng(0)
     for scale in (0.0, 1e-3, 1.0, 1e6):
         wrong = {"structure": own.duals["structure"] + scale * rng.normal(size=own.duals["structure"].size)}
-        bound, start = certify(structured.problem, program, own.values, wrong)
+        bound, start = program.certify(program, own.values, wrong)
         assert start is None and bound.value <= own.objective * (1 + 1e-9)
         assert bound.proved or scale
         assert np.linalg.norm(bound.multipliers, 2) <= 1 + 1e-9
@@ -163,13 +164,12 @@ def test_the_programme_chooses_the_admm_unless_something_else_is_asked_of_it():
     assert held.status in (Status.OPTIMAL, Status.LOCAL) and held.objective >= free.objective - 1e-7
 
 
-def test_weights_are_parameters_of_one_programme():
+def test_weights_are_changed_in_one_problem():
     structured, program = programme()
     first = solve(program)
-    program.parameters["weight"].value = structured.penalty(200.0)
-    second = solve(program)
+    second = solve(program.core.under_weights(weight=structured.penalty(200.0)))
     assert second.objective > first.objective
-    again = solve(nuclear_programme(structured, structured.penalty(200.0)))
+    again = solve(low_rank(structured, structured.penalty(200.0)))
     assert again.objective == pytest.approx(second.objective, rel=1e-6)
 
 

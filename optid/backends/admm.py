@@ -27,12 +27,10 @@ def run(program: Program, settings: Settings) -> Answer:
     """
     form = program.structure
     assert isinstance(form, NuclearNormStructure)
-    weight = float(np.asarray(program.parameters["weight"].value))
     allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
-    found = minimise(form.problem, weight, allowed, int(dict(settings.options).get("limit", 20_000)))
+    found = minimise(form.problem, form.weight, allowed, int(dict(settings.options).get("limit", 20_000)))
     v, theta = found.point
-    misfit = (v - form.problem.data)[form.problem.known]
-    duals = {"structure": -np.ravel(found.dual, order="F"), "residual": -2.0 * weight * misfit}
+    duals = {"structure": -np.ravel(found.dual, order="F")}
     return found.answer(allowed, {"yhat": v} | ({"T": theta} if form.problem.parameters else {}), duals)
 
 

@@ -13,6 +13,7 @@ import cvxpy as cp
 import numpy as np
 
 from optid.core.leaves import Product
+from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
 from optid.core.terms import Squares
 from optid.program.program import Program
@@ -20,7 +21,7 @@ from optid.program.view import View
 from optid.solving.express import as_program
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 from optid.structures.least_squares import LinearStructure
-from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
+from optid.structures.nuclear_norm import NuclearProblem
 from optid.structures.rank_one import RankOne
 
 SOLVED, INFEASIBLE, UNBOUNDED = "solved", "infeasible", "unbounded"
@@ -239,18 +240,13 @@ def _nuclear() -> Case:
     kept = np.maximum(values - 0.5 / weight, 0.0)
     best = (left * kept) @ right
 
-    def statement(yhat: Any, inner: Any, r: Any) -> tuple:
-        misfit = cp.vec(yhat - y, order="C")
-        parameter = cp.Parameter(nonneg=True, name="weight", value=weight)
-        return cp.normNuc(inner) + parameter * cp.sum_squares(r), {
-            "structure": inner == yhat.T, "residual": r == misfit}, {
-            "structural": frozenset({"structure", "residual"}), "derived": {"X": yhat.T, "r": misfit},
-            "parameters": {"weight": parameter}, "structure": NuclearNormStructure(NuclearProblem(y, np.arange(9), 1)),
-            "scale": weight * float(np.sum(y**2))}
+    def build() -> Program:
+        matrix = LowRank(NuclearProblem(y, np.arange(9), 1))
+        return as_program(Problem("nuclear_shrinkage", matrix.start(), (matrix, matrix.misfit(weight)),
+                                  scale=weight * float(np.sum(y**2)), weights={"weight": weight}))
 
-    return _case("nuclear_shrinkage", {"yhat": y.shape, "X": y.T.shape, "r": y.size}, statement, {"yhat": y},
-                 value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)), point={"yhat": best},
-                 duals={"structure": np.ravel(-2 * weight * (y - best).T, order="F")})
+    return Case("nuclear_shrinkage", build, value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)),
+                point={"yhat": best}, duals={"structure": np.ravel(-2 * weight * (y - best).T, order="F")})
 
 
 def _group_sparse() -> Case:

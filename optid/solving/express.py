@@ -9,13 +9,16 @@ import cvxpy as cp
 import numpy as np
 
 from optid.certificate.lifting import MAX_SIZE, certify_nuclear, certify_rank_one
+from optid.certificate.low_rank import certify_low_rank
 from optid.core.leaves import Affine, Product
+from optid.core.low_rank import LowRank
 from optid.core.problem import GAUGE, Problem
 from optid.core.terms import NuclearNorms, Squares, stacked_expression, sum_of
 from optid.errors import StructureError
 from optid.program.program import Program
 from optid.program.view import View
 from optid.structures.least_squares import LinearStructure, RankOneStructure
+from optid.structures.nuclear_norm import NuclearNormStructure
 from optid.structures.rank_one import RankOne
 
 
@@ -73,21 +76,32 @@ def _of_terms(problem: Problem, step: bool) -> Program:
             raise StructureError(f"{type(term).__name__}, a term of {problem.name!r}, is no expression of its "
                                  "unknowns: state its squares near a point (Problem.tangent)")
     unknowns, leaves = _expressions(problem)
-    gauge = {GAUGE: tuple(one.condition(unknowns) for one in problem.products)} if problem.products else {}
+    structural = {GAUGE: tuple(one.condition(unknowns) for one in problem.products)} if problem.products else {}
+    parts, derived = [], {}
+    for term in terms:
+        expression = term.express(leaves)
+        if isinstance(term, LowRank):  # its multipliers, those of a matrix of its own, tell a bound
+            derived["X"], expression = expression, cp.Variable(expression.shape, name="X")
+            structural["structure"] = (expression == derived["X"],)
+            unknowns, expression = {**unknowns, "X": expression}, cp.normNuc(expression)
+        parts.append(expression)
     program = Program(
-        problem.name, cp.Minimize(sum_of([term.express(leaves) for term in terms])), gauge, unknowns,
-        problem.start, problem.model, _view(problem, leaves), problem.structural | gauge.keys(), scale=problem.scale,
+        problem.name, cp.Minimize(sum_of(parts)), structural, unknowns, problem.start, problem.model,
+        _view(problem, leaves), problem.structural | structural.keys(), derived=derived, scale=problem.scale,
         unit=problem.unit, compressed=problem.compressed, step=step, core=replace(problem, builders=()),
-        certify=_proof(problem))
+        **_special(problem))
     return program.subject_to(*problem.builders)
 
 
-def _proof(problem: Problem) -> Any:
-    """Return the certificate of a special form of terms, None where there is none."""
+def _special(problem: Problem) -> dict[str, Any]:
+    """Return what special methods and proofs know of a form of terms: arguments of a `Program`."""
     match problem.terms:
         case (Squares(lifted=RankOne() as numbers, z=z), NuclearNorms() as norms) if z == tuple(problem.start):
-            return partial(certify_nuclear, numbers, z, norms)
-    return None
+            return {"certify": partial(certify_nuclear, numbers, z, norms)}
+        case (LowRank(numbers=numbers), Squares()):
+            form = NuclearNormStructure(numbers, problem.weights["weight"])
+            return {"certify": partial(certify_low_rank, form), "structure": form}
+    return {}
 
 
 def _expressions(problem: Problem) -> tuple[dict[str, cp.Variable], dict[str, Any]]:

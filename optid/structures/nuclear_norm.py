@@ -293,12 +293,12 @@ def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray
 class NuclearNormStructure(Structure):
     """``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²`` in ``yhat`` = v and ``T`` = theta.
 
-    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix to them, the parameter ``weight``
-    holds the weight.
+    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix to them.
     """
 
     word: ClassVar[str] = "nuclear"
     problem: NuclearProblem
+    weight: float
 
     @property
     def about(self) -> str:

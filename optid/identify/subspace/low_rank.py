@@ -4,16 +4,17 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cvxpy as cp
 import numpy as np
 
 from optid.arrays import Array
+from optid.core.problem import Problem
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
 from optid.identify.subspace.observability import Observability, Windows
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.projection import realise
 from optid.identify.validation.predictions import MEASURED, SIMULATION, prediction_fit
-from optid.program.program import Program
 from optid.program.solution import Solution
 from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
 
@@ -41,6 +42,11 @@ class Structured:
     def order(self, sizes: Array) -> int:
         """Return the rank, one at least, `LARGEST` and what the block rows can carry at most."""
         return int(np.clip(self.rank(sizes), 1, min(LARGEST, self.problem.rows - 1)))
+
+    def in_units(self, view: Mapping[str, Any], _: Values) -> dict[str, Any]:
+        """Return the expression ``output``: yhat in units of the record, beside the unknowns themselves."""
+        shape = (len(self.problem.y), 1)
+        return {"output": cp.multiply(view["yhat"], np.tile(self.scale, shape)) + np.tile(self.centre, shape)}
 
     def penalty(self, weight: float) -> float:
         """Return lambda for a weight: the inverse noise variance times the size per output sample."""
@@ -78,20 +84,20 @@ class Structured:
         return Observability(self.windows, np.vstack(blocks), self.scale)
 
 
-def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Program]
-                  ) -> Generator[Program, Solution, tuple[float, int | str, dict[str, Any]]]:
+def choose_weight(plan: Plan, weights: tuple[float, ...], hold_out: float, pose: Callable[[Structured], Problem]
+                  ) -> Generator[Problem, Solution, tuple[float, int | str, dict[str, Any]]]:
     """Return the weight, and where it is free the order, with the best simulation of the parts held out, and figures.
 
-    ``hold_out`` is a fraction of every experiment; ``pose`` builds the programme, with a parameter "weight".
+    ``hold_out`` is a fraction of every experiment; ``pose`` states the problem, with a penalty called "weight".
     """
     part, rest = plan.data.split(1 - hold_out)
     structured, trials = structure(replace(plan, data=part, block_rows=Windows.of(plan).alpha)), []
-    program = pose(structured)
+    problem = pose(structured)
     for weight in weights:
-        program.parameters["weight"].value = structured.penalty(weight)
-        solution = yield program
+        problem = problem.under_weights(weight=structured.penalty(weight)).beginning(problem.start)
+        solution = yield problem
         if solution.has_point:
-            program = replace(program, start={name: solution.values[name] for name in program.start})
+            problem = problem.beginning({name: solution.values[name] for name in problem.start})
             scores = order_scores(structured, solution.values, rest)
             trials += [(score, weight, nx) for nx, score in scores.items()]
     if not trials:
