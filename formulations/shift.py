@@ -17,20 +17,21 @@ from cvxpy.constraints.psd import PSD
 
 from formulations.constraints.rule import Rule
 from optid.core.problem import Problem
-from optid.core.terms import Inner, Length, flat
+from optid.core.terms import Inner, Length
 from optid.identify.subspace import shift
-from optid.identify.subspace.shift import DEFINITE, Shifting, ShiftStep
+from optid.identify.subspace.shift import Shifting, ShiftStep
 from optid.program.program import named
 
+DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
 NORMAL = frozenset({"positive", "trace"})  # constraints that fix the size of P
 
 
 def constrained_shift(up: np.ndarray, down: np.ndarray, rules: Sequence[Rule] = ()) -> Shifting:
     """Solve ``min ‖up A - down‖`` under rules, as `optid.identify.subspace.shift.constrained_shift`."""
-    return shift.constrained_shift(up, down, rules, (fitted, centred))
+    return shift.constrained_shift(up, down, rules, (fit_of_shift, centre_of_shift))
 
 
-def fitted(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray, np.ndarray] | None = None) -> Problem:
+def fit_of_shift(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray, np.ndarray] | None = None) -> Problem:
     """Return min ‖residual‖ under rules: in P and Q, weighted by P; with P and a start for A given, in A alone.
 
     The model is A. The norm rather than its square: where a plant obeys almost exactly, the square would vanish in the
@@ -47,18 +48,19 @@ def fitted(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray, np.n
             (Length(root, np.zeros(len(root)), ("P", "Q")),),  # ‖(top Q - low P) change‖
             builders=(_normalised, *rules), structural=NORMAL, symmetric=frozenset({"P"}), **common)
     p = (given[0] + given[0].T) / 2
+    target = np.ravel(step.low @ step.change, order="F")
     return Problem(
         "shift with fixed P", {"A": step.inner(given[1])},
-        (Length(np.kron(step.change.T, step.top), flat(step.low @ step.change), ("A",)),),  # ‖(top A - low) change‖
+        (Length(np.kron(step.change.T, step.top), target, ("A",)),),  # ‖(top A - low) change‖
         further=lambda variables, _: {"P": cp.Constant(p), "Q": variables["A"] @ p, "A": None},
         builders=tuple(rules), **common)
 
 
-def centred(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Problem:
+def centre_of_shift(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Problem:
     """Return the problem for the P that leaves a given A the largest margin in the matrix inequalities."""
     inner = step.inner(a)
 
-    def eased(view: Any) -> dict[str, list[Any]]:
+    def ease(view: Any) -> dict[str, list[Any]]:
         # the rules hold at A already: here they are not the user's, so that their prices stay those of the fit
         members = [limit.member for rule in rules for limits in named(rule(view), "").values() for limit in limits]
         return {"margin": [one.args[0] - view["margin"] * np.eye(one.args[0].shape[0]) >> 0
@@ -67,7 +69,7 @@ def centred(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Problem:
     return Problem(
         "centre", {"P": np.eye(len(a)), "margin": np.zeros(())}, (Inner({"margin": np.array(-1.0)}),),
         further=lambda variables, _: {"Q": inner @ variables["P"]}, facts={"reference": {"A": step.free}},
-        builders=(_normalised, eased), structural=NORMAL | {"margin"}, symmetric=frozenset({"P"}))
+        builders=(_normalised, ease), structural=NORMAL | {"margin"}, symmetric=frozenset({"P"}))
 
 
 def _normalised(view: Any) -> dict[str, list[Any]]:

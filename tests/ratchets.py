@@ -24,6 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 RECORD = Path(__file__).with_name("ratchets.json")
 LONG_SIGNATURE = 8
+TERMS = ("optid.core.terms.", "optid.core.low_rank.")
 STATE_SPACE = ("formulations.state_space", "formulations.state_shooting", "formulations.latent_signals")
 PARTICIPLES = set("""begun bent bought broken brought built caught chosen drawn driven fed felt found frozen given gone
 grown held hidden kept known laid led left lent lost made meant met paid said seen sent shown spent stuck sought sworn
@@ -101,13 +102,13 @@ def engine_names(house: House, state_space: bool, helped: bool) -> dict[str, int
 def unreadable_formulations(house: House) -> list[str]:
     """Registered formulations whose file states no objective or whose unknowns are not in it.
 
-    An objective is stated by a call of `Minimize`, or by a term of `optid.core.terms` in a `Problem`.
+    An objective is stated by a call of `Minimize`, or by a term of the core in a `Problem`.
     """
     found = []
     for module, functions in house.registered.items():
         called = {part for node in house.nodes[module] if isinstance(node, ast.Call)
                   for part in ast.unparse(node.func).split(".")}
-        terms = {local for local, name in house.imports[module].items() if name.startswith("optid.core.terms.")}
+        terms = {local for local, name in house.imports[module].items() if name.startswith(TERMS)}
         if not ("Minimize" in called or "Problem" in called and terms & called):
             found += [f"{module}:{function}" for function in functions]
     return found

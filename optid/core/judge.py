@@ -233,7 +233,7 @@ class LagrangianAtPoint:
                 slope = np.zeros((len(term.target), self.problem.size))
                 places = [np.arange(self.problem.size)[self.problem.slices[name]] for name in term.z]
                 slope[:, np.concatenate(places)] = term.root
-                found += term.eased(self.x, self._symmetric(slope), self._symmetric(total), NOTHING * self.yardstick)
+                found += term.ease(self.x, self._symmetric(slope), self._symmetric(total), NOTHING * self.yardstick)
         return found
 
     def _symmetric(self, slope: Array) -> Array:

@@ -115,7 +115,7 @@ class Length:
         return Pull(size, {name: g / (2 * max(size, TINY)) for name, g in squares.gradient.items()},
                     {name: g / (2 * max(size, TINY)) for name, g in squares.magnitudes.items()})
 
-    def eased(self, y: Values, slope: Array, pull: Array, rest: float) -> Array:
+    def ease(self, y: Values, slope: Array, pull: Array, rest: float) -> Array:
         """Return what another subgradient adds to the gradient (unknowns,), so that less is left of a pull.
 
         The direction of a short residual is known no better than its entries, and all directions w within the unit

@@ -22,7 +22,7 @@ from optid.errors import StructureError
 from optid.identify.arguments import violations
 from optid.program.solution import Solution, Status
 
-DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
+SINGULAR = 1e-4  # least eigenvalue of a P of trace n below which it is no point
 ROUNDS = 6  # pairs of programmes in A and in P at most
 ENOUGH = 1e-2  # fall of the residual, relative to the suboptimality left, below which rounds stop
 TINY = 1e-9  # suboptimality relative to the size of Gamma that is none
@@ -193,4 +193,4 @@ def _violated(a: Array, rules: Sequence[Any]) -> list[str]:
 
 
 def _definite(p: Array) -> bool:
-    return bool(np.all(np.isfinite(p))) and float(np.min(np.linalg.eigvalsh((p + p.T) / 2))) > DEFINITE / 10
+    return bool(np.all(np.isfinite(p))) and float(np.min(np.linalg.eigvalsh((p + p.T) / 2))) > SINGULAR
