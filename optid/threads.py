@@ -6,22 +6,22 @@ result would depend on their number.
 
 from collections.abc import Callable
 from functools import cache, wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """Variables of the environment that a fresh interpreter takes the number of its threads from."""
 
-Arguments, Result = ParamSpec("Arguments"), TypeVar("Result")
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def one_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+def one_thread(function: Function) -> Function:
     """Run a function with one thread for linear algebra; afterwards there are as many as before."""
     @wraps(function)
-    def alone(*arguments: Arguments.args, **options: Arguments.kwargs) -> Result:
+    def alone(*arguments: Any, **options: Any) -> Any:
         with _libraries().limit(limits=1):
             return function(*arguments, **options)
 
-    return alone
+    return alone  # type: ignore[return-value]
 
 
 @cache

@@ -358,11 +358,12 @@ def resolve(fit: Fit, weights: Mapping[str, float], *, solver: Any = "auto", acc
     An unknown weight is a `StructureError`. The other arguments are as in `fit`.
     """
     started = time.perf_counter()
-    problem = fit.program.core
-    known = {} if problem is None else problem.weights
+    problem: Problem | None = fit.program.core
+    if problem is None:
+        raise StructureError(f"{fit.program.name!r} has no penalties with weights")
     for name in weights:
-        if name not in known:
-            raise StructureError(f"problem {fit.program.name!r} has no weight {name!r}. {nearest(name, known)}")
+        if name not in problem.weights:
+            raise StructureError(f"problem {problem.name!r} has no weight {name!r}. {nearest(name, problem.weights)}")
     again = problem.under_weights(**{name: float(value) for name, value in weights.items()})
     again = again.beginning({name: fit.solution.values[name] for name in again.start})
     return _finished(fit.data, fit.formulation, {**fit.arguments, **weights}, [], again, Solvers(solver),
