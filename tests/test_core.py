@@ -313,3 +313,19 @@ def test_a_short_length_is_judged_by_the_best_of_its_directions(seed):
     assert judge(problem, x, found.duals).residuals.stationarity < 1e-6
     x = {"P": x["P"] + 0.01 * (root[:3].T @ root[:3])[:3, :3]}
     assert judge(problem, {"P": (x["P"] + x["P"].T) / 2}, found.duals).residuals.stationarity > 1e-3
+
+
+def test_an_unknown_that_is_to_be_symmetric_is_and_one_that_is_not_is_a_violation():
+    """With squares alone and rows, which are solved without CVXPY where nothing is symmetric."""
+    rng = np.random.default_rng(3)
+    root, target = rng.normal(size=(12, 9)), rng.normal(size=12)
+    problem = Problem("symmetric", {"P": np.eye(3)}, (Squares(root, target, 0.0, ("P",)),), scale=float(target @ target),
+                      symmetric=frozenset({"P"}), builders=(lambda v: {"definite": v["P"] >> 0},))
+    found = optid.solve(problem)
+    p = found.values["P"]
+    assert found.status is Status.OPTIMAL and np.allclose(p, p.T, atol=1e-9)
+    x = cp.Variable((3, 3), symmetric=True)
+    value = cp.Problem(cp.Minimize(cp.sum_squares(root @ cp.vec(x, order="F") - target)), [x >> 0]).solve(solver="SCS")
+    assert found.objective == pytest.approx(value, rel=1e-3)
+    skew = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    assert judge(problem, {"P": p + 0.1 * skew}, found.duals).residuals.violation > 0.01

@@ -18,12 +18,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.faults.residual import least_squares
+from formulations.faults.residual import half_squares
+from optid.core.problem import Problem
 from optid.errors import StructureError, nearest
 from optid.faults.consistency.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
 from optid.faults.signatures import Dictionary
 from optid.faults.whitening import Whitened
-from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 
@@ -61,25 +61,29 @@ def covariance(found: Dictionary, whitened: Whitened, *, form: str = "places", l
                     {"lags": problem.lags})
 
 
-def _places(problem: CovarianceProblem) -> Program:
+def _places(problem: CovarianceProblem) -> Problem:
     """The non-negative least-squares problem of the candidates."""
     sizes = np.linalg.norm(problem.signatures, axis=0)
-    scaled, units = cp.Variable(sizes.size, name="scaled"), problem.signatures / sizes
-    return least_squares(
-        "fault.noise_covariance", problem.target, units @ scaled, {"scaled": scaled},
-        {"scaled": np.maximum(units.T @ problem.target, 1.0)}, {"rho": cp.multiply(1 / sizes, scaled)},
-        constraints={"variances": (scaled >= 0,)})
+    units = problem.signatures / sizes
+    return Problem(
+        "fault.noise_covariance", {"scaled": np.maximum(units.T @ problem.target, 1.0)},
+        (half_squares(problem.target, {"scaled": units}),),
+        further=lambda v, _: {"rho": cp.multiply(1 / sizes, v["scaled"])},
+        builders=(lambda view: {"variances": view["rho"] >= 0},), structural=frozenset({"variances"}),
+        scale=0.5 * float(problem.target @ problem.target))
 
 
-def _full(problem: CovarianceProblem) -> Program:
-    """The semidefinite programme of full covariances of the added process and sensor noise."""
-    n, l = problem.nx, problem.l  # noqa: E741
-    Q, R = cp.Variable((n, n), symmetric=True, name="Q"), cp.Variable((l, l), symmetric=True, name="R")
-    process, sensor = (cp.multiply(units, one) for units, one in zip(_units(problem), (Q, R)))
-    fit = problem.by_process @ cp.vec(process, order="F") + problem.by_sensor @ cp.vec(sensor, order="F")
-    return least_squares(
-        "fault.noise_covariance full", problem.target, fit, {"Q": Q, "R": R}, {"Q": np.eye(n), "R": np.eye(l)},
-        {"Q": process, "R": sensor}, constraints={"process covariance": (Q >> 0,), "sensor covariance": (R >> 0,)})
+def _full(problem: CovarianceProblem) -> Problem:
+    """The semidefinite problem of full covariances of the added process and sensor noise."""
+    of_process, of_sensor = _units(problem)
+    parts = {"Q": problem.by_process * of_process.ravel(order="F"), "R": problem.by_sensor * of_sensor.ravel(order="F")}
+    return Problem(
+        "fault.noise_covariance full", {"Q": np.eye(problem.nx), "R": np.eye(problem.l)},
+        (half_squares(problem.target, parts),), symmetric=frozenset("QR"),
+        further=lambda v, _: {"Q": cp.multiply(of_process, v["Q"]), "R": cp.multiply(of_sensor, v["R"])},
+        builders=(lambda view: {"process covariance": view["Q"] >> 0, "sensor covariance": view["R"] >> 0},),
+        structural=frozenset({"process covariance", "sensor covariance"}),
+        scale=0.5 * float(problem.target @ problem.target))
 
 
 def _units(problem: CovarianceProblem) -> list[np.ndarray]:

@@ -184,7 +184,7 @@ def _has_rows_alone(program: Program) -> bool:
     problem: Problem | None = program.core
     if problem is None or len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares):
         return False
-    if not all(isinstance(leaf, Affine) for leaf in problem.leaves):
+    if problem.symmetric or not all(isinstance(leaf, Affine) for leaf in problem.leaves):
         return False
     return problem.is_measured
 

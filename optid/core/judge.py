@@ -95,6 +95,10 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
         amount = abs(level) / (1.0 + sum(float(np.sum(np.abs(flat(x[name])))) for name in parts))
         if not amount <= violation:  # also true for nan
             violation, worst = amount, "gauge"
+    for name in problem.symmetric:
+        amount = float(np.max(np.abs(x[name] - x[name].T), initial=0.0)) / (1.0 + float(np.max(np.abs(x[name]))))
+        if not amount <= violation:
+            violation, worst = amount, f"symmetry of {name}"
     for row in rows:
         if not row.excess <= violation:
             violation, worst = row.excess, row.constraint.name

@@ -38,7 +38,8 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
     """
     several = [term for term in problem.terms if isinstance(term, Squares)]
     factorised = len(several) == 1 and several[0].lifted is not None
-    if len(several) < len(problem.terms) or problem.products and not factorised:
+    if len(several) < len(problem.terms) or problem.products and not factorised or not (
+            len(several) > 1 or _is_triangular(several[0].root)):
         return _of_terms(problem, step)
     if len(several) > 1:
         sizes = {name: place.stop - place.start for name, place in problem.space.places.items()}
@@ -84,6 +85,10 @@ def _of_terms(problem: Problem, step: bool) -> Program:
             derived["X"], expression = expression, cp.Variable(expression.shape, name="X")
             structural["structure"] = (expression == derived["X"],)
             unknowns, expression = {**unknowns, "X": expression}, cp.normNuc(expression)
+        if isinstance(term, Squares) and "residual" not in unknowns:  # a small dense matrix makes a sparse programme
+            derived["residual"] = term.root @ stacked_expression(leaves, term.z) - term.target
+            r = unknowns["residual"] = cp.Variable(len(term.target), name="residual")
+            structural["residual"], expression = (r == derived["residual"],), cp.sum_squares(r) + term.remainder
         parts.append(expression)
     program = Program(
         problem.name, cp.Minimize(sum_of(parts)), structural, unknowns, problem.start, problem.model,
@@ -91,6 +96,10 @@ def _of_terms(problem: Problem, step: bool) -> Program:
         unit=problem.unit, compressed=problem.compressed, step=step, core=replace(problem, builders=()),
         **_special(problem))
     return program.subject_to(*problem.builders)
+
+
+def _is_triangular(root: Any) -> bool:
+    return isinstance(root, np.ndarray) and root.shape[0] == root.shape[1] and not np.tril(root, -1).any()
 
 
 def _special(problem: Problem) -> dict[str, Any]:
