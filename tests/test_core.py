@@ -319,8 +319,8 @@ def test_an_unknown_that_is_to_be_symmetric_is_and_one_that_is_not_is_a_violatio
     """With squares alone and rows, which are solved without CVXPY where nothing is symmetric."""
     rng = np.random.default_rng(3)
     root, target = rng.normal(size=(12, 9)), rng.normal(size=12)
-    problem = Problem("symmetric", {"P": np.eye(3)}, (Squares(root, target, 0.0, ("P",)),), scale=float(target @ target),
-                      symmetric=frozenset({"P"}), builders=(lambda v: {"definite": v["P"] >> 0},))
+    problem = Problem("symmetric", {"P": np.eye(3)}, (Squares(root, target, 0.0, ("P",)),), symmetric=frozenset({"P"}),
+                      scale=float(target @ target), builders=(lambda v: {"definite": v["P"] >> 0},))
     found = optid.solve(problem)
     p = found.values["P"]
     assert found.status is Status.OPTIMAL and np.allclose(p, p.T, atol=1e-9)

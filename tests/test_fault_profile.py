@@ -6,7 +6,7 @@ from fault_plants import LOAD, record, refused
 from scipy.optimize import nnls
 from test_fault_injection import small
 
-from formulations.faults.profile import profile_programme, smooth_programme
+from formulations.faults.profile import course_of_changes, random_walk
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, SolverFailed, StructureError
 from optid.faults import Fault, dictionary, profile, scan, whiten
@@ -49,11 +49,11 @@ def test_courses_are_found_and_the_prior_is_chosen(found, fault, label, prior, c
 @pytest.mark.parametrize("prior", ["tv", "trend"])
 def test_own_solver_agrees_with_clarabel_and_the_conditions_hold(found, prior):
     problem = course_problem(search(found, Fault.step("sensor:y1", 20, 1.0)), "sensor:y1")
-    program = profile_programme(problem, prior)
-    own, other = (solve(program, solver, accuracy=1e-9) for solver in ("block_descent", "clarabel"))
+    stated = course_of_changes(problem, prior)
+    own, other = (solve(stated, solver, accuracy=1e-9) for solver in ("block_descent", "clarabel"))
     assert own.proof and other.proof and other.objective == pytest.approx(own.objective, rel=1e-6)
     columns = problem.matrix @ problem.shapes(prior)
-    penalty = float(program.parameters["lambda"].value)
+    penalty = stated.weights["lambda"]
     slopes = columns.T @ (problem.r - columns @ own.values["changes"][:, 0])
     assert np.all(np.abs(slopes) <= penalty * (1 + 1e-4))
     active = np.abs(own.values["changes"][:, 0]) > 1e-7
@@ -62,11 +62,9 @@ def test_own_solver_agrees_with_clarabel_and_the_conditions_hold(found, prior):
 
 def test_the_random_walk_is_the_smoother(found):
     problem = course_problem(search(found, Fault.step("sensor:y1", 20, 1.0)), "sensor:y1")
-    program = smooth_programme(problem)
-    program.parameters["root of rho"].value = 3.0
     D = np.eye(N) - np.eye(N, k=-1)
     known = np.linalg.solve(problem.matrix.T @ problem.matrix + 9 * D.T @ D, problem.matrix.T @ problem.r)
-    np.testing.assert_allclose(solve(program).values["f"], known, atol=1e-6)
+    np.testing.assert_allclose(solve(random_walk(problem, 9.0)).values["f"], known, atol=1e-6)
     result = profile(search(found, Fault.step("sensor:y1", 20, 1.0)), "sensor:y1", "smooth")
     assert result.prior == "smooth" and result.certified and 1 < result.freedom < N
     assert np.linalg.norm(result.course - 1.0 * (np.arange(N) >= 20)) < 0.4 * np.sqrt(40)

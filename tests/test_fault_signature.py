@@ -24,6 +24,7 @@ from optid.faults import (
 from optid.faults.search.atoms import atoms_of
 from optid.program.solution import Status
 from optid.registry import fault_formulation
+from optid.solving.express import as_program
 from optid.solving.solve import solve
 from optid.structures.group_sparse import GroupSparseStructure
 
@@ -145,7 +146,7 @@ def test_user_constraints_bind_and_keep_a_proof(found, limits):
 
 def test_sizes_are_in_the_units_of_the_fault(found, limits):
     s = two(found)
-    program = next(fault_formulation("fault.signature")(s, limits))
+    program = as_program(next(fault_formulation("fault.signature")(s, limits)))
     atoms = {atom.label: atom for atom in atoms_of(s, limits)}
     rng = np.random.default_rng(0)
     for name, variable in program.variables.items():

@@ -13,20 +13,21 @@ Named expressions: ``f`` (N,), the course; ``changes``, the penalised quantities
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
-from formulations.faults.group_bound import certify
-from formulations.faults.residual import least_squares
+from formulations.faults.residual import half_squares
+from optid.core.problem import Problem
+from optid.core.terms import GroupNorms
 from optid.errors import StructureError, nearest
 from optid.faults.consistency.profiles import EACH, PRIORS, CourseProblem, Profile, course_problem
 from optid.faults.search.scanning import Scan
-from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
-from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
+from optid.structures.group_sparse import GroupProblem
 
 PENALTIES = tuple(float(share) for share in np.geomspace(0.5, 0.003, 10))
 """Penalties tried, as shares of the one at which the course is zero."""
@@ -57,13 +58,10 @@ class _Fits:
         self.failed = self.failed or f"{word}: {solution.status}, {solution.reason}"
         return False
 
-    def add(self, program: Program, solution: Solution, prior: str, course: np.ndarray, std: np.ndarray,
-            changes: dict[int, float], freedom: float) -> None:
+    def add(self, solution: Solution, fit: Profile) -> None:
         """Add a course with the value of its criterion."""
-        rest = self.problem.r - self.problem.matrix @ course
-        fit = Profile(self.problem.label, course, std, prior, changes, {}, freedom, 0.0, False,
-                      tuple(program.user_constraints))
-        self.found.append((self.problem.criterion(float(rest @ rest), freedom), fit, solution))
+        rest = self.problem.r - self.problem.matrix @ fit.course
+        self.found.append((self.problem.criterion(float(rest @ rest), fit.freedom), fit, solution))
 
 
 def profile(found: Scan, label: str, *, prior: str = "auto", sign: str | None = None, limit: float | None = None,
@@ -123,12 +121,11 @@ def _changing(prior: str, shares: Sequence[float], rules: Sequence[Any], fits: _
     shapes = problem.shapes(prior)
     design = problem.matrix @ shapes
     lengths = np.linalg.norm(design, axis=0)
-    program = profile_programme(problem, prior).subject_to(*rules)
+    penalised = course_of_changes(problem, prior).subject_to(*rules)
     largest = float(np.abs(design.T @ problem.r).max())
     seen: set[tuple[int, ...]] = set()
     for share in sorted(shares, reverse=True):
-        program.parameters["lambda"].value = share * largest
-        solution = yield program
+        solution = yield penalised.under_weights(**{"lambda": share * largest})
         if not fits.usable(f"{prior} at {share:.2g}", solution, proved=False):
             continue
         sizes = np.abs(np.ravel(solution.values["changes"])) * lengths
@@ -142,11 +139,13 @@ def _changing(prior: str, shares: Sequence[float], rules: Sequence[Any], fits: _
         columns, course, std = design[:, kept] * unit, np.zeros(problem.count), np.zeros(problem.count)
         changes: dict[int, float] = {}
         if kept.size:
-            scaled, courses = cp.Variable(kept.size, name="scaled"), shapes[:, kept] * unit
-            solution = yield least_squares(
-                f"fault.profile {prior} refit", problem.r, columns @ scaled, {"scaled": scaled},
-                {"scaled": problem.refitted(columns)[0]}, {"f": courses @ scaled, "changes": cp.multiply(unit, scaled)},
-            ).subject_to(*rules)
+            courses = shapes[:, kept] * unit
+            solution = yield Problem(
+                f"fault.profile {prior} refit", {"scaled": problem.refitted(columns)[0]},
+                (half_squares(problem.r, {"scaled": columns}),),
+                further=lambda v, _, courses=courses, unit=unit: {
+                    "f": courses @ v["scaled"], "changes": cp.multiply(unit, v["scaled"])},
+                scale=0.5 * float(problem.r @ problem.r), builders=tuple(rules))
             if not fits.usable(f"refit of {prior}", solution):
                 continue
             heights = np.asarray(solution.values["scaled"]) * unit
@@ -155,11 +154,12 @@ def _changing(prior: str, shares: Sequence[float], rules: Sequence[Any], fits: _
             std = np.sqrt(np.maximum(np.einsum("kp,pq,kq->k", courses, covariance, courses), 0.0))
             scale = 1.0 if prior == "tv" else 1.0 / problem.count
             changes = {int(k): float(height * scale) for k, height in zip(kept, heights)}
-        fits.add(program, solution, prior, course, std, changes, float(EACH * kept.size))
+        fits.add(solution, Profile(problem.label, course, std, prior, changes, {}, float(EACH * kept.size), 0.0, False,
+                                   penalised.constraint_names))
 
 
-def profile_programme(problem: CourseProblem, prior: str) -> Program:
-    """Build the programme with a penalty on the changes of the course ("tv") or of its slope ("trend").
+def course_of_changes(problem: CourseProblem, prior: str) -> Problem:
+    """State the problem with a penalty on the changes of the course ("tv") or of its slope ("trend").
 
     Args:
         problem: from `optid.faults.consistency.profiles.course_problem`.
@@ -167,44 +167,44 @@ def profile_programme(problem: CourseProblem, prior: str) -> Program:
     """
     count, shapes = problem.count, problem.shapes(prior)
     columns = problem.matrix @ shapes
-    level = cp.Parameter(nonneg=True, name="lambda", value=0.1 * float(np.abs(columns.T @ problem.r).max()))
-    changes = cp.Variable((count, 1), name="changes")
-    form = GroupSparseStructure(GroupProblem(columns, problem.r, np.arange(count + 1), np.ones(count)),
-                                {"changes": (count, 1)})
-    return least_squares(
-        f"fault.profile {prior}", problem.r, columns @ changes[:, 0], {"changes": changes},
-        {"changes": _one(columns, problem.r)[:, None]}, {"f": shapes @ changes[:, 0], "changes": changes[:, 0]},
-        penalty=level * cp.norm1(changes), parameters={"lambda": level}, structure=form, certify=certify)
+    numbers = GroupProblem(columns, problem.r, np.arange(count + 1), np.ones(count))
+    misfit = half_squares(problem.r, {"changes": columns}, numbers)  # 1/2 ‖r - T f‖²
+
+    def stated(**weights: float) -> Problem:
+        sparse = GroupNorms({"changes": np.full(count, weights["lambda"])})  # lambda ‖changes‖_1
+        return Problem(
+            f"fault.profile {prior}", {"changes": _one(columns, problem.r)[:, None]}, (misfit, sparse),
+            further=lambda v, _: {"f": shapes @ v["changes"][:, 0], "changes": v["changes"][:, 0]},
+            scale=0.5 * float(problem.r @ problem.r), weights=weights, posed=stated)
+
+    return stated(**{"lambda": 0.1 * float(np.abs(columns.T @ problem.r).max())})
 
 
 def _smoothed(shares: Sequence[float], rules: Sequence[Any], fits: _Fits) -> Procedure:
     """Fit random walks of several variances; the trace of the smoother counts as degrees of freedom."""
     problem = fits.problem
-    program = smooth_programme(problem).subject_to(*rules)
+    walk = random_walk(problem).subject_to(*rules)
     differences = np.eye(problem.count) - np.eye(problem.count, k=-1)
     products = problem.matrix.T @ problem.matrix
     scale = max(float(np.trace(products)) / problem.count, 1e-300)
     for share in shares:
-        program.parameters["root of rho"].value = np.sqrt(share * scale)
-        solution = yield program
+        solution = yield walk.under_weights(rho=share * scale)
         if fits.usable(f"smooth at {share:.2g}", solution):
             covariance = np.linalg.inv(products + share * scale * differences.T @ differences)
-            fits.add(program, solution, "smooth", np.asarray(solution.values["f"]), np.sqrt(np.diag(covariance)), {},
-                     float(np.sum(covariance * products)))
+            fits.add(solution, Profile(
+                problem.label, np.asarray(solution.values["f"]), np.sqrt(np.diag(covariance)), "smooth", {}, {},
+                float(np.sum(covariance * products)), 0.0, False, walk.constraint_names))
 
 
-def smooth_programme(problem: CourseProblem) -> Program:
-    """Build the programme of the random walk: that of the Kalman smoother, with constraints."""
-    f, rough = cp.Variable(problem.count, name="f"), cp.Variable(problem.count, name="rough")
-    root = cp.Parameter(nonneg=True, name="root of rho", value=1.0)
-    shapes = problem.shapes("tv")
-    changes = f - cp.hstack([np.zeros(1), f[:-1]])
-    program = least_squares(
-        "fault.profile smooth", problem.r, problem.matrix @ f, {"f": f, "rough": rough},
-        {"f": shapes @ _one(problem.matrix @ shapes, problem.r)}, {"f": f, "changes": changes},
-        penalty=0.5 * cp.sum_squares(rough), constraints={"roughness": (rough == root * changes,)},
-        parameters={"root of rho": root})
-    return replace(program, derived={**program.derived, "rough": root * changes})
+def random_walk(problem: CourseProblem, rho: float = 1.0) -> Problem:
+    """State the problem of a random walk: that of the Kalman smoother, with constraints."""
+    differences = np.eye(problem.count) - np.eye(problem.count, k=-1)
+    shapes, misfit = problem.shapes("tv"), half_squares(problem.r, {"f": problem.matrix})  # 1/2 ‖r - T f‖²
+    rough = half_squares(np.zeros(problem.count), {"f": np.sqrt(rho) * differences})  # rho/2 ‖D1 f‖²
+    return Problem(
+        "fault.profile smooth", {"f": shapes @ _one(problem.matrix @ shapes, problem.r)}, (misfit, rough),
+        further=lambda v, _: {"changes": differences @ v["f"]}, scale=0.5 * float(problem.r @ problem.r),
+        weights={"rho": rho}, posed=partial(random_walk, problem))
 
 
 def _one(columns: np.ndarray, r: np.ndarray) -> np.ndarray:

@@ -30,7 +30,8 @@ def run(program: Program, settings: Settings) -> Answer:
     allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
     found = minimise(form.problem, form.weight, allowed, int(dict(settings.options).get("limit", 20_000)))
     v, theta = found.point
-    duals = {"structure": -np.ravel(found.dual, order="F")}
+    misfit = np.sqrt(form.weight) * (v - form.problem.data)[form.problem.known]
+    duals = {"structure": -np.ravel(found.dual, order="F"), "residual": -2.0 * misfit}
     return found.answer(allowed, {"yhat": v} | ({"T": theta} if form.problem.parameters else {}), duals)
 
 

@@ -26,12 +26,12 @@ def run(program: Program, settings: Settings) -> Answer:
     """
     form = program.structure
     assert isinstance(form, GroupSparseStructure)
-    penalty = float(np.asarray(program.parameters[form.penalty].value))
-    if not penalty > 0:
-        return Answer(Status.FAILED, f"the penalty is {penalty}; this method needs a positive one")
+    if not form.penalty > 0:
+        return Answer(Status.FAILED, f"the penalty is {form.penalty}; this method needs a positive one")
     start = form.flat(program.start) if settings.warm and program.start else None
-    found = minimise(form.problem, penalty, settings.accuracy, int(dict(settings.options).get("limit", 2000)), start)
-    return found.answer(tolerance(settings.accuracy), form.shaped(found.point), {form.residual: -found.dual})
+    limit = int(dict(settings.options).get("limit", 2000))
+    found = minimise(form.problem, form.penalty, settings.accuracy, limit, start)
+    return found.answer(tolerance(settings.accuracy), form.shaped(found.point), form.duals(found.dual))
 
 
 def minimise(problem: GroupProblem, penalty: float, gap: float = 1e-9, limit: int = 2000,

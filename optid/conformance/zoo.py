@@ -15,11 +15,11 @@ import numpy as np
 from optid.core.leaves import Product
 from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
-from optid.core.terms import Squares
+from optid.core.terms import GroupNorms, Squares
 from optid.program.program import Program
 from optid.program.view import View
 from optid.solving.express import as_program
-from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
+from optid.structures.group_sparse import GroupProblem
 from optid.structures.least_squares import LinearStructure
 from optid.structures.nuclear_norm import NuclearProblem
 from optid.structures.rank_one import RankOne
@@ -260,15 +260,13 @@ def _group_sparse() -> Case:
     value = 0.5 * float(rest @ rest) + penalty * sum(w * float(np.linalg.norm(z)) for w, z in zip(weights, shrunk))
     shapes = {f"a{i + 1}": z.shape for i, z in enumerate(groups)}
 
-    def statement(*variables: Any) -> tuple:
-        *parts, e = variables
-        parameter = cp.Parameter(nonneg=True, name="lambda", value=penalty)
-        misfit = target - design @ cp.hstack(parts)
-        norms: Any = sum(w * cp.norm(part, 2) for w, part in zip(weights, parts))
-        return 0.5 * cp.sum_squares(e) + parameter * norms, {"residual": e == misfit}, {
-            "structural": frozenset({"residual"}), "derived": {"residual": misfit}, "parameters": {"lambda": parameter},
-            "structure": GroupSparseStructure(GroupProblem(design, target, edges, weights), shapes),
-            "scale": 0.5 * float(target @ target)}
+    def build() -> Program:
+        half = np.sqrt(0.5)
+        misfit = Squares(half * design, half * target, 0.0, tuple(shapes), GroupProblem(design, target, edges, weights))
+        norms = GroupNorms({name: np.array(penalty * w) for name, w in zip(shapes, weights)})
+        start = {name: np.zeros(shape) for name, shape in shapes.items()}
+        return as_program(Problem("group_shrinkage", start, (misfit, norms), scale=0.5 * float(target @ target),
+                                  weights={"lambda": penalty}))
 
-    return _case("group_shrinkage", {**shapes, "residual": 12}, statement, value=value,
-                 point=dict(zip(shapes, shrunk)), duals={"residual": -rest})
+    return Case("group_shrinkage", build, value=value, point=dict(zip(shapes, shrunk)),
+                duals={"residual": np.sqrt(2.0) * rest})

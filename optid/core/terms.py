@@ -42,14 +42,14 @@ class Squares:
         target: (k,).
         remainder: what no leaf changes.
         z: names of the leaves.
-        lifted: the same numbers with their rank-one blocks, factorised once, where there are some.
+        lifted: what special methods know of it: the same numbers with their rank-one blocks, or with groups.
     """
 
     root: Array
     target: Array
     remainder: float
     z: tuple[str, ...]
-    lifted: RankOne | None = field(default=None, repr=False)
+    lifted: Any = field(default=None, repr=False)
 
     @classmethod
     def of(cls, lifted: RankOne, z: tuple[str, ...]) -> "Squares":
@@ -215,7 +215,13 @@ class GroupNorms:
 
     def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the term in CVXPY expressions of the leaves."""
-        return sum_of([cp.sum(cp.multiply(t, cp.norm(v[name], 2, axis=1))) for name, t in self.weights.items()])
+        return sum_of([cp.sum(cp.multiply(t, self._lengths(v[name]))) for name, t in self.weights.items()])
+
+    @staticmethod
+    def _lengths(rows: cp.Expression) -> Any:
+        if rows.ndim == 2 and rows.shape[1] == 1:  # a linear programme
+            return cp.abs(rows[:, 0])
+        return cp.norm(rows, 2, axis=1) if rows.ndim == 2 else cp.norm(rows, 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,15 +8,17 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from optid.certificate.group_sparse import certify_groups
 from optid.certificate.lifting import MAX_SIZE, certify_nuclear, certify_rank_one
 from optid.certificate.low_rank import certify_low_rank
 from optid.core.leaves import Affine, Product
 from optid.core.low_rank import LowRank
 from optid.core.problem import GAUGE, Problem
-from optid.core.terms import NuclearNorms, Squares, stacked_expression, sum_of
+from optid.core.terms import GroupNorms, NuclearNorms, Squares, stacked_expression, sum_of
 from optid.errors import StructureError
 from optid.program.program import Program
 from optid.program.view import View
+from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 from optid.structures.least_squares import LinearStructure, RankOneStructure
 from optid.structures.nuclear_norm import NuclearNormStructure
 from optid.structures.rank_one import RankOne
@@ -107,6 +109,10 @@ def _special(problem: Problem) -> dict[str, Any]:
     match problem.terms:
         case (Squares(lifted=RankOne() as numbers, z=z), NuclearNorms() as norms) if z == tuple(problem.start):
             return {"certify": partial(certify_nuclear, numbers, z, norms)}
+        case (Squares(lifted=GroupProblem() as numbers, z=z), GroupNorms()):
+            shapes = {name: np.shape(problem.start[name]) for name in z}
+            groups = GroupSparseStructure(numbers, problem.weights["lambda"], shapes)
+            return {"certify": partial(certify_groups, groups), "structure": groups}
         case (LowRank(numbers=numbers), Squares()):
             form = NuclearNormStructure(numbers, problem.weights["weight"])
             return {"certify": partial(certify_low_rank, form), "structure": form}

@@ -93,12 +93,11 @@ class GroupProblem:
 
 @dataclass(frozen=True, eq=False)
 class GroupSparseStructure(Structure):
-    """P(a) with lambda as the parameter ``lambda``; the constraint ``residual`` defines r - M a as a variable."""
+    """P(a); the multiplier of the constraint ``residual``, which defines (M a - r) / sqrt 2, is a point of the dual."""
 
     word: ClassVar[str] = "group-sparse"
-    penalty: ClassVar[str] = "lambda"
-    residual: ClassVar[str] = "residual"
     problem: GroupProblem  # the numbers
+    penalty: float  # lambda
     # {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row
     blocks: Mapping[str, tuple[int, ...]]
 
@@ -112,7 +111,15 @@ class GroupSparseStructure(Structure):
         return np.concatenate([np.ravel(np.asarray(values[name], dtype=float)) for name in self.blocks])
 
     def shaped(self, a: Array) -> dict[str, Array]:
-        """Return named values from a, the residual included."""
+        """Return named values from a."""
         cuts = np.cumsum([int(np.prod(shape)) for shape in self.blocks.values()])[:-1]
-        parts = {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}
-        return {**parts, self.residual: self.problem.target - self.problem.design @ a}
+        return {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}
+
+    def duals(self, v: Array) -> dict[str, Array]:
+        """Return the multipliers of the constraint that a point v (m,) of the dual stands for."""
+        return {"residual": np.sqrt(2.0) * v}
+
+    def dual_point(self, duals: Mapping[str, Array]) -> Array | None:
+        """Return v of the multipliers of a solver, None without them."""
+        given = np.ravel(np.asarray(duals.get("residual", ()), dtype=float))
+        return given / np.sqrt(2.0) if given.size == self.problem.target.size else None

@@ -1,0 +1,58 @@
+"""The proof of a group-sparse problem: a lower bound recomputed from a feasible dual point.
+
+For ``min 1/2 ‖r - M a‖² + lambda sum w_g ‖a_g‖`` under affine constraints whose multipliers make the part ``c' a + k``
+of the Lagrangian, every v with ``‖M_g' v - c_g‖ <= lambda w_g`` gives the bound ``r' v - 1/2 ‖v‖² + k``. The
+point of a solver is scaled into that set, v and multipliers together, so that the bound always holds.
+"""
+
+import numpy as np
+
+from optid.arrays import Array
+from optid.core.judge import in_dual_cone
+from optid.core.problem import Problem
+from optid.program.program import Program, Values
+from optid.program.solution import Bound, relative_gap
+from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
+
+PROVED = 1e-6
+"""Relative gap below which a point is optimal."""
+
+
+def certify_groups(form: GroupSparseStructure, program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
+    """Return the best bound from the residual at the point and from the multipliers that the solver gave."""
+    numbers, a = form.problem, form.flat(values)
+    candidates = [numbers.target - numbers.design @ a]
+    if (given := form.dual_point(duals)) is not None:
+        candidates.append(given)
+    slope, constant = _lagrangian(program.core, form, duals)
+    bounds = [_bound(numbers, v, form.penalty, slope, constant) for v in candidates]
+    bounds += [_bound(numbers, v, form.penalty, 0.0 * slope, 0.0) for v in candidates]
+    value, point = max(bounds, key=lambda pair: pair[0])
+    gap = relative_gap(numbers.value(a, form.penalty), value, program.scale)
+    return Bound(value, gap < PROVED, "group-sparse dual", f"feasible dual point, relative gap {gap:.1e}",
+                 multipliers=point), None
+
+
+def _bound(numbers: GroupProblem, v: Array, penalty: float, slope: Array, constant: float) -> tuple[float, Array]:
+    """Scale v and the multipliers into the feasible set and return the value there."""
+    if not np.isfinite(v).all():
+        return -np.inf, np.zeros_like(v)
+    most = float(np.max(numbers.norms(numbers.design.T @ v - slope) / (penalty * numbers.weights), initial=0.0))
+    square, along = float(v @ v), float(numbers.target @ v) + constant
+    best = 0.0 if square == 0.0 else max(along, 0.0) / square
+    scale = best if most == 0.0 else min(best, 1.0 / most)
+    if not scale > 0 or not np.isfinite(scale):  # also a most or along that is not a number
+        return 0.0, np.zeros_like(v)
+    return scale * along - 0.5 * scale**2 * square, scale * v
+
+
+def _lagrangian(problem: Problem, form: GroupSparseStructure, duals: Values) -> tuple[Array, float]:
+    """Return c (p,) and k of the user's constraints that are affine in a; others count with multiplier zero."""
+    total, constant = np.zeros(problem.space.size), 0.0
+    for one in problem.constraints():
+        given = np.ravel(duals.get(one.name, np.zeros(0)))[one.span]
+        if one.cone != "other" and given.size == len(one) and np.isfinite(given).all():
+            weights = in_dual_cone(one, given)
+            total, constant = total + weights @ one.rows, constant - float(weights @ one.right)
+    parts = {name: total[problem.space.places[name]].reshape(shape, order="F") for name, shape in form.blocks.items()}
+    return form.flat(parts), constant
