@@ -15,15 +15,14 @@ healthy prior; a Gauss-Newton procedure whose steps are the same QP. Named varia
 from collections.abc import Sequence
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from formulations.constraints.rule import Rule
+from optid.core.problem import Problem
+from optid.core.terms import Squares, Values
 from optid.errors import StructureError
 from optid.faults.repair.refitting import Refitting
-from optid.program.program import Program, Values
 from optid.program.solution import Bound, Status
-from optid.program.view import View
 from optid.registry import named_constraint
 from optid.solving.solve import Evidence, Procedure
 
@@ -38,7 +37,7 @@ SETTLED = 1e-6
 HALVINGS = 12
 
 
-def actuator(problem: Refitting, *, constraints: Sequence[Any] | str = "default") -> Program:
+def actuator(problem: Refitting, *, constraints: Sequence[Any] | str = "default") -> Problem:
     """Build the refit of the damaged nonlinearities alone.
 
     Args:
@@ -98,47 +97,42 @@ class Refitted:
 
 
 def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, constraints: Sequence[Any] | str
-          ) -> Program:
-    """Build the programme linearised at theta: one sum of squares, of the record and of the prior."""
+          ) -> Problem:
+    """State the problem linearised at theta: one sum of squares, of the record and of the prior."""
     if isinstance(constraints, str) and constraints != "default":
         raise StructureError(f"constraints={constraints!r}: a list of rules, or 'default'.")
     believed, wanted = problem.believed()
     rows = np.vstack([np.pad(s, ((0, 0), (0, len(problem.curves)))), believed])
     q = rows.shape[1]
     factor: Any = np.linalg.qr(np.column_stack([rows, np.concatenate([s @ theta - r, wanted])]), mode="r")
-    triangle, target, rest = factor[:q, :q], factor[:q, q], float(np.sum(factor[q:, q] ** 2))
-    variables = {key: cp.Variable(value.shape, name=key) for key, value in problem.unknowns.items()}
-    variables |= {f"lost[{curve.name}]": cp.Variable(1, name=f"lost[{curve.name}]") for curve in problem.curves}
-    point = cp.hstack([v if v.ndim == 1 else cp.vec(v, order="C") for v in variables.values()])
-    forecast, residual = triangle @ point - target, cp.Variable(target.size, name="residual")
-    structural: dict[str, tuple[Any, ...]] = {"residuals": (residual == forecast,)}
-    for key, part in problem.slices.items():
-        if problem.held[part].any():
-            structural[f"zeros stay[{key}]"] = (variables[key] == 0,)
+    rest = float(np.sum(factor[q:, q] ** 2))
+    start = problem.unpack(theta) | {f"lost[{curve.name}]": np.zeros(1) for curve in problem.curves}
+    names = tuple(start)
+    places = problem.unpack(np.arange(theta.size, dtype=float)).values()  # row by row
+    by_column = np.concatenate([*(part.ravel(order="F") for part in places), np.arange(theta.size, q)]).astype(int)
+    misfit = Squares(factor[:q, by_column], factor[:q, q], rest, names)  # of the record, and of what is believed
     rules: list[Any] = []
-    for curve in problem.curves:
-        lost = variables[f"lost[{curve.name}]"]
-        structural[f"share lost[{curve.name}]"] = (lost >= 0, lost <= 1)
-        rules += [] if curve.dead else _not_stronger(curve, variables[f"mu[{curve.name}]"])
+    for curve in () if not isinstance(constraints, str) else problem.curves:
+        rules += [] if curve.dead else _not_stronger(curve)
     if not isinstance(constraints, str):
         rules = [named_constraint(rule) if isinstance(rule, str) else rule for rule in constraints]
-    expressions: dict[str, Any] = dict(variables)
-    if len(problem.curves) == 1:
-        expressions["mu"] = variables[f"mu[{problem.curves[0].name}]"]
-    view = View(expressions, channels=tuple(curve.name for curve in problem.curves), gauge="none",
-                bases={curve.name: curve.basis for curve in problem.curves}, outputs=problem.model.outputs)
-    begin = np.append(theta, np.zeros(len(problem.curves)))
-    start = problem.unpack(theta) | {f"lost[{curve.name}]": np.zeros(1) for curve in problem.curves}
-    misfit = triangle @ begin - target
-    program = Program(
-        name, cp.Minimize(cp.sum_squares(residual) + rest), structural, {**variables, "residual": residual},
-        {**start, "residual": misfit}, lambda values: Refitted(problem, _vector(problem, values)), view,
-        frozenset(structural), derived={"residual": forecast}, scale=float(misfit @ misfit) + rest or 1.0,
-    )
-    return program.subject_to(*rules)
+
+    def held(view: Any) -> dict[str, Any]:
+        still = [key for key, part in problem.slices.items() if problem.held[part].any()]
+        zeros = {f"zeros stay[{key}]": view[key] == 0 for key in still}
+        shares = [(curve.name, view[f"lost[{curve.name}]"]) for curve in problem.curves]
+        return zeros | {f"share lost[{name}]": [lost >= 0, lost <= 1] for name, lost in shares}
+
+    of_one = {"mu": f"mu[{problem.curves[0].name}]"} if len(problem.curves) == 1 else {}
+    return Problem(
+        name, start, (misfit,), model=lambda values: Refitted(problem, _vector(problem, values)),
+        facts={"channels": tuple(curve.name for curve in problem.curves), "gauge": "none",
+               "bases": {curve.name: curve.basis for curve in problem.curves}, "outputs": problem.model.outputs},
+        further=lambda view, _: {short: view[long] for short, long in of_one.items()}, builders=(held, *rules),
+        structural=frozenset(held(start)), scale=misfit.value(start) or 1.0)
 
 
-def _not_stronger(curve: Any, mu: Any) -> list[Any]:
+def _not_stronger(curve: Any) -> list[Any]:
     """Monotone like the healthy nonlinearity and nowhere steeper; nothing for one that is not monotone."""
     steps = np.diff(curve.healthy)
     sign = 1.0 if steps.sum() >= 0 else -1.0
@@ -146,8 +140,8 @@ def _not_stronger(curve: Any, mu: Any) -> list[Any]:
         return []
     rows = sign * np.diff(curve.to_nodes[:, :-1], axis=0)
     return [
-        Rule(f"monotone[{curve.name}]", lambda view: rows @ mu >= 0),
-        Rule(f"not steeper[{curve.name}]", lambda view: rows @ mu <= sign * steps),
+        Rule(f"monotone[{curve.name}]", lambda view: rows @ view[f"mu[{curve.name}]"] >= 0),
+        Rule(f"not steeper[{curve.name}]", lambda view: rows @ view[f"mu[{curve.name}]"] <= sign * steps),
     ]
 
 
