@@ -36,6 +36,7 @@ from optid.faults import (
 from optid.faults.repair.refitting import refitting
 from optid.models import Nonlinearity
 from optid.registry import fault_formulation
+from optid.solving.express import as_program
 from optid.solving.solve import run, solve
 
 ONSET, COUNT = 80, 140
@@ -204,9 +205,9 @@ def test_evidence_is_the_density_of_the_record(healthy):
 def test_refit_is_the_same_by_any_back_end(healthy, solver):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), seed=1, count=ONSET + 10)
     problem = refitting(healthy, data, ONSET, damaged=[1])
-    program = actuator(problem)
-    assert program.kind == "QP"
-    found, other = solve(program, solver), solve(actuator(problem), "piqp")
+    stated = actuator(problem)
+    assert as_program(stated).kind == "QP"
+    found, other = solve(stated, solver), solve(stated, "piqp")
     assert found.objective == pytest.approx(other.objective, rel=1e-5)
 
 

@@ -170,14 +170,14 @@ def course_of_changes(problem: CourseProblem, prior: str) -> Problem:
     numbers = GroupProblem(columns, problem.r, np.arange(count + 1), np.ones(count))
     misfit = half_squares(problem.r, {"changes": columns}, numbers)  # 1/2 ‖r - T f‖²
 
-    def stated(**weights: float) -> Problem:
+    def state(**weights: float) -> Problem:
         sparse = GroupNorms({"changes": np.full(count, weights["lambda"])})  # lambda ‖changes‖_1
         return Problem(
             f"fault.profile {prior}", {"changes": _one(columns, problem.r)[:, None]}, (misfit, sparse),
             further=lambda v, _: {"f": shapes @ v["changes"][:, 0], "changes": v["changes"][:, 0]},
-            scale=0.5 * float(problem.r @ problem.r), weights=weights, posed=stated)
+            scale=0.5 * float(problem.r @ problem.r), weights=weights, posed=state)
 
-    return stated(**{"lambda": 0.1 * float(np.abs(columns.T @ problem.r).max())})
+    return state(**{"lambda": 0.1 * float(np.abs(columns.T @ problem.r).max())})
 
 
 def _smoothed(shares: Sequence[float], rules: Sequence[Any], fits: _Fits) -> Procedure:

@@ -95,7 +95,7 @@ class BackEnd:
     def exploits(self, program: "Program") -> bool:
         """Whether it accepts the structure of the programme, with the user's constraints."""
         structure = program.structure
-        return isinstance(structure, self.structures) and (structure.constrained or not program.user_constraints)
+        return isinstance(structure, self.structures) and (structure.constrained or not program.is_restricted)
 
     def refuses(self, program: "Program") -> str:
         """Return why this back end cannot take the programme, or an empty string."""

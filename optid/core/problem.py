@@ -12,8 +12,8 @@ from optid.arrays import Array
 from optid.core.constraint import Constraint, ConstraintReader
 from optid.core.leaves import Affine, Leaf, LeafSpace, Product, slices_of
 from optid.core.terms import Errors, Squares, Term, Values, flat
+from optid.program.structure import GAUGE
 
-GAUGE = "gauge"  # of the constraints that fix the scales of products to first order
 TRIALS = 5  # random points at which constraints are compared with those of the opposite signs
 
 

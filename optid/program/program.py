@@ -15,7 +15,7 @@ from optid.errors import StructureError, nearest
 from optid.program.compressed import Compressed
 from optid.program.limits import Limit
 from optid.program.solution import Bound
-from optid.program.structure import Structure
+from optid.program.structure import GAUGE, Structure
 from optid.program.view import Values, View
 
 AFFINE = ("zero", "below")  # cones of constraints of the core whose rows have sizes
@@ -192,6 +192,12 @@ class Program:
         if not self.is_stated:
             return {} if self.core is None else dict.fromkeys(self.core.constraint_names, ())
         return {name: group for name, group in self.constraints.items() if name not in self.structural}
+
+    @property
+    def is_restricted(self) -> bool:
+        """Whether anything but gauges restricts the unknowns, which methods for its structure alone do not know."""
+        of_problem = () if self.core is None else self.core.constraints()
+        return bool(self.user_constraints) or any(one.name != GAUGE for one in of_problem)
 
     def nonconvex_parts(self) -> list[str]:
         """Names of the parts that break convexity."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from optid.arrays import Array
 
+GAUGE = "gauge"  # of the constraints that fix the scale between the factors of products, which no objective sees
 ZERO = 1e-9  # a variable without a start that is smaller than this has no size to measure by
 
 

@@ -16,10 +16,10 @@ from optid.backends.back_end import Answer, Settings
 from optid.program.expressions import flat
 from optid.program.program import Program
 from optid.program.solution import Solution, Status
+from optid.program.structure import GAUGE
 from optid.solving.solve import solve
 from optid.structures.least_squares import rank_one_of
 
-GAUGE = "gauge"  # name of the structural constraint that fixes the scale between mu and b
 STEPS = 1000
 
 

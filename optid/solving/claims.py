@@ -99,7 +99,7 @@ def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -
     """
     duals = _usable(program, answer.duals)
     if program.core is not None and program.core.is_measured and (
-            program.user_constraints or program.structure is None):
+            program.is_restricted or program.structure is None):
         return _judged_in_core(program.core, answer.values, duals, base)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
         values, objective, residuals = judge(program, answer.values, duals)

@@ -13,10 +13,11 @@ from optid.certificate.lifting import MAX_SIZE, certify_nuclear, certify_rank_on
 from optid.certificate.low_rank import certify_low_rank
 from optid.core.leaves import Affine, Product
 from optid.core.low_rank import LowRank
-from optid.core.problem import GAUGE, Problem
+from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, NuclearNorms, Squares, stacked_expression, sum_of
 from optid.errors import StructureError
 from optid.program.program import Program
+from optid.program.structure import GAUGE
 from optid.program.view import View
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
 from optid.structures.least_squares import LinearStructure, RankOneStructure
