@@ -108,9 +108,8 @@ def test_three_channels_with_constraints():
 
 def test_the_step_model_is_the_second_order_expansion_of_the_lagrangian():
     """Against finite differences, at a point with multipliers for a bilinear constraint."""
-    program = program_of(record(), [shape.gain(1.0, at=0.1)])
-    problem, free = program.core, minimise(program.structure.problem).point
-    steps = RankOneSQP(problem, program.start, free, lambda x, duals: False).model
+    problem = program_of(record(), [shape.gain(1.0, at=0.1)])
+    steps = RankOneSQP(problem, problem.start, minimise(problem.terms[0].lifted).point, lambda x, duals: False).model
     rng = np.random.default_rng(0)
     x, pull = rng.normal(size=problem.size), rng.normal(size=problem.space.size)
 

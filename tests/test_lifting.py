@@ -9,6 +9,7 @@ import optid
 from formulations.constraints import shape
 from optid.certificate.lifting import lift, places
 from optid.registry import formulation
+from optid.solving.express import as_program
 
 SETS = {
     "cone": [shape.monotone()],
@@ -20,6 +21,10 @@ SETS = {
     "linear in a": [shape.stable(0.6), lambda v: {"sum": cp.sum(v["a"]) >= -0.7}],
     "everything": [shape.monotone(), shape.sign("b"), shape.value_range(-2, 2), shape.stable(0.9)],
 }
+
+
+def stated(data, **arguments):
+    return as_program(formulation("hammerstein_arx.exact")[1](data, na=2, nb=2, basis=BASIS, **arguments))
 
 
 @pytest.mark.sampled(2)
@@ -40,7 +45,7 @@ def test_bounds_hold_and_proofs_are_true(name, gain, seed):
 def test_a_point_that_is_not_optimal_is_never_proved():
     """The certificate is asked about points away from the optimum, some of them stationary for another branch."""
     data = record(count=60, noise=1.0)
-    program = formulation("hammerstein_arx.exact")[1](data, na=2, nb=2, basis=BASIS, constraints=[shape.monotone()])
+    program = stated(data, constraints=[shape.monotone()])
     fit = optid.fit(data, na=2, nb=2, basis=BASIS, constraints=[shape.monotone()])
     rng = np.random.default_rng(0)
     for _ in range(10):
@@ -67,7 +72,7 @@ def test_what_is_not_lifted_leaves_no_proof_and_says_why(rule):
 def test_lifted_rows_are_the_constraints_themselves(gauge):
     """At random points of the factored problem both readings have the same left-hand sides."""
     rules = [shape.slope(0.5, 2.0), shape.dead_zone(-0.3, 0.3), lambda v: {"a": 2 * v["a"][0] - v["a"][1] <= 3}]
-    program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS, constraints=rules, gauge=gauge)
+    program = stated(record(), constraints=rules, gauge=gauge)
     lifted = lift(program, program.structure)
     assert not lifted.refused and not lifted.cones
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
@@ -87,9 +92,7 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
 
 
 def test_products_of_two_cones():
-    program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS,
-                                                      constraints=[
-        lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b")])
+    program = stated(record(), constraints=[lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b")])
     lifted = lift(program, program.structure)
     assert set(lifted.cones) == set(lifted.directions) == {0}
     assert lifted.add_products(program.structure.problem) == [] and set(lifted.cones) == {0}
@@ -103,7 +106,7 @@ def test_products_of_two_cones():
 
 
 def test_places_read_bilinear_constraints_only():
-    program = formulation("hammerstein_arx.exact")[1](record(), na=2, nb=2, basis=BASIS)
+    program = stated(record())
     where, v = places(program, program.structure), program.view.inner
     rows, right = where.rows(v["Theta"][2, 1] - 3 * v["a"][1] <= 4)
     assert rows.shape == (1, 15) and right == pytest.approx([4])

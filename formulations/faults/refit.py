@@ -117,7 +117,7 @@ def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, const
     if not isinstance(constraints, str):
         rules = [named_constraint(rule) if isinstance(rule, str) else rule for rule in constraints]
 
-    def held(view: Any) -> dict[str, Any]:
+    def restrict(view: Any) -> dict[str, Any]:
         still = [key for key, part in problem.slices.items() if problem.held[part].any()]
         zeros = {f"zeros stay[{key}]": view[key] == 0 for key in still}
         shares = [(curve.name, view[f"lost[{curve.name}]"]) for curve in problem.curves]
@@ -128,8 +128,8 @@ def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, const
         name, start, (misfit,), model=lambda values: Refitted(problem, _vector(problem, values)),
         facts={"channels": tuple(curve.name for curve in problem.curves), "gauge": "none",
                "bases": {curve.name: curve.basis for curve in problem.curves}, "outputs": problem.model.outputs},
-        further=lambda view, _: {short: view[long] for short, long in of_one.items()}, builders=(held, *rules),
-        structural=frozenset(held(start)), scale=misfit.value(start) or 1.0)
+        further=lambda view, _: {short: view[long] for short, long in of_one.items()}, builders=(restrict, *rules),
+        structural=frozenset(restrict(start)), scale=misfit.value(start) or 1.0)
 
 
 def _not_stronger(curve: Any) -> list[Any]:

@@ -42,7 +42,7 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
     several = [term for term in problem.terms if isinstance(term, Squares)]
     factorised = len(several) == 1 and several[0].lifted is not None
     if len(several) < len(problem.terms) or problem.products and not factorised or not (
-            len(several) > 1 or _is_triangular(several[0].root)):
+            step or len(several) > 1 or _is_triangular(several[0].root)):
         return _of_terms(problem, step)
     if len(several) > 1:
         sizes = {name: place.stop - place.start for name, place in problem.space.places.items()}
