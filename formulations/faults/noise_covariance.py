@@ -18,8 +18,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.faults.residual import half_squares
 from optid.core.problem import Problem
+from optid.core.terms import Squares
 from optid.errors import StructureError, nearest
 from optid.faults.consistency.noise_matching import CovarianceMatch, CovarianceProblem, covariance_problem
 from optid.faults.signatures import Dictionary
@@ -67,7 +67,7 @@ def _places(problem: CovarianceProblem) -> Problem:
     units = problem.signatures / sizes
     return Problem(
         "fault.noise_covariance", {"scaled": np.maximum(units.T @ problem.target, 1.0)},
-        (half_squares(problem.target, {"scaled": units}),),
+        (Squares.half(problem.target, {"scaled": units}),),
         further=lambda v, _: {"rho": cp.multiply(1 / sizes, v["scaled"])},
         builders=(lambda view: {"variances": view["rho"] >= 0},), structural=frozenset({"variances"}),
         scale=0.5 * float(problem.target @ problem.target))
@@ -79,7 +79,7 @@ def _full(problem: CovarianceProblem) -> Problem:
     parts = {"Q": problem.by_process * of_process.ravel(order="F"), "R": problem.by_sensor * of_sensor.ravel(order="F")}
     return Problem(
         "fault.noise_covariance full", {"Q": np.eye(problem.nx), "R": np.eye(problem.l)},
-        (half_squares(problem.target, parts),), symmetric=frozenset("QR"),
+        (Squares.half(problem.target, parts),), symmetric=frozenset("QR"),
         further=lambda v, _: {"Q": cp.multiply(of_process, v["Q"]), "R": cp.multiply(of_sensor, v["R"])},
         builders=(lambda view: {"process covariance": view["Q"] >> 0, "sensor covariance": view["R"] >> 0},),
         structural=frozenset({"process covariance", "sensor covariance"}),

@@ -19,9 +19,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.faults.residual import half_squares
 from optid.core.problem import Problem
-from optid.core.terms import GroupNorms
+from optid.core.terms import GroupNorms, Squares
 from optid.errors import StructureError, nearest
 from optid.faults.consistency.profiles import EACH, PRIORS, CourseProblem, Profile, course_problem
 from optid.faults.search.scanning import Scan
@@ -142,7 +141,7 @@ def _changing(prior: str, shares: Sequence[float], rules: Sequence[Any], fits: _
             courses = shapes[:, kept] * unit
             solution = yield Problem(
                 f"fault.profile {prior} refit", {"scaled": problem.refitted(columns)[0]},
-                (half_squares(problem.r, {"scaled": columns}),),
+                (Squares.half(problem.r, {"scaled": columns}),),
                 further=lambda v, _, courses=courses, unit=unit: {
                     "f": courses @ v["scaled"], "changes": cp.multiply(unit, v["scaled"])},
                 scale=0.5 * float(problem.r @ problem.r), builders=tuple(rules))
@@ -168,7 +167,7 @@ def course_of_changes(problem: CourseProblem, prior: str) -> Problem:
     count, shapes = problem.count, problem.shapes(prior)
     columns = problem.matrix @ shapes
     numbers = GroupProblem(columns, problem.r, np.arange(count + 1), np.ones(count))
-    misfit = half_squares(problem.r, {"changes": columns}, numbers)  # 1/2 ‖r - T f‖²
+    misfit = Squares.half(problem.r, {"changes": columns}, numbers)  # 1/2 ‖r - T f‖²
 
     def state(**weights: float) -> Problem:
         sparse = GroupNorms({"changes": np.full(count, weights["lambda"])})  # lambda ‖changes‖_1
@@ -199,8 +198,8 @@ def _smoothed(shares: Sequence[float], rules: Sequence[Any], fits: _Fits) -> Pro
 def random_walk(problem: CourseProblem, rho: float = 1.0) -> Problem:
     """State the problem of a random walk: that of the Kalman smoother, with constraints."""
     differences = np.eye(problem.count) - np.eye(problem.count, k=-1)
-    shapes, misfit = problem.shapes("tv"), half_squares(problem.r, {"f": problem.matrix})  # 1/2 ‖r - T f‖²
-    rough = half_squares(np.zeros(problem.count), {"f": np.sqrt(rho) * differences})  # rho/2 ‖D1 f‖²
+    shapes, misfit = problem.shapes("tv"), Squares.half(problem.r, {"f": problem.matrix})  # 1/2 ‖r - T f‖²
+    rough = Squares.half(np.zeros(problem.count), {"f": np.sqrt(rho) * differences})  # rho/2 ‖D1 f‖²
     return Problem(
         "fault.profile smooth", {"f": shapes @ _one(problem.matrix @ shapes, problem.r)}, (misfit, rough),
         further=lambda v, _: {"changes": differences @ v["f"]}, scale=0.5 * float(problem.r @ problem.r),

@@ -17,9 +17,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from formulations.faults.residual import half_squares
 from optid.core.problem import Problem
-from optid.core.terms import GroupNorms, Values
+from optid.core.terms import GroupNorms, Squares, Values
 from optid.errors import StructureError
 from optid.faults.search.atoms import Atoms, atoms_of
 from optid.faults.search.calibration import Thresholds
@@ -73,7 +72,7 @@ def _problem(atoms: Sequence[Atoms], r: np.ndarray, penalty: float) -> Problem:
     edges = np.cumsum([0, *(atom.dimension for atom in atoms for _ in atom.onsets)])
     numbers = GroupProblem(np.hstack(designs), r, edges, np.concatenate(list(weights.values())) / penalty)
 
-    misfit = half_squares(r, parts, numbers)  # 1/2 ‖r - sum Q a‖²
+    misfit = Squares.half(r, parts, numbers)  # 1/2 ‖r - sum Q a‖²
     groups = GroupNorms(weights)  # lambda sum sqrt(q) ‖a‖
 
     return Problem("fault.signature", start, (misfit, groups), further=partial(_sizes, atoms),

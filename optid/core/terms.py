@@ -57,6 +57,12 @@ class Squares:
         return cls(lifted.root, lifted.target, lifted.remainder, z, lifted)
 
     @classmethod
+    def half(cls, target: Array, parts: Mapping[str, Array], lifted: Any = None) -> "Squares":
+        """Return ``1/2 ‖target - sum parts[name] vec(name)‖²``, target (k,), parts (k, size) column by column."""
+        root = np.sqrt(0.5)
+        return cls(root * np.hstack(list(parts.values())), root * target, 0.0, tuple(parts), lifted)
+
+    @classmethod
     def of_sum(cls, several: Sequence["Squares"], sizes: Mapping[str, int]) -> "Squares":
         """Return the sum of squares of leaves of these sizes as one, its root upper triangular."""
         z = tuple(dict.fromkeys(name for one in several for name in one.z))
