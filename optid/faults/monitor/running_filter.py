@@ -99,11 +99,8 @@ class RunningFilter:
         if self.held.any():
             for target, added in zip((drive, direct), self.additions(f)):
                 target += added
-        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
-        x[0] = self.x
         A, C, K, root = map(compact, (model.A, model.C, steady.K, steady.root))
-        predict(A, C, K, root, drive, y, direct, x, r)
-        return x, r
+        return predict(A, C, K, root, drive, y - direct, self.x)
 
     def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
         """Process one sample; return the whitened innovation (l,) and the matrices of the search.
