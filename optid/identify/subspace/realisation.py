@@ -6,6 +6,7 @@ its own initial state; those of all but the first run of an experiment are elimi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,16 @@ from optid.statistics.factors import add_to_root
 from optid.structures.bilinear import starts
 from optid.structures.lifted_regression import leading_pairs
 from optid.structures.rank_one import RankOne
+
+
+class StepMatrices(NamedTuple):
+    """What the step estimates: x+ = A x + Bu eta(u) + Ez zeta(y), y = C x + Du eta(u) + d, from x0."""
+
+    bu: Array  # (n, p)
+    du: Array  # (l, p)
+    ez: Array  # (n, q)
+    d: Array  # (l,)
+    x0: Array  # (experiments, n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +64,16 @@ class Realisation:
                 found[f"second over first singular value, {name}"] = float(values[1] / values[0])
         return found
 
-    def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""
+    def matrices(self, z: Array) -> StepMatrices:
+        """Split z into matrices."""
         form, x, states = self.form, self.form.expansion, self.form.experiments * self.form.n
         thetas = form.thetas(z)
         effects = np.hstack([theta[:, : form.n].T for theta in thetas])
         direct = [theta[:, form.n :].T if direct else np.zeros((form.l, len(theta)))
                   for theta, direct in zip(thetas, form.feedthrough)]
         offset = z[states : form.linear] if form.offset else np.zeros(form.l)
-        return effects[:, : x.p], np.hstack(direct), effects[:, x.p :], offset, z[:states].reshape(-1, form.n)
+        return StepMatrices(effects[:, : x.p], np.hstack(direct), effects[:, x.p :], offset,
+                            z[:states].reshape(-1, form.n))
 
     @property
     def names(self) -> list[tuple[str, str, str]]:
