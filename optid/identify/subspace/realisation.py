@@ -109,9 +109,10 @@ class Realisation:
         n, l, m = form.n, form.l, x.m  # noqa: E741
         mus, bs = [mu for mu, _ in pairs], [b for _, b in pairs]
         direct = [b[n:] if len(b) > n else np.zeros(l) for b in bs[:m]]
-        matrices = form.a, np.column_stack([b[:n] for b in bs[:m]]), form.c, np.column_stack(direct)
-        found = state_model(x, data, matrices, mus[:m], mus[m:], np.column_stack([np.zeros((n, 0)), *bs[m:]]),
-                            offset=np.asarray(values["offset"]) if form.offset else np.zeros(l))
+        matrices = {"A": form.a, "B": np.column_stack([b[:n] for b in bs[:m]]), "C": form.c,
+                    "D": np.column_stack(direct),
+                    "offset_y": np.asarray(values["offset"]) if form.offset else np.zeros(l)}
+        found = state_model(x, data, matrices, mus[:m], mus[m:], np.column_stack([np.zeros((n, 0)), *bs[m:]]))
         if not any(basis.size > 1 for basis in x.inputs):
             return found
         signs = np.where([isinstance(basis, Linear) for basis in x.inputs], 1.0, found.gain_signs)
@@ -163,20 +164,19 @@ def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
     return mu * length, b / length
 
 
-def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
-                e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
+def state_model(expansion: Expansion, data: Data, matrices: Mapping[str, Array], mus: Sequence[Array],
+                nus: Sequence[Array], e: Array) -> HammersteinSS:
     """Build the model with the meta data of a record; the linear part of the feedback becomes L and a constant.
 
-    The matrices are A (n, n), B (n, m), C (l, n) and D (l, m); mus are the coefficients of the nonlinearity of every
-    input, nus those of every feedback family in its orthonormal coordinates, with one column of e (n, s) each. K (n, l)
-    and the offset (l,) of the output are zero where None.
+    The matrices are A (n, n), B (n, m), C (l, n) and D (l, m) of `HammersteinSS`, and its K (n, l) and offset_y (l,)
+    where they are not zero; mus are the coefficients of the nonlinearity of every input, nus those of every feedback
+    family in its orthonormal coordinates, with one column of e (n, s) each.
     """
     families = expansion.feedback
     parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]
     injection, constant = expansion.injection(np.hstack([np.zeros((len(e), 0)), *parts]))
-    A, B, C, D = matrices
     return HammersteinSS(
-        A=A, B=B, C=C, D=D, K=K, E=e if families else None, L=injection,
+        **matrices, E=e if families else None, L=injection,
         nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, mus)),
         feedback=tuple(Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, nus)),
-        output_of=tuple(family.output for family in families), offset_x=constant, offset_y=offset, **model_meta(data))
+        output_of=tuple(family.output for family in families), offset_x=constant, **model_meta(data))
