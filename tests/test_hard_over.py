@@ -13,6 +13,7 @@ from optid.errors import DataError, RankError, StructureError
 from optid.faults import Fault, hard_over_test, inject
 from optid.faults.rank.hard_over import (
     MARGIN,
+    ChannelRegression,
     HardOver,
     WindowVerdict,
     ZeroTest,
@@ -22,7 +23,7 @@ from optid.faults.rank.hard_over import (
 )
 from optid.identify.order.ranks import rank_test
 from optid.plants import two_mode_plant
-from optid.statistics.hankel import hankel_statistics
+from optid.statistics.hankel import RegressionRows, hankel_statistics
 from optid.statistics.sums import windows_of
 
 N = 1500
@@ -211,7 +212,7 @@ def test_statistic_against_a_dense_regression():
     at = statistics.at
     others = np.r_[0, at([1], range(alpha + 1)), at([2, 3], range(alpha))]
     tests = at([0], range(alpha + 1)), others, at([2, 3], [alpha])
-    found = zero_test(statistics, *tests, rows=2 * alpha, level=0.01)
+    found = zero_test(statistics, ChannelRegression("actuator:u1", *tests), rows=2 * alpha, level=0.01)
     windows = windows_of(np.hstack([data.u, data.y]), 3 * alpha).reshape(len(data.u) - 3 * alpha + 1, -1)
     dense = np.hstack([np.ones((len(windows), 1)), windows])
     t, o, y = (dense[:, part] for part in tests)
@@ -265,19 +266,19 @@ def test_tails_of_the_forecast_against_the_windows_themselves():
     parts = signals[: 2 * N], signals[2 * N :]
     first, second = (hankel_statistics([part], 3 * alpha, centre="mean") for part in parts)
     at = first.at
-    z, phi, y = np.r_[0, at([0, 1], range(2 * alpha))], np.r_[0, at([0, 1], range(alpha, 2 * alpha))], at(
-        [2, 3], range(alpha, 2 * alpha))
-    pi = coefficients(first, z, y)
+    z, y = np.r_[0, at([0, 1], range(2 * alpha))], at([2, 3], range(alpha, 2 * alpha))
+    regression = RegressionRows(z, np.r_[0, at([0, 1], range(alpha, 2 * alpha))], y)
+    pi = coefficients(first, regression)
     windows = windows_of(parts[0] - first.centre, 3 * alpha).reshape(-1, 3 * alpha * 4)
     dense = np.hstack([np.ones((len(windows), 1)), windows])
     np.testing.assert_allclose(pi, np.linalg.lstsq(dense[:, z], dense[:, y], rcond=None)[0].T, atol=1e-8)
     scale = np.ones(y.size)
-    test = rank_test(second, z, phi, y, rows=2 * alpha, level=1e-3, largest=10, scale=scale)
-    assert least_order(second, z, phi, pi, test, 4, scale) == test.order == 4
+    test = rank_test(second, regression, rows=2 * alpha, level=1e-3, largest=10, scale=scale)
+    assert least_order(second, regression, pi, test, 4, scale) == test.order == 4
     # thresholds just above what a healthy plant shows after the first two: the orders 2 and 3 tell nothing any more
     raised = replace(test, thresholds=np.where(np.arange(test.thresholds.size) < 2, test.thresholds,
                                                test.statistics[2] / MARGIN * 1.2))
-    assert least_order(second, z, phi, pi, raised, 4, scale) == 2
+    assert least_order(second, regression, pi, raised, 4, scale) == 2
 
 
 @pytest.mark.slow

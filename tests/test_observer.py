@@ -8,7 +8,7 @@ from optid.data.record import Data
 from optid.errors import RankError
 from optid.identify.noise import observer_gain
 from optid.identify.subspace.instruments import simulate_clipped
-from optid.identify.subspace.realisation import observer_problem
+from optid.identify.subspace.realisation import StepMatrices, observer_problem
 from optid.identify.subspace.regressors import ObserverForm
 from optid.statistics.expansion import expand
 
@@ -214,7 +214,8 @@ def test_clipped_simulation_follows_the_model_and_stays_inside():
     ez, d = 0.1 * rng.standard_normal((2, expansion.q)), np.array([0.1, -0.1])
     low, high = records[0][:, 2:].min(axis=0), records[0][:, 2:].max(axis=0)
     low, high = low - 0.2 * (high - low), high + 0.2 * (high - low)
-    (found,) = simulate_clipped(records, expansion, 0.3 * A, C, 0.1 * bu, du, ez, d)
+    step = StepMatrices(0.1 * bu, du, ez, d, np.zeros((1, 2)))
+    (found,) = simulate_clipped(records, expansion, 0.3 * A, C, step)
     x, eta = np.zeros(2), expansion.without_feedback()(records[0])[:, :3]
     for k in range(300):
         y = np.clip(C @ x + du @ eta[k] + d, low, high)
@@ -222,9 +223,10 @@ def test_clipped_simulation_follows_the_model_and_stays_inside():
         x = 0.3 * A @ x + 0.1 * bu @ eta[k] + ez @ expansion.feedback[0].values(y[None])[0]
     silent = records[0].copy()
     silent[:, 2] = np.nan  # an experiment without the output: its range is that of the others
-    np.testing.assert_array_equal(simulate_clipped([records[0], silent], expansion, A, C, bu, du, ez, d)[1],
-                                  simulate_clipped(records, expansion, A, C, bu, du, ez, d)[0])
-    (wild,) = simulate_clipped(records, expansion, 2 * A, C, bu, du, 50 * ez, d)
+    step = step._replace(bu=bu)
+    np.testing.assert_array_equal(simulate_clipped([records[0], silent], expansion, A, C, step)[1],
+                                  simulate_clipped(records, expansion, A, C, step)[0])
+    (wild,) = simulate_clipped(records, expansion, 2 * A, C, step._replace(ez=50 * ez))
     assert np.all(wild >= low - 1e-12) and np.all(wild <= high + 1e-12)
 
 

@@ -23,7 +23,7 @@ from optid.identify.order.study import block_rows_for, with_simulated_outputs
 from optid.plants import EXAMPLE1, TWO_MODES
 from optid.statistics import collect
 from optid.statistics.expansion import expand
-from optid.statistics.hankel import hankel_statistics
+from optid.statistics.hankel import RegressionRows, hankel_statistics
 from optid.statistics.sums import windows_of
 from optid.structures import lifted_regression
 
@@ -42,7 +42,7 @@ def positions(statistics, alpha, m, d):
     at = statistics.at
     z = np.r_[0, at(range(m), range(2 * alpha))]
     phi = np.r_[0, at(range(m), range(alpha, 2 * alpha))]
-    return z, phi, at(range(m, d), range(alpha, 2 * alpha))
+    return RegressionRows(z, phi, at(range(m, d), range(alpha, 2 * alpha)))
 
 
 def linear(data):
@@ -155,23 +155,23 @@ def test_simulated_outputs_follow_the_inputs_alone():
 def test_the_choice_has_a_reason():
     data = record()
     statistics = hankel_statistics(data.records, 15)
-    z, phi, y = positions(statistics, 5, 1, 2)
-    n, reason = rank_test(statistics, z, phi, y, rows=10).choice
+    regression = positions(statistics, 5, 1, 2)
+    n, reason = rank_test(statistics, regression, rows=10).choice
     assert n == 2 and "order 1 is rejected" in reason
-    assert rank_test(statistics, z, phi, y, rows=10, largest=1).choice == (
+    assert rank_test(statistics, regression, rows=10, largest=1).choice == (
         1, "1: every smaller order is rejected and the block rows show no larger one; use more block rows")
 
 
 def test_refusals_of_the_test():
     data = record()
     statistics = hankel_statistics(data.records, 15)
-    z, phi, y = positions(statistics, 5, 1, 2)
-    refuses(StructureError, "take windows that are longer", rank_test, statistics, z, phi, y, rows=15)
-    refuses(StructureError, "within the first 9 block rows", rank_test, statistics, z, phi, y, rows=9)
-    refuses(StructureError, "level=2", rank_test, statistics, z, phi, y, rows=10, level=2)
-    refuses(StructureError, "5 positive numbers", rank_test, statistics, z, phi, y, rows=10, scale=np.zeros(5))
+    regression = positions(statistics, 5, 1, 2)
+    refuses(StructureError, "take windows that are longer", rank_test, statistics, regression, rows=15)
+    refuses(StructureError, "within the first 9 block rows", rank_test, statistics, regression, rows=9)
+    refuses(StructureError, "level=2", rank_test, statistics, regression, rows=10, level=2)
+    refuses(StructureError, "5 positive numbers", rank_test, statistics, regression, rows=10, scale=np.zeros(5))
     short = hankel_statistics([np.hstack([data.u, data.y])[:28]], 15)
-    refuses(RankError, "14 complete windows for 11 instruments and 5 outputs", rank_test, short, z, phi, y, rows=10)
+    refuses(RankError, "14 complete windows for 11 instruments and 5 outputs", rank_test, short, regression, rows=10)
 
 
 def test_prediction_errors_of_full_order_are_those_of_least_squares():

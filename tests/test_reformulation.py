@@ -33,6 +33,7 @@ from optid.faults import (
     subspace_projection,
     trajectory,
 )
+from optid.faults.repair.damage import Damage
 from optid.faults.repair.refitting import refitting
 from optid.models import Nonlinearity
 from optid.registry import fault_formulation
@@ -129,12 +130,18 @@ def reformulated(model, faults, label, size, data, **how):
     return reformulate(model, diagnosis(model, answer(estimate(faults, label, size))), data, **how)
 
 
+def damaged(column, offsets=(), onset=ONSET):
+    """Damage of one of the two actuators of the standard plant, of three states, and additions to it."""
+    return Damage("", 1.0, onset, True, (column,), (), (), offsets, {}, np.zeros((3, 3)), np.ones(2), np.zeros(2),
+                  np.zeros(3), ())
+
+
 def test_the_state_before_the_fault_is_that_of_the_predictor(healthy):
     model = replace(with_feedback(healthy), L=np.array([[0.1, 0.0], [0.0, -0.1], [0.05, 0.1]]))
     data = broken_record(model, Fault.loss("actuator:u1", 300, 0.5), count=360)
     y = data.y.copy()
     y[150, 0] = np.nan  # corrects nothing, and is interpolated where it is fed back
-    window = refitting(model, Data(data.u, y), 300, damaged=[0]).windows[0]
+    window = refitting(model, Data(data.u, y), damaged(0, onset=300)).windows[0]
     steady, f, x = predictor(model), model.expanded(data.u), np.zeros(3)
     filled = y.copy()
     filled[150, 0] = (y[149, 0] + y[151, 0]) / 2
@@ -155,7 +162,7 @@ def test_sensitivities_are_those_of_finite_differences(healthy, faults, whole, h
         y[ONSET + 7] = np.nan
         data = Data(data.u, y)
     load = replace(faults["process:load"], kind="bias")
-    problem = refitting(healthy, data, ONSET, damaged=[1], offsets=[load], whole=whole)
+    problem = refitting(healthy, data, damaged(1, offsets=(load,)), whole=whole)
     theta = problem.start + 0.02 * np.random.default_rng(0).standard_normal(problem.start.size)
     r, s = problem.linearised(theta)
     assert r.size == problem.readings
@@ -166,7 +173,7 @@ def test_sensitivities_are_those_of_finite_differences(healthy, faults, whole, h
 
 def test_refit_equals_regularised_least_squares_where_no_rule_binds(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.4), count=400)
-    problem = refitting(healthy, data, ONSET, damaged=[1])
+    problem = refitting(healthy, data, damaged(1))
     found = run(actuator(problem, constraints=[]))
     r, s = problem.linearised(problem.start)
     curve, half = problem.curves[0], problem.curves[0].half_range
@@ -189,7 +196,7 @@ def test_evidence_is_the_density_of_the_record(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.4), count=ONSET + 12)
     found = []
     for curvature in (0.02, 0.1, 0.5):
-        problem = refitting(healthy, data, ONSET, damaged=[1], prior=Prior(curvature=curvature))
+        problem = refitting(healthy, data, damaged(1), prior=Prior(curvature=curvature))
         r, s = problem.linearised(problem.start)
         rows, wanted = problem.believed()
         rows, wanted = np.vstack([rows, 2 * np.eye(8)[7:]]), np.append(wanted, 1.0)
@@ -204,7 +211,7 @@ def test_evidence_is_the_density_of_the_record(healthy):
 @pytest.mark.parametrize("solver", ["clarabel", "osqp", "daqp", "ipopt"])
 def test_refit_is_the_same_by_any_back_end(healthy, solver):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), seed=1, count=ONSET + 10)
-    problem = refitting(healthy, data, ONSET, damaged=[1])
+    problem = refitting(healthy, data, damaged(1))
     stated = actuator(problem)
     assert as_program(stated).kind == "QP"
     found, other = solve(stated, solver), solve(stated, "piqp")
@@ -213,15 +220,15 @@ def test_refit_is_the_same_by_any_back_end(healthy, solver):
 
 def test_rules_hold_and_binding_ones_are_named(healthy, faults):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), seed=1, count=ONSET + 6)
-    found = run(actuator(refitting(healthy, data, ONSET, damaged=[1])))
+    found = run(actuator(refitting(healthy, data, damaged(1))))
     mu = np.insert(found.model.model.nonlinearities[1].mu, 3, 0.0)
     before = np.insert(healthy.nonlinearities[1].mu, 3, 0.0)
     assert np.all(np.diff(mu) >= -1e-7) and np.all(np.diff(mu) <= np.diff(before) + 1e-7)
-    again = run(actuator(refitting(healthy, data, ONSET, damaged=[1]), constraints=["monotone:increasing"]))
+    again = run(actuator(refitting(healthy, data, damaged(1)), constraints=["monotone:increasing"]))
     assert again.model.model.nonlinearities[1].mu.shape == (6,)
     with pytest.raises(StructureError, match="'default'"):
-        actuator(refitting(healthy, data, ONSET, damaged=[1]), constraints="monotone")
-    assert run(actuator(refitting(healthy, data, ONSET, damaged=[1]), constraints=[monotone("increasing")])).model
+        actuator(refitting(healthy, data, damaged(1)), constraints="monotone")
+    assert run(actuator(refitting(healthy, data, damaged(1)), constraints=[monotone("increasing")])).model
 
 
 @pytest.mark.slow
@@ -231,7 +238,7 @@ def test_refit_beats_the_healthy_model_and_the_wrong_part(healthy, faults):
         data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.6), seed=seed, count=ONSET + 30)
         truth = scaled(healthy, 1, 0.4)
         for word, column in (("right", 1), ("wrong", 0)):
-            model = run(actuator(refitting(healthy, data, ONSET, damaged=[column]))).model.model
+            model = run(actuator(refitting(healthy, data, damaged(column)))).model.model
             fits[word].append(simulated_fit(model, truth))
         fits["healthy"].append(simulated_fit(healthy, truth))
     assert np.median(fits["right"]) > 95 > np.median(fits["healthy"]) > np.median(fits["wrong"])
@@ -253,7 +260,7 @@ def test_all_parameters_overtake_when_the_healthy_model_is_off(healthy, faults):
 
 def test_gauss_newton_ends_at_a_stationary_point(healthy):
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), count=300)
-    problem = refitting(healthy, data, ONSET, damaged=[1], whole=True, prior=Prior(healthy=0.05))
+    problem = refitting(healthy, data, damaged(1), whole=True, prior=Prior(healthy=0.05))
     found = run(parameters(problem, constraints=[]), prove=False)
     r, s = problem.linearised(found.model.theta)
     rows, wanted = problem.believed()
@@ -283,14 +290,14 @@ def test_healthy_is_the_identity(healthy):
 
 def test_too_few_samples_name_the_least_number_and_fall_back(healthy, faults):
     with pytest.raises(RankError, match="at least 4 samples"):
-        refitting(healthy, broken_record(healthy, (), count=ONSET + 3), ONSET, damaged=[1])
+        refitting(healthy, broken_record(healthy, (), count=ONSET + 3), damaged(1))
     data = broken_record(healthy, Fault.loss("actuator:u2", ONSET, 0.5), count=ONSET + 3)
     unsure = replace(estimate(faults, "actuator:u2 loss", 0.5), size=np.array([np.nan]))
     with pytest.warns(DataWarning, match="at least 4 samples"):
         found = reformulate(healthy, diagnosis(healthy, answer(unsure)), data)
     assert found.status == "as diagnosed" and found.schedule.stage == "prior" and found.schedule.least == 4
     assert found.model.nonlinearities[1].mu == pytest.approx(healthy.nonlinearities[1].mu)
-    refitting(healthy, broken_record(healthy, (), count=ONSET + 5), ONSET, damaged=[1])
+    refitting(healthy, broken_record(healthy, (), count=ONSET + 5), damaged(1))
 
 
 @pytest.mark.parametrize("still", [False, True])

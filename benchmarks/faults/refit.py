@@ -113,19 +113,21 @@ def levenberg_marquardt(problem: Refitting, steps: int = 60) -> np.ndarray:
 def one(plant: HammersteinSS, damaged: HammersteinSS, count: int, seed: int, off: float) -> dict[str, float]:
     data, u = record(plant, damaged, count, seed), levels(UNSEEN, 77)
     truth, known = damaged.simulate(u), off_by(plant, off, seed)
-    damage = Damage("u2", 1.0, BEFORE, True, (1,), (), (), (), {}, np.zeros((4, 4)), np.ones(2), np.zeros(2),
-                    np.zeros(4), ())
+
+    def broken(which: int) -> Damage:
+        return Damage(f"u{which + 1}", 1.0, BEFORE, True, (which,), (), (), (), {}, np.zeros((4, 4)), np.ones(2),
+                      np.zeros(2), np.zeros(4), ())
 
     def narrow(which: int = 1, prior: Prior | None = None, rules: Any = "default") -> Any:
-        problem = refitting(known, data, BEFORE, damaged=[which], prior=prior)
+        problem = refitting(known, data, broken(which), prior=prior)
         return run(actuator(problem, constraints=rules), prove=False).model.model
 
     def wide() -> Any:
-        problem = refitting(known, data, BEFORE, damaged=[1], whole=True)
+        problem = refitting(known, data, broken(1), whole=True)
         return run(parameters(problem), prove=False).model.model
 
     def no_prior() -> Any:
-        problem = refitting(known, data, BEFORE, damaged=[1], whole=True)
+        problem = refitting(known, data, broken(1), whole=True)
         return problem.model_at(levenberg_marquardt(problem))
 
     tries: dict[str, Callable[[], Any]] = {
@@ -134,7 +136,7 @@ def one(plant: HammersteinSS, damaged: HammersteinSS, count: int, seed: int, off
         "all, prior": wide,
         "all, no prior": no_prior,
         "wrong actuator": lambda: narrow(0),
-        "schedule": lambda: refit(known, data, damage)[0],
+        "schedule": lambda: refit(known, data, broken(1))[0],
     }
     results = {}
     for word, how in tries.items():

@@ -183,7 +183,8 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     for i, cone in white.items():
         if (cone @ mus[i]).sum() < 0:
             mus[i], bs[i] = -mus[i], -bs[i]
-    z = np.concatenate([w, *(np.outer(b, mu).ravel() for mu, b in zip(mus, bs))])
+    at = Point(w, tuple(mus), tuple(bs))
+    z = at.lift()
     residual = core.root @ z - core.target
     slope = core.root.T @ residual
     value = float(residual @ residual) + problem.remainder
@@ -191,7 +192,7 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
         linear = replace(linear, rows=core.whitening.columns(linear.rows[:, 0 if keep_linear else problem.linear:]))
     else:
         linear = Linear.none(len(z))
-    nu, lam = kkt_multipliers(slope, core.shapes, core.linear, mus, bs, white, linear, z)
+    nu, lam = kkt_multipliers(slope, at, white, linear)
     return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear)
 
 

@@ -6,7 +6,7 @@ the rows of C Theta satisfy ``(row j)^T (row k) = delta_j delta_k b b^T``, posit
 Constraints ``E z <= f`` on the lifted vector are linear and enter the Lagrangian exactly.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,25 +52,25 @@ def check_constraints(cones: Mapping[int, Array], linear: Linear, problem: RankO
             raise StructureError(f"cone {i} has shape {cone.shape}; block {i} of {problem.blocks} needs (r, P)")
 
 
-def kkt_multipliers(slope: Array, shapes: Sequence[tuple[int, int]], offset: int, mus: Sequence[Array],
-                    bs: Sequence[Array], cones: dict[int, Array], linear: Linear, z: Array
+def kkt_multipliers(slope: Array, point: Point, cones: Mapping[int, Array], linear: Linear
                     ) -> tuple[dict[int, Array], Array]:
     """Return the multipliers, of the cones and linear, that make the gradient along the manifold vanish.
 
-    All is meant in the coordinates of the core: half the gradient of the objective (k,), blocks (P_i, nb_i) behind
-    ``offset`` other unknowns, mu (P_i,) and b (nb_i,) of unit length, and the lifted point z (k,).
+    All is meant in the coordinates of the core: half the gradient of the objective (k,), and a point whose b are of
+    unit length.
     """
     if not cones and not len(linear.right):
         return {}, np.zeros(0)
-    units = [mu / (np.linalg.norm(mu) or 1.0) for mu in mus]
-    jacobian = Point(np.zeros(offset), tuple(units), tuple(bs)).tangent()
-    firsts = np.cumsum([offset, *(p + nb for p, nb in shapes)])  # of every mu in the tangent coordinates
+    mus = point.mus
+    jacobian = Point(point.w, tuple(mu / (np.linalg.norm(mu) or 1.0) for mu in mus), point.bs).tangent()
+    # of every mu in the tangent coordinates
+    firsts = np.cumsum([len(point.w), *(mu.size + b.size for mu, b in zip(mus, point.bs))])
     active, parts = {}, []
     for i, cone in cones.items():
         active[i] = np.flatnonzero(np.abs(cone @ mus[i]) <= ACTIVE * (np.abs(cone) @ np.abs(mus[i])))
         parts.append(np.zeros((len(active[i]), jacobian.shape[1])))
         parts[-1][:, firsts[i] : firsts[i] + len(mus[i])] = cone[active[i]]
-    slack, terms = linear.slack(z)
+    slack, terms = linear.slack(point.lift())
     held = np.flatnonzero((np.abs(slack) <= ACTIVE * terms) | linear.equality)
     rows = np.vstack([*parts, -linear.rows[held] @ jacobian])
     equality = np.append(np.zeros(len(rows) - len(held), dtype=bool), linear.equality[held])

@@ -28,21 +28,33 @@ class Trajectory(NamedTuple):
     x: Array
 
 
-class _Plan(NamedTuple):
-    """Signals of a record with faults; see `optid.faults.kernels.march_faulty`."""
+class Sensors(NamedTuple):
+    """The sensors of a record: a reading is gain * output + shift + noise, unless it is fixed or held."""
 
-    state: Array
-    output: Array
-    jolt: Array
-    start: Array
-    w: Array
-    gain: Array
-    shift: Array
-    v: Array
-    fixed: Array
-    hold: Array
-    A: Array
-    B: Array
+    gain: Array  # (N, l)
+    shift: Array  # (N, l)
+    noise: Array  # (N, l)
+    fixed: Array  # (N, l) reading that replaces the output; NaN for none
+    hold: Array  # (N, l) whether the reading of the sample before is repeated
+
+    @classmethod
+    def healthy(cls, noise: Array) -> "Sensors":
+        """Return sensors without a fault."""
+        return cls(np.ones(noise.shape), np.zeros(noise.shape), noise, np.full(noise.shape, np.nan),
+                   np.zeros(noise.shape, dtype=bool))
+
+
+class _Plan(NamedTuple):
+    """Signals of a record with faults."""
+
+    state: Array  # (N, r) functions of the inputs in the next state
+    output: Array  # (N, r) those in the output
+    jolt: Array  # (N, n) added to the next state
+    start: Array  # (n,) added to the first one
+    w: Array  # (N, n) process noise
+    sensors: Sensors
+    A: Array  # (N, n, n)
+    B: Array  # (N, n, r)
 
 
 def inject(
@@ -102,13 +114,9 @@ def trajectory(
     drive = plan.jolt + model.offset_x + np.einsum("kir,kr->ki", plan.B, plan.state, optimize=True)
     direct = plan.output @ model.D.T + model.offset_y
     x = _started(model, x0, inputs) + plan.start
-    states, readings = np.empty((len(inputs), model.nx)), np.empty((len(inputs), model.l))
-    table, which = (plan.A[:1], np.zeros(len(inputs), dtype=np.int64)) if plan.A.strides[0] == 0 else (
-        plan.A, np.arange(len(inputs)))
-    ended, at = march_faulty(
-        model.parts, compact(table), which, drive, direct, plan.w, plan.gain, plan.shift, plan.v,
-        plan.fixed, plan.hold, feedback == "true", x, states, readings,
-    )
+    table = plan.A[:1] if plan.A.strides[0] == 0 else plan.A
+    ended, at, states, readings = march_faulty(
+        model.parts, compact(table), drive + plan.w, direct, plan.sensors, feedback == "true", x)
     if ended != INSIDE:
         raise DataError(
             f"At sample {at} the output leaves the interval of a feedback basis with outside='error'."
@@ -129,8 +137,7 @@ def _planned(
         drawn = _draw(healthy, count, np.block([[covariances.Q, covariances.S], [covariances.S.T, covariances.R]]))
     w, v = np.ascontiguousarray(drawn[:, :n]), np.ascontiguousarray(drawn[:, n:])
     plan = _Plan(
-        f, f.copy(), np.zeros((count, n)), np.zeros(n), w, np.ones((count, l)), np.zeros((count, l)), v,
-        np.full((count, l), np.nan), np.zeros((count, l), dtype=bool),
+        f, f.copy(), np.zeros((count, n)), np.zeros(n), w, Sensors.healthy(v),
         np.broadcast_to(model.A, (count, n, n)), np.broadcast_to(model.B, (count, n, f.shape[1])),
     )
     for fault, stream in sorted(zip(faults, streams), key=lambda pair: pair[0].kind in ADDITIVE):
@@ -147,14 +154,14 @@ def _planned(
                     plan = plan._replace(**{word: changed})
         elif fault.kind in ("process_noise", "sensor_noise"):
             state, output = place_of(model, fault.name, fault.direction, process)
-            where, target, samples, word = (output, plan.v, now, "R") if fault.kind == "sensor_noise" else (
+            where, target, samples, word = (output, plan.sensors.noise, now, "R") if fault.kind == "sensor_noise" else (
                 state, plan.w, before, "Q")
             spread = _added(fault, where, None if covariances is None else getattr(covariances, word))
             target[samples] += _draw(stream, samples.stop - samples.start, spread) @ where.T
         elif fault.place == "actuator":
             _break_actuator(model, plan, fault, now, before, u)
         else:
-            _break_sensor(model, plan, fault, now)
+            _break_sensor(model, plan.sensors, fault, now)
     return plan
 
 
@@ -168,7 +175,7 @@ def _add(
             f"{fault.name}: size of shape {size.shape}; this place has {into_state.shape[1]} columns: give one entry "
             "for each."
         )
-    course = np.zeros(len(plan.shift))
+    course = np.zeros(len(plan.jolt))
     course[now] = np.arange(1, now.stop - now.start + 1) if fault.kind == "ramp" else 1.0
     if fault.kind == "jump":
         course[now.start + 1 :] = 0.0
@@ -177,7 +184,7 @@ def _add(
         plan.output[:, columns] += np.outer(course, size)
         plan.state[:-1, columns] += np.outer(course[1:], size)
     else:
-        plan.shift[:] += np.outer(course, into_output @ size)
+        plan.sensors.shift[:] += np.outer(course, into_output @ size)
         plan.jolt[:-1] += np.outer(course[1:], into_state @ size)
     plan.start[:] += course[0] * (into_state @ size)
 
@@ -193,17 +200,17 @@ def _break_actuator(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slic
                 values[samples, i] = 0.0 if size is None else model.nonlinearities[i](stop)
 
 
-def _break_sensor(model: "HammersteinSS", plan: _Plan, fault: Fault, now: slice) -> None:
+def _break_sensor(model: "HammersteinSS", sensors: Sensors, fault: Fault, now: slice) -> None:
     o = channel_of(model.outputs, fault.name)
     if fault.kind == "loss":
-        plan.gain[now, o] *= 1.0 - np.asarray(fault.size)
-        plan.shift[now, o] += fault.bias
+        sensors.gain[now, o] *= 1.0 - np.asarray(fault.size)
+        sensors.shift[now, o] += fault.bias
     elif fault.size is None:
-        plan.gain[now, o] = 0.0
+        sensors.gain[now, o] = 0.0
     elif fault.size == "last":
-        plan.hold[now, o] = True
+        sensors.hold[now, o] = True
     else:
-        plan.fixed[now, o] = fault.size
+        sensors.fixed[now, o] = fault.size
 
 
 def _covariances(model: "HammersteinSS", noise: NoiseCovariances | str) -> NoiseCovariances | None:

@@ -7,33 +7,28 @@ from optid.models.state_kernels import INSIDE, LEFT, REFUSED, value_and_slope
 
 
 @cached_njit
-def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, true_feedback, x, states, outputs):
+def march_faulty(parts, A, drive, direct, sensors, true_feedback, start):
     """Run a plant with faults.
 
     Args:
         parts: matrices and tables of the plant.
-        A: (M, n, n) the values of A(k).
-        which: (N,) index into A of the step from sample k to k + 1.
-        jolt: (N, n) inputs, constants and faults in the step from k to k + 1.
+        A: (1, n, n), or (N, n, n) of every step from k to k + 1.
+        drive: (N, n) inputs, constants, faults and process noise in the step from k to k + 1.
         direct: (N, l) inputs and constants in the output.
-        w: (N, n) process noise.
-        gain: (N, l) factor of the output.
-        shift: (N, l) added to the output after it.
-        v: (N, l) measurement noise.
-        fixed: (N, l) reading that replaces the output; NaN for none.
-        hold: (N, l) whether the reading of the sample before is repeated.
+        sensors: `optid.faults.injection.Sensors`.
         true_feedback: whether the plant feeds back its true outputs, not those of the faulty sensors.
-        x: (n,) state, changed in place.
-        states: (N, n) written.
-        outputs: (N, l) written.
+        start: (n,) state of the first sample.
 
     Returns:
-        the outcome of the run and the sample at which it ended.
+        the outcome of the run, the sample at which it ended, the states (N, n) and the readings (N, l).
     """
     C, E, L = parts.C, parts.E, parts.L
-    n, l, s = x.size, C.shape[0], E.shape[1]  # noqa: E741
-    later, seen = np.empty(n), np.empty(l)
+    gain, shift, v, fixed, hold = sensors
+    n, l, s = start.size, C.shape[0], E.shape[1]  # noqa: E741
+    states, outputs = np.empty(drive.shape), np.empty(direct.shape)
+    x, later, seen = start.copy(), np.empty(n), np.empty(l)
     for k in range(outputs.shape[0]):
+        t = k if A.shape[0] > 1 else 0
         for o in range(l):
             true = direct[k, o]
             for i in range(n):
@@ -44,30 +39,30 @@ def march_faulty(parts, A, which, jolt, direct, w, gain, shift, v, fixed, hold, 
             if hold[k, o] and k > 0:
                 reading = outputs[k - 1, o]
             if not np.isfinite(reading):
-                return LEFT, k
+                return LEFT, k, states, outputs
             outputs[k, o] = reading
             seen[o] = true + v[k, o] if true_feedback else reading
         for i in range(n):
             states[k, i] = x[i]
-            later[i] = jolt[k, i] + w[k, i]
+            later[i] = drive[k, i]
             for j in range(n):
-                later[i] += A[which[k], i, j] * x[j]
+                later[i] += A[t, i, j] * x[j]
             for o in range(l):
                 later[i] += L[i, o] * seen[o]
         for j in range(s):
             fed, slope, refused = value_and_slope(parts.tables, j, seen[parts.output_of[j]])
             if refused:
-                return REFUSED, k
+                return REFUSED, k, states, outputs
             for i in range(n):
                 later[i] += E[i, j] * fed
         for i in range(n):
             x[i] = later[i]
-    return INSIDE, outputs.shape[0]
+    return INSIDE, outputs.shape[0], states, outputs
 
 
 @cached_njit
-def respond(A, C, K, L, present, into_state, into_output, response):
-    """Write the response of the innovations of the steady predictor to additions to state and output.
+def respond(A, C, K, L, present, into_state, into_output):
+    """Return the response (N, l, d) of the innovations of the steady predictor to additions to state and output.
 
     Args:
         A: (1, n, n), or (N, n, n) of every sample.
@@ -77,10 +72,9 @@ def respond(A, C, K, L, present, into_state, into_output, response):
         present: (N, l) whether there is a reading; a missing one is not used for correction.
         into_state: (N, n, d) added to x(k).
         into_output: (N, l, d) added to y(k).
-        response: (N, l, d) written.
     """
     n, l, d = A.shape[1], C.shape[0], into_state.shape[2]  # noqa: E741
-    x, later = np.zeros((n, d)), np.zeros((n, d))
+    x, later, response = np.zeros((n, d)), np.zeros((n, d)), np.empty(into_output.shape)
     for k in range(present.shape[0]):
         t = k if A.shape[0] > 1 else 0
         for p in range(d):
@@ -99,6 +93,7 @@ def respond(A, C, K, L, present, into_state, into_output, response):
                     later[i, p] += (-K[i, o] if present[k, o] else L[i, o]) * response[k, o, p]
             for i in range(n):
                 x[i, p] = later[i, p]
+    return response
 
 
 @cached_njit
@@ -113,13 +108,18 @@ def add_product(M, v, out):
 
 
 @cached_njit
-def predict(A, C, K, root, drive, y, direct, x, r):
-    """Run the steady predictor; write states x (T + 1, n) from x[0] on and whitened innovations r (T, l)."""
+def predict(A, C, K, root, drive, y, start):
+    """Run the steady predictor from a state (n,); return states (T + 1, n) and whitened innovations (T, l).
+
+    y (T, l) are the readings less what inputs and constants add to them, drive (T, n) what these, the feedback and the
+    readings themselves add to the next state.
+    """
     n, l = A.shape[0], C.shape[0]  # noqa: E741
-    e = np.empty(l)
+    x, r, e = np.empty((y.shape[0] + 1, n)), np.empty(y.shape), np.empty(l)
+    x[0] = start
     for k in range(y.shape[0]):
         for o in range(l):
-            e[o] = y[k, o] - direct[k, o]
+            e[o] = y[k, o]
             for i in range(n):
                 e[o] -= C[o, i] * x[k, i]
         for o in range(l):
@@ -133,3 +133,4 @@ def predict(A, C, K, root, drive, y, direct, x, r):
             for o in range(l):
                 total += K[i, o] * e[o]
             x[k + 1, i] = total
+    return x, r

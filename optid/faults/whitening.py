@@ -86,11 +86,9 @@ class Predictor:
         from optid.faults import kernels
 
         shown = np.ones(into_output.shape[:2], dtype=bool) if present is None else present
-        response = np.empty(into_output.shape)
         followed = self.A[None] if A is None else A
         A, C, K, L, state, output = map(compact, (followed, self.C, self.K, self.L, into_state, into_output))
-        kernels.respond(A, C, K, L, shown, state, output, response)
-        return response
+        return kernels.respond(A, C, K, L, shown, state, output)
 
     def jumps(self, onset: int, present: Array) -> Array:
         """Return the response (N, l, n) of the innovations of readings (N, l) to unit jumps of the state at `onset`."""

@@ -346,8 +346,8 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     settings = {"accuracy": accuracy, "time_limit": time_limit, "isolate": isolate,
                 "prove": prove and not _stand_in(arguments),
                 "options": dict(solver_options or {})}
-    return _finished(data, name, arguments, findings, problem, solvers, {**settings, "solver": solver}, raises,
-                     started)
+    outcome = _solved(problem, solvers, settings, raises, started)
+    return _finished(outcome, data, name, arguments, findings, {**settings, "solver": solver}, started)
 
 
 @one_thread
@@ -366,20 +366,26 @@ def resolve(fit: Fit, weights: Mapping[str, float], *, solver: Any = "auto", acc
             raise StructureError(f"problem {problem.name!r} has no weight {name!r}. {nearest(name, problem.weights)}")
     again = problem.under_weights(**{name: float(value) for name, value in weights.items()})
     again = again.beginning({name: fit.solution.values[name] for name in again.start})
-    return _finished(fit.data, fit.formulation, {**fit.arguments, **weights}, [], again, Solvers(solver),
-                     {"accuracy": accuracy, "solver": solver}, raises, started)
+    outcome = _solved(again, Solvers(solver), {"accuracy": accuracy}, raises, started)
+    return _finished(outcome, fit.data, fit.formulation, {**fit.arguments, **weights}, [],
+                     {"accuracy": accuracy, "solver": solver}, started)
 
 
-def _finished(data: Data | Stream, name: str, arguments: Mapping[str, Any], findings: list[str],
-              problem: Program | Procedure, solvers: Solvers, settings: Mapping[str, Any], raises: bool,
-              started: float) -> Fit:
+def _solved(problem: Program | Problem | Procedure, solvers: Solvers, settings: Mapping[str, Any], raises: bool,
+            started: float) -> Outcome:
+    """Solve a problem that took the time since ``started`` to build."""
     built_at = time.perf_counter()
-    outcome = run(problem, solvers, **{word: value for word, value in settings.items() if word != "solver"})
+    outcome = run(problem, solvers, **settings)
     times = outcome.solution.times
     times = replace(times, build=times.build + built_at - started)
     outcome = replace(outcome, solution=replace(outcome.solution, times=times))
     if raises:
         _raise_failure(outcome)
+    return outcome
+
+
+def _finished(outcome: Outcome, data: Data | Stream, name: str, arguments: Mapping[str, Any], findings: list[str],
+              settings: Mapping[str, Any], started: float) -> Fit:
     _in_raw_units(outcome.model, data)  # a model without an equivalent in raw units is refused here
     findings = findings + _violated(outcome.model, arguments.get("constraints", ()))
     compressed, words = outcome.program.compressed, ("rows", "candidates", "condition", "method")

@@ -21,8 +21,10 @@ FORGOTTEN = 1e-150  # derivatives of the state below this size count as zero
 
 
 @cached_njit
-def evaluate(kind, low, high, outside, cells, angular, numbers, v):
-    """Return (f(v), f'(v), whether v was refused) of a function: its entries of `Tables`."""
+def value_and_slope(tables, j, v):
+    """Return (f_j(v), f_j'(v), whether v was refused)."""
+    kind, low, high, outside = tables.kind[j], tables.low[j], tables.high[j], tables.outside[j]
+    cells, angular, numbers = tables.cells[j], tables.rate[j], tables.numbers[j]
     slack = 1e-12 * max(abs(low), abs(high))
     beyond = v < low - slack or v > high + slack
     refused = beyond and outside == 2
@@ -66,21 +68,11 @@ def evaluate(kind, low, high, outside, cells, angular, numbers, v):
 
 
 @cached_njit
-def value_and_slope(tables, j, v):
-    """Return (f_j(v), f_j'(v), whether v was refused)."""
-    return evaluate(tables.kind[j], tables.low[j], tables.high[j], tables.outside[j], tables.cells[j], tables.rate[j],
-                    tables.numbers[j], v)
-
-
-@cached_njit
 def slopes(tables, first, z, found):
     """Write the slopes (T, k) of the k functions of a table behind the first ones at arguments z (T, k)."""
-    kind, low, high, outside, cells, rate, numbers = tables
     for k in range(z.shape[0]):
         for j in range(z.shape[1]):
-            c = first + j
-            found[k, j] = evaluate(
-                kind[c], low[c], high[c], outside[c], cells[c], rate[c], numbers[c], z[k, j])[1]
+            found[k, j] = value_and_slope(tables, first + j, z[k, j])[1]
 
 
 @cached_njit
@@ -93,7 +85,7 @@ def march(parts, stretch, x, outputs, states):
     A, C, E, L, K, output_of = parts.A, parts.C, parts.E, parts.L, parts.K, parts.output_of
     Ez, Fz, Cz = parts.Ez, parts.Fz, parts.Cz
     drive, direct, feedback, measured, inward, least, most = stretch
-    kind, low, high, outside, cells, rate, numbers = parts.tables
+    tables = parts.tables
     n, l, s, latent = A.shape[0], C.shape[0], E.shape[1], Ez.shape[1]  # noqa: E741
     later, w = np.empty(n), np.empty(latent)
     for k in range(measured.shape[0]):
@@ -101,8 +93,7 @@ def march(parts, stretch, x, outputs, states):
             z = inward[k, j]
             for i in range(n):
                 z += Cz[j, i] * x[i]
-            c = s + j
-            w[j], _, refused = evaluate(kind[c], low[c], high[c], outside[c], cells[c], rate[c], numbers[c], z)
+            w[j], _, refused = value_and_slope(tables, s + j, z)
             if refused:
                 return REFUSED, k
         for i in range(n):
@@ -128,8 +119,7 @@ def march(parts, stretch, x, outputs, states):
         for j in range(s):
             fed = feedback[k, j]
             if np.isnan(fed):
-                fed, _, refused = evaluate(
-                    kind[j], low[j], high[j], outside[j], cells[j], rate[j], numbers[j], outputs[k, output_of[j]])
+                fed, _, refused = value_and_slope(tables, j, outputs[k, output_of[j]])
                 if refused:
                     return REFUSED, k
             for i in range(n):

@@ -1,11 +1,21 @@
 """Compiled recursions of the simulated plants: the next sample needs the last, so no array expression serves."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from optid.arrays import Array
 from optid.kernel_cache import cached_njit
 
 PENDULUM, VAN_DER_POL, TANKS = 0, 1, 2
+
+
+class IntegrationScheme(NamedTuple):
+    """Steps of equal length in a sample: the classical Runge-Kutta method has 4 stages, Euler's 1."""
+
+    stages: int
+    substeps: int
+    step: float  # s
 
 
 @cached_njit
@@ -27,15 +37,14 @@ def _rates(plant: int, x: Array, drive: float, v: float, p: Array, out: Array) -
 
 
 @cached_njit
-def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array, dt: float, substeps: int,
-              stages: int) -> Array:
+def integrate(plant: int, drive: Array, v: Array, w: Array, x0: Array, p: Array, scheme: IntegrationScheme) -> Array:
     """Return the states (N, n) of `PENDULUM`, `VAN_DER_POL` or `TANKS` at the sampling instants, from x0 (n,).
 
-    The classical Runge-Kutta method has 4 stages, Euler's 1. The drive (N,) and the measurement noise v (N,), which is
-    fed back, are held over a sample; the process noise w (N, n) is added at its end. The parameters p are those of
-    `_rates`.
+    The drive (N,) and the measurement noise v (N,), which is fed back, are held over a sample; the process noise w
+    (N, n) is added at its end. The parameters p are those of `_rates`.
     """
-    n, h = x0.size, dt / substeps
+    stages, substeps, h = scheme
+    n = x0.size
     states = np.empty((drive.size, n))
     x, at, rate, step = np.empty(n), np.empty(n), np.zeros(n), np.empty(n)
     for i in range(n):

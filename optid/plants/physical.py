@@ -5,7 +5,7 @@ The arguments that they share are those of `optid.plants`.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +16,9 @@ from optid.data.record import Data
 from optid.errors import StructureError, nearest
 from optid.models.equations import Equations
 from optid.plants.sampling import as_input, as_state, check_bounded, check_parameters, gaussian
+
+if TYPE_CHECKING:
+    from optid.plants.kernels import IntegrationScheme
 
 STAGES = {"euler": 1, "rk4": 4}  # stages of the methods of integration
 
@@ -99,18 +102,17 @@ class ReactionWheelPendulum:
         """Return angle (rad), rate (rad/s) and wheel speed (rad/s), (N, 3), under commands (N,) held over a sample."""
         from optid.plants.kernels import PENDULUM, integrate
 
-        check_parameters(dt=dt, substeps=substeps)
+        scheme = _scheme(dt, substeps)
         torque = self.torque(as_input(u, 1)[:, 0])
         quiet = np.zeros((len(torque), 3))
-        states = integrate(PENDULUM, torque, quiet[:, 0], quiet, as_state(x0, 3), self.coefficients, float(dt),
-                           int(substeps), 4)
+        states = integrate(PENDULUM, torque, quiet[:, 0], quiet, as_state(x0, 3), self.coefficients, scheme)
         check_bounded(states, "pendulum")
         return states
 
 
 def pendulum(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement: float = 0.2,
              quantum: float = 2 * np.pi / 4000, dt: float = 0.02, substeps: int = 4,
-             x0: ArrayLike = (0.0, 0.0, 0.0), plant: ReactionWheelPendulum | None = None) -> Data:
+             x0: ArrayLike = (0.0, 0.0, 0.0)) -> Data:
     """Simulate the reaction wheel pendulum: command to angle (rad, from an encoder) and wheel speed (rad/s).
 
     Further arguments:
@@ -118,11 +120,10 @@ def pendulum(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement: 
         measurement: standard deviation of the noise on the speed, rad/s.
         quantum: resolution of the encoder, rad; 0 for none.
         x0: angle, rate and wheel speed at the first sample.
-        plant: the parameters; those of the class when not given.
     """
     u = as_input(u, 1)
     check_parameters(positive=False, quantum=quantum)
-    states = (plant or ReactionWheelPendulum()).states(u, dt=dt, substeps=substeps, x0=x0)
+    states = ReactionWheelPendulum().states(u, dt=dt, substeps=substeps, x0=x0)
     angle = np.round(states[:, 0] / quantum) * quantum if quantum else states[:, 0]
     speed = states[:, 2] + gaussian(np.random.default_rng(seed), len(u), 1, measurement, 0.0, "measurement")[:, 0]
     return Data(u, np.column_stack([angle, speed]), dt, inputs="command", outputs=["angle", "speed"],
@@ -171,24 +172,21 @@ def van_der_pol(u: ArrayLike, seed: int | np.random.Generator = 0, *, process: f
     from optid.plants.kernels import VAN_DER_POL, integrate
 
     u = as_input(u, 1)
-    check_parameters(dt=dt, substeps=substeps)
-    one_of("method", method, tuple(STAGES))
+    scheme = _scheme(dt, substeps, method)
     rng = np.random.default_rng(seed)
     w = gaussian(rng, len(u), 2, process, 0.0, "process")
     v = gaussian(rng, len(u), 1, measurement, colour, "measurement")[:, 0]
-    states = integrate(VAN_DER_POL, van_der_pol_drive(u[:, 0]), v, w, as_state(x0, 2), np.array([float(eps)]),
-                       float(dt), int(substeps) if method == "rk4" else 1, STAGES[method])
+    states = integrate(VAN_DER_POL, van_der_pol_drive(u[:, 0]), v, w, as_state(x0, 2), np.array([float(eps)]), scheme)
     check_bounded(states, "Van der Pol oscillator")
     return Data(u, states[:, 0] + v, dt, name="vanderpol")
 
 
 def two_tanks(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement: float = 0.0, pump: float = 0.4,
-              upper: float = 0.3, lower: float = 0.25, dt: float = 1.0, substeps: int = 10,
-              x0: ArrayLike = (1.0, 1.0)) -> Data:
+              upper: float = 0.3, lower: float = 0.25, dt: float = 1.0) -> Data:
     """Simulate two tanks, the upper one emptying into the lower one; the level of the lower one is measured.
 
-    h1' = pump u - upper sqrt h1, h2' = upper sqrt h1 - lower sqrt h2, y = h2 + v (Torricelli's law). `TWO_TANKS` are
-    these equations with the parameters unknown.
+    h1' = pump u - upper sqrt h1, h2' = upper sqrt h1 - lower sqrt h2, y = h2 + v (Torricelli's law), from levels of 1.
+    `TWO_TANKS` are these equations with the parameters unknown.
 
     Further arguments:
         u: (N,) voltage of the pump, held over a sample.
@@ -196,18 +194,27 @@ def two_tanks(u: ArrayLike, seed: int | np.random.Generator = 0, *, measurement:
         pump: flow per volt.
         upper: coefficient of the outlet of the upper tank.
         lower: coefficient of the outlet of the lower tank.
-        x0: levels at the first sample.
     """
     from optid.plants.kernels import TANKS, integrate
 
     u = as_input(u, 1)
-    check_parameters(dt=dt, substeps=substeps, pump=pump, upper=upper, lower=lower)
+    scheme = _scheme(dt, substeps=10)
+    check_parameters(pump=pump, upper=upper, lower=lower)
     v = gaussian(np.random.default_rng(seed), len(u), 1, measurement, 0.0, "measurement")[:, 0]
     still = np.zeros(len(u)), np.zeros((len(u), 2))
-    levels = integrate(TANKS, u[:, 0], *still, as_state(x0, 2), np.array([pump, upper, lower]), float(dt),
-                       int(substeps), STAGES["rk4"])
+    levels = integrate(TANKS, u[:, 0], *still, np.ones(2), np.array([pump, upper, lower]), scheme)
     check_bounded(levels, "pair of tanks")
     return Data(u, levels[:, 1] + v, dt, name="two_tanks")
+
+
+def _scheme(dt: float, substeps: int, method: str = "rk4") -> "IntegrationScheme":
+    """Return the scheme of a method of `STAGES`; one of Euler takes one step per sample."""
+    from optid.plants.kernels import IntegrationScheme
+
+    check_parameters(dt=dt, substeps=substeps)
+    one_of("method", method, tuple(STAGES))
+    count = int(substeps) if method == "rk4" else 1
+    return IntegrationScheme(STAGES[method], count, float(dt) / count)
 
 
 def _torricelli(v: Mapping[str, Any]) -> dict[str, Any]:

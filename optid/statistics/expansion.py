@@ -17,7 +17,7 @@ from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError
 from optid.statistics.factors import ROUNDING, root_of_rows
-from optid.statistics.hankel import hankel_statistics
+from optid.statistics.hankel import RegressionRows, hankel_statistics
 
 # part of a function outside the span of {1, y} and of the other functions, relative to it, that is not rounding
 SMALLEST = 1e-6
@@ -101,8 +101,8 @@ class Expansion:
         return np.concatenate(parts, axis=1)
 
     def positions(self, at: Callable[..., NDArray[np.intp]], instruments: str, alpha: int, offset: bool = True
-                  ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-        """Return the positions of instruments, regressors and outputs among the first 2 alpha samples of the windows.
+                  ) -> RegressionRows:
+        """Return the rows of instruments, regressors and outputs among the first 2 alpha samples of the windows.
 
         Past and future have alpha block rows each; the last one of the feedback functions never reaches the future
         outputs and is left out. ``at`` is that of `optid.statistics.hankel.HankelStatistics`. Instruments are "past"
@@ -118,7 +118,7 @@ class Expansion:
         if instruments.endswith("past"):
             z += [at(self.zeta, past), at(self.y, past)]
         phi = [one, at(self.eta, future), at(self.zeta, future[:-1])]
-        return np.concatenate(z), np.concatenate(phi), at(self.y, future)
+        return RegressionRows(np.concatenate(z), np.concatenate(phi), at(self.y, future))
 
     def block_rows(self, records: Sequence[Array], nx: int | None, *, spans: int = 2, per_row: float = 2.0,
                    least: int | None = None) -> int:

@@ -8,7 +8,7 @@ experiments, chunks and workers.
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,14 @@ from optid.statistics.sums import Factor, Sums
 Expand = Callable[[Array], Array]  # from raw channels (T, c) to signals (T, d), sample by sample
 # samples expanded at a time: they stay in the processor's cache. Eight of these chunks are summed up at a time
 CHUNK = 4096
+
+
+class RegressionRows(NamedTuple):
+    """Positions of the rows of a regression with instruments (`HankelStatistics.at`; 0 is the constant)."""
+
+    instruments: NDArray[np.intp]
+    regressors: NDArray[np.intp]
+    outputs: NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,8 @@ Compiled at the first call and cached on disk. Every function is single threaded
 the machine. Indices are unsigned: signed ones are tested for counting from the end, which takes half of the time.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,14 +17,21 @@ unsigned = np.uintp
 ONE = unsigned(1)
 
 
-@cached_njit
-def local_by_local(first: Indices, weights: Array, other: Indices, others: Array, start: int, stop: int, lag: int,
-                   out: Array) -> None:
-    """Add sum_t g(t) h(t - lag - d)^T to out[:, d, :] for samples start <= t < stop of two local families g and h.
+class LocalFamily(NamedTuple):
+    """Functions of which at most s neighbours differ from zero at any sample."""
 
-    A family has the position (T,) of its first function and its values (T, s) from there on; every t - lag - d must lie
-    in the arrays. out is (functions of g, differences, functions of h).
+    first: Indices  # (T,) position of the first of them
+    weights: Array  # (T, s) their values
+
+
+@cached_njit
+def local_by_local(g: LocalFamily, h: LocalFamily, start: int, stop: int, lag: int, out: Array) -> None:
+    """Add sum_t g(t) h(t - lag - d)^T to out[:, d, :] for samples start <= t < stop.
+
+    Every t - lag - d must lie in the arrays. out is (functions of g, differences, functions of h).
     """
+    first, weights = g
+    other, others = h
     if weights.shape[1] == 2 and others.shape[1] == 2:  # hats: unrolled, more than twice as fast
         for t in range(unsigned(start), unsigned(stop)):
             left, right, row = weights[t, 0], weights[t, 1], unsigned(first[t])
@@ -47,11 +56,12 @@ def local_by_local(first: Indices, weights: Array, other: Indices, others: Array
 
 
 @cached_njit
-def local_by_dense(first: Indices, weights: Array, flat: Array, step: int, out: Array) -> None:
-    """Add w(t) * flat[t * step : t * step + width] to the rows of out (functions, width) of a local family.
+def local_by_dense(g: LocalFamily, flat: Array, step: int, out: Array) -> None:
+    """Add g(t) * flat[t * step : t * step + width] to the rows of out (functions of g, width).
 
-    The family is given as in `local_by_local`, flat as the samples of ``step`` dense signals, one after the other.
+    The samples of ``step`` dense signals are one after the other in ``flat``.
     """
+    first, weights = g
     if weights.shape[1] == 2:
         for t in range(unsigned(first.size)):
             start, left, right, row = t * unsigned(step), weights[t, 0], weights[t, 1], unsigned(first[t])

@@ -54,9 +54,11 @@ def lagged_products(g: Signals, h: Signals, lags: range, reach: int) -> Array:
     sums = np.zeros((g.size, len(lags), h.size))
     if not h.local:  # the values of h at all these lags are neighbours in memory, the oldest first
         windows = h.weights.reshape(-1)[(start - lags[-1]) * h.size :]
-        kernels.local_by_dense(g.first[start:stop], g.weights[start:stop], windows, h.size, sums.reshape(g.size, -1))
+        inner = kernels.LocalFamily(g.first[start:stop], g.weights[start:stop])
+        kernels.local_by_dense(inner, windows, h.size, sums.reshape(g.size, -1))
         return sums[:, ::-1]
-    kernels.local_by_local(g.first, g.weights, h.first, h.weights, start, stop, lags[0], sums)
+    families = (kernels.LocalFamily(one.first, one.weights) for one in (g, h))
+    kernels.local_by_local(*families, start, stop, lags[0], sums)
     return sums
 
 

@@ -74,10 +74,11 @@ def cells(study: Study) -> list[Cell]:
         contents = [content_hash(entry) for entry in entries]
     except OSError as error:  # it was there when the data were checked
         raise StudyError(f"study {study.name!r}: {error.filename} cannot be read: {error.strerror}") from error
-    found = [_cell(study, entry, content, record, formulation, solver, accuracy, repetition)
+    found = [replace(cell, repetition=repetition)
              for entry, content in zip(entries, contents) for record in _records(entry, study.seeds)
              for formulation in study.formulations if formulation.is_for(entry)
              for solver in study.solvers for accuracy in solver.accuracy or study.accuracy
+             for cell in [_cell(study, entry, content, record, formulation, solver, accuracy)]
              for repetition in range(study.repetitions)]
     seen: dict[tuple[str, int], Cell] = {}
     for cell in found:
@@ -151,7 +152,8 @@ def _records(entry: DataEntry, seeds: tuple[int, ...]) -> Iterable[_Simulated]:
 
 
 def _cell(study: Study, entry: DataEntry, content: str, record: _Simulated, formulation: FormulationEntry,
-          solver: SolverEntry, accuracy: float, repetition: int) -> Cell:
+          solver: SolverEntry, accuracy: float) -> Cell:
+    """Return the first repetition of a cell."""
     samples, noise, seed = record
     determined = {
         "key": KEY_VERSION,
@@ -165,7 +167,7 @@ def _cell(study: Study, entry: DataEntry, content: str, record: _Simulated, form
     }
     text = json.dumps(determined, sort_keys=True, separators=(",", ":"), default=str)
     return Cell(
-        key=hashlib.sha256(text.encode()).hexdigest(), repetition=repetition, study=study.name, data=entry.name,
+        key=hashlib.sha256(text.encode()).hexdigest(), repetition=0, study=study.name, data=entry.name,
         formulation=formulation.name, solver=solver.name, data_source=entry, data_hash=content, samples=samples,
         noise=noise, seed=seed, formulation_name=formulation.formulation, options=dict(formulation.options),
         constraints=formulation.constraints, solver_name=solver.solver, solver_options=dict(solver.options),

@@ -209,7 +209,7 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
 
 def noise_test(
     found: Dictionary, whitened: Whitened, *, onset: int = 0, false_alarm: float = 0.01, draws: int = 2000,
-    seed: int | None = 0, free_start: bool = True, search: NoiseSearch | None = None, healthy: Array | None = None,
+    search: NoiseSearch | None = None, healthy: Array | None = None,
 ) -> NoiseTest:
     """Test every place for more noise by the exact likelihood.
 
@@ -219,10 +219,8 @@ def noise_test(
         onset: sample from which the noise has increased.
         false_alarm: probability of an alarm of a healthy plant.
         draws: simulated healthy windows behind the p-value.
-        seed: of the simulation.
-        free_start: as in `noise_search`.
-        search: from `noise_search` for a window like this one.
-        healthy: from its `healthy`, instead of a simulation.
+        search: from `noise_search` for a window like this one; by default for an unknown initial state.
+        healthy: from its `healthy`, instead of a simulation from the seed 0.
 
     Raises:
         DataError: innovations that are not finite, or too few draws for so rare an alarm.
@@ -234,8 +232,8 @@ def noise_test(
             f"{draws} simulated windows cannot support a false alarm in {1 / false_alarm:.3g}: use at least "
             f"{int(np.ceil(10 / false_alarm))}, or a higher probability.")
     check_window(found.model, whitened, "The noise test", onset, LONGEST)
-    prepared = noise_search(found, whitened, onset=onset, free_start=free_start) if search is None else search
-    levels = prepared.healthy(draws, seed) if healthy is None else healthy
+    prepared = noise_search(found, whitened, onset=onset) if search is None else search
+    levels = prepared.healthy(draws, 0) if healthy is None else healthy
     window = whitened.r.reshape(1, -1)
     rho, gains = prepared.gains(window)
     clean = prepared.cleaned(window)[0]

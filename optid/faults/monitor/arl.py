@@ -19,8 +19,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, StructureError
-from optid.faults.monitor.columns import Columns, Window
-from optid.faults.whitening import Predictor
+from optid.faults.monitor.columns import Window
 
 ALARMS = 60
 """False alarms of a simulation by default: their rate is then known to 13 %."""
@@ -89,15 +88,13 @@ class Calibration:
 
 
 def calibrate(
-    columns: Columns, steady: Predictor, window: int, f: Array, arl0: float, *, samples: int | None = None,
-    seed: int | None = 0, extrapolate: bool = False, effect: Array | None = None,
+    search: Window, f: Array, arl0: float, *, samples: int | None = None, seed: int | None = 0,
+    extrapolate: bool = False, effect: Array | None = None,
 ) -> Calibration:
     """Return the thresholds of a search; errors as of `Monitor`.
 
     Args:
-        columns: of its candidates.
-        steady: the predictor behind the innovations.
-        window: samples of the window.
+        search: its candidates, its predictor and its length.
         f: (T, r) functions of the input of a healthy plant, repeated as often as needed.
         arl0: samples between false alarms.
         samples: samples to simulate; enough for `ALARMS` false alarms by default, `LONGEST` at most.
@@ -105,6 +102,7 @@ def calibrate(
         extrapolate: whether the tail may be extrapolated where the simulation is too short.
         effect: of uncertain parameters on the innovations along f, as of `parameter_effect`.
     """
+    columns, steady, window = search.columns, search.steady, search.length
     if not (np.isfinite(arl0) and arl0 >= window):
         raise StructureError(f"arl0={arl0!r}: it must be at least the window, {window} samples.")
     wanted = int(min(max(ALARMS * arl0, 200 * window), LONGEST)) if samples is None else int(samples)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optid.arrays import Array, compact
-from optid.faults.monitor.search_kernel import DRIFT, DRIVEN, JUMP, LASTING, search
+from optid.faults.monitor.search_kernel import DRIFT, DRIVEN, JUMP, LASTING, SearchMemory, Signatures, search
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
@@ -101,11 +101,11 @@ class Window:
 
     Attributes:
         columns, length, steady: the candidates, the samples W, the predictor.
-        xi, b, gram, grown, clock: memory of the search.
+        xi, b, gram, grown, clock, peak: memory of the search.
         clean: (1,) samples searched by the steady predictor since another one was used.
         whitened: (W, l) innovations, by sample.
         readings: (W,) numbers of readings, by sample.
-        statistic, peak, weight: of the last sample (C,).
+        statistic, weight: of the last sample (C,).
     """
 
     KEPT = "xi", "b", "grown", "gram", "whitened", "readings", "statistic", "peak", "weight", "clock", "clean"
@@ -119,14 +119,17 @@ class Window:
         self.xi, self.b, self.gram = (np.zeros((*shape, length)) for shape in ((D, room), (D,), (pairs,)))
         self.grown, self.whitened, self.readings = np.zeros(length), np.zeros((length, l)), np.zeros(length)
         self.peak, self.clock, self.clean = (np.zeros(size, dtype=np.int64) for size in (C, 1, 1))
-        self.work = tuple(np.zeros((*shape, length)) for shape in ((D, l), (pairs,), (D,)))
-        self.table = tuple(np.concatenate([part, part], axis=-1) for part in self.work)
+        self.work = Signatures._make([np.zeros((*shape, length)) for shape in ((D, l), (pairs,), (D,))])
+        self.table = self._tabulate()
         # every onset is followed through the steady predictor once, the oldest first; only losses differ later
         still = tuple(np.zeros((length, len(columns.losses), size)) for size in (len(steady.A), l))
         self._search(self.matrices, still, np.zeros((length, l)), np.full(C, np.inf), False)
-        self.table = tuple(np.concatenate([part, part], axis=-1) for part in self.work)
+        self.table = self._tabulate()
         self.deviations, self.products = self.xi[:, : len(steady.A)].copy(), self.gram.copy()
         self.restart()
+
+    def _tabulate(self) -> Signatures:
+        return Signatures._make([np.concatenate([part, part], axis=-1) for part in self.work])
 
     def restart(self) -> None:
         """Discard all onsets before the next sample."""
@@ -136,9 +139,8 @@ class Window:
 
     def _search(self, matrices: Matrices, signals: tuple[Array, ...], r: Array, limit: Array, tabled: bool
                 ) -> tuple[int, Array, Array]:
-        statistic, weight = np.empty((2, len(r), len(limit)))
-        done = search(matrices, self.columns.arrays, signals, r, limit, tabled, self.table, self.work,
-                      (self.xi, self.b, self.gram, self.grown, self.clock), (statistic, self.peak, weight))
+        memory = SearchMemory(self.table, self.work, self.xi, self.b, self.gram, self.grown, self.clock, self.peak)
+        done, statistic, weight = search(matrices, self.columns.arrays, signals, r, limit, tabled, memory)
         return done, statistic[:done], weight[:done]
 
     def _leave_tables(self) -> None:

@@ -159,7 +159,7 @@ class Monitor:
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
 
     def _simulated(self, f: Array, effect: Array | None, arl0: float, **how: Any) -> Calibration:
-        c, steady = self.columns, self.dictionary.predictor
+        c = self.columns
         key = hashlib.sha256(repr((self.labels, float(arl0), self.seed, self.window, how)).encode())
         losses = [part for pair in c.losses for part in pair]
         for part in (f, np.array([]) if effect is None else effect, c.into_state, c.into_output, c.course, *losses,
@@ -167,7 +167,7 @@ class Monitor:
             key.update(np.ascontiguousarray(part).tobytes())
         name = key.hexdigest()
         if name not in _KNOWN:
-            _KNOWN[name] = calibrate(c, steady, self.window, f, arl0, seed=self.seed, effect=effect, **how)
+            _KNOWN[name] = calibrate(self.search, f, arl0, seed=self.seed, effect=effect, **how)
         return _KNOWN[name]
 
     def _given(self, thresholds: Any, arl0: float) -> Calibration:

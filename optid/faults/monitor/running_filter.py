@@ -99,11 +99,8 @@ class RunningFilter:
         if self.held.any():
             for target, added in zip((drive, direct), self.additions(f)):
                 target += added
-        x, r = np.empty((len(y) + 1, model.nx)), np.empty((len(y), model.l))
-        x[0] = self.x
         A, C, K, root = map(compact, (model.A, model.C, steady.K, steady.root))
-        predict(A, C, K, root, drive, y, direct, x, r)
-        return x, r
+        return predict(A, C, K, root, drive, y - direct, self.x)
 
     def step(self, f: Array, fed: Any, y: Array, unsure: np.ndarray) -> tuple[Array, Matrices]:
         """Process one sample; return the whitened innovation (l,) and the matrices of the search.
@@ -185,21 +182,23 @@ class RunningFilter:
         self.P = self.P + moved @ covariance @ moved.T
         self.certain = False
         if not jump:
-            self._append(number, own, sizes, covariance, moved, float(drifting), course)
+            self._append([Direction(number, j, float(drifting), course) for j in range(own.start, own.stop)], sizes,
+                         covariance, moved)
         if drifting:  # an error of the onset leaves a constant
             self.P[n + q :, n + q :] *= 4.0
             guess = np.diag(np.diag(covariance)) * (2.0 * grown) ** 2
             constant = np.vstack([self._constant(own, grown), np.zeros((q + len(sizes), len(sizes)))])
             self.P = self.P + constant @ guess @ constant.T
-            self._append(number, own, np.zeros(len(sizes)), guess, constant, 0.0, 1.0)
+            self._append([Direction(number, j, 0.0, 1.0) for j in range(own.start, own.stop)], np.zeros(len(sizes)),
+                         guess, constant)
         return energy
 
-    def _append(self, number: int, own: slice, sizes: Array, covariance: Array, moved: Array, growth: float,
-                grown: float) -> None:
+    def _append(self, directions: list[Direction], sizes: Array, covariance: Array, moved: Array) -> None:
+        """Carry d more constants: expected sizes, covariance (d, d), effect (n + q, d) on the state and the others."""
         cross = moved @ covariance
         self.P = np.block([[self.P, cross], [cross.T, covariance]])
         self.x = np.concatenate([self.x, sizes])
-        self.directions += [Direction(number, j, growth, grown) for j in range(own.start, own.stop)]
+        self.directions += directions
 
     def _constant(self, own: slice, count: int) -> Array:
         """Effect of constants in the place of columns on the state after some samples of the steady predictor."""

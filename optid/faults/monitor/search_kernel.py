@@ -5,8 +5,11 @@ window. The arrays are ring buffers with the onset as last index, so that every 
 contiguous numbers; the onsets in use are the first ones of the ring.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
+from optid.arrays import Array
 from optid.kernel_cache import cached_njit
 from optid.models.state_kernels import value_and_slope
 
@@ -15,6 +18,27 @@ LASTING, DRIFT, JUMP, DRIVEN = range(4)
 
 DEPENDENT = 1e-9
 """A column with less than this share of its energy beside the columns before it counts as dependent."""
+
+
+class Signatures(NamedTuple):
+    """Whitened signatures of D columns for W onsets, or for 2 W: the oldest onset first, twice."""
+
+    lines: Array  # (D, l, W)
+    factors: Array  # (pairs, W) Cholesky factors of the products of the columns of a candidate
+    inverses: Array  # (D, W) inverses of the diagonals of the factors, zero for a dependent column
+
+
+class SearchMemory(NamedTuple):
+    """What a running search keeps from one sample to the next; the search changes all but the table."""
+
+    table: Signatures  # (..., 2 W) of the steady predictor
+    work: Signatures  # (..., W) of the window, for the columns that are propagated
+    deviations: Array  # (D, room, W)
+    correlations: Array  # (D, W) of the columns with the innovations
+    products: Array  # (pairs, W) of the columns of a candidate
+    since: Array  # (W,) samples since the onset, the first counted
+    clock: np.ndarray  # (1,) samples searched
+    peak: np.ndarray  # (C,) samples since the best onset of the last sample, 0 without one
 
 
 @cached_njit
@@ -41,8 +65,8 @@ def accumulate(v, source, target, count):
 
 
 @cached_njit(fastmath={"contract", "reassoc", "nsz"})
-def search(matrices, parts, signals, r, limit, tabled, table, work, memory, found):
-    """Search the windows that end with each of T samples, until one exceeds a limit; return the samples searched.
+def search(matrices, parts, signals, r, limit, tabled, memory):
+    """Search the windows that end with each of T samples, until one exceeds a limit.
 
     Args:
         matrices: of the predictor, carried faults included: transition (N, N), output (l, N), gain (N, l), which is
@@ -52,21 +76,19 @@ def search(matrices, parts, signals, r, limit, tabled, table, work, memory, foun
         r: (T, l) whitened innovations.
         limit: (C,) thresholds.
         tabled: whether the columns of candidates without a driven one are those of the table.
-        table: signatures (D, l, 2 W), Cholesky factors (pairs, 2 W) of the products of a candidate, and inverses
-            (D, 2 W) of their diagonals, zero for a dependent column; oldest onset first, twice.
-        work: the same of one window, for the propagated columns; changed.
-        memory: deviations (D, room, W), correlations with r (D, W), products of the columns of a candidate (pairs, W),
-            samples since the onset (W,), the first counted, and samples searched (1,); changed.
-        found: statistics (T, C), samples since the best onset of the last sample (C,), 0 without one, and the energy of
-            the last column of a candidate with a driven one beside the others in a whole window (T, C); written.
+        memory: a `SearchMemory`, changed.
+
+    Returns:
+        the samples searched, their statistics (T, C), and the energy (T, C) of the last column of a candidate with a
+        driven one beside the others in a whole window.
     """
     A, C, gain, root = matrices
     into_state, into_output, course, driven, moving, first, size, least = parts
     moving_state, moving_output = signals
+    table, work, xi, b, gram, grown, clock, peak = memory
     lines, all_factors, all_inverses = table
     sig, factors, inverses = work
-    xi, b, gram, grown, clock = memory
-    statistic, peak, weight = found
+    statistic, weight = np.empty((r.shape[0], size.size)), np.empty((r.shape[0], size.size))
     N, l, n, D, W = A.shape[0], C.shape[0], into_state.shape[1], xi.shape[0], xi.shape[2]  # noqa: E741
     raw, later, z, total = np.empty((l, W)), np.empty((N, W)), np.empty((D, W)), np.empty(W)
     for t in range(r.shape[0]):
@@ -175,5 +197,5 @@ def search(matrices, parts, signals, r, limit, tabled, table, work, memory, foun
             over = over or best > limit[c]
         clock[0] = k + 1
         if over:
-            return t + 1
-    return r.shape[0]
+            return t + 1, statistic, weight
+    return r.shape[0], statistic, weight

@@ -16,15 +16,16 @@ one window later. Open loop is assumed: under feedback inputs depend on sensor n
 
 from dataclasses import dataclass, field, replace
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array, check_integer, check_probability, one_of
 from optid.data.record import Data
 from optid.errors import DataError, RankError, StructureError
-from optid.identify.order.ranks import Positions, RankTest, lagged_covariances, moments_of_sum, rank_test
-from optid.statistics.hankel import HankelStatistics, hankel_statistics
+from optid.identify.order.ranks import RankTest, lagged_covariances, moments_of_sum, rank_test
+from optid.statistics.hankel import HankelStatistics, RegressionRows, hankel_statistics
 
 if TYPE_CHECKING:
     from optid.models.hammerstein_ss import HammersteinSS
@@ -36,6 +37,15 @@ STILL = 0.1  # smallest excitation, relative to the healthy record, below which 
 DROPPED = 1e-8  # eigenvalue of the scaled tested rows below which a direction is not excited and not tested
 QUIET = 1e-7  # residuals relative to the spread of the healthy output that count as rounding
 MARGIN = 3.0  # a test is conclusive where a healthy plant would exceed the threshold this many times
+
+
+class ChannelRegression(NamedTuple):
+    """The regression that tests a channel, as positions (`HankelStatistics.at`): are the coefficients of t zero?"""
+
+    name: str  # the channel, for instance "sensor:y1"
+    tested: NDArray[np.intp]  # t
+    others: NDArray[np.intp]  # o, the constant (0) among them
+    outputs: NDArray[np.intp]  # y
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,11 +229,13 @@ def hard_over_test(
     if window < least or hop < 1:
         raise StructureError(f"window={window}, hop={hop}: a window of at least {least} samples (20 per block row and "
                              "output) and a hop of at least 1 are needed.")
-    tests = _Tests(healthy, model, int(block_rows), instruments, level, order, white_sensors)
+    tests = _Tests(healthy, model, int(block_rows), instruments, level, order)
     found = tuple(tests.judge(record[start : start + window], (e, start, start + window))
                   for e, record in enumerate(tests.signals(data)) for start in range(0, len(record) - window + 1, hop))
     if not found:
         raise RankError(f"No experiment has the {window} samples of a window: shorten it or take fewer block rows.")
+    if not white_sensors:  # an autocorrelated output tells nothing
+        found = tuple(replace(verdict, moving=frozenset()) for verdict in found)
     return HardOver(found, tests.order, window, hop, tests.alpha, instruments, data.name)
 
 
@@ -231,12 +243,12 @@ class _Tests:
     """The tests of windows of 3 alpha samples of the signals [f(u) | y], compared with a healthy record."""
 
     def __init__(self, healthy: Data, model: "HammersteinSS | None", alpha: int, instruments: str, level: float,
-                 order: int | None, white_sensors: bool) -> None:
+                 order: int | None) -> None:
         if model is not None and model.feedback:
             raise StructureError("The model feeds outputs back: this test is for plants in open loop.")
         if model is not None and (model.inputs, model.outputs) != (healthy.inputs, healthy.outputs):
             raise DataError(f"the model has channels {', '.join((*model.inputs, *model.outputs))}, the record others.")
-        self.model, self.alpha, self.level, self.white_sensors = model, alpha, level, white_sensors
+        self.model, self.alpha, self.level = model, alpha, level
         self.input_of = range(healthy.m) if model is None else model.input_of
         places: list[Any] = np.split(np.arange(len(self.input_of) + healthy.l), [len(self.input_of)])
         self.u, self.y = places
@@ -245,9 +257,10 @@ class _Tests:
         statistics = hankel_statistics(self.signals(healthy), 3 * alpha, centre="mean")
         statistics.check()
         at, past, future = statistics.at, range(alpha), range(alpha, 2 * alpha)
-        self.inputs, self.future = at(self.u, range(2 * alpha)), at(self.y, future)
-        self.phi = np.r_[0, at(self.u, future)]
-        self.z = np.r_[0, self.inputs, at(self.y if instruments == "inputs+past" else [], past)]
+        self.inputs = at(self.u, range(2 * alpha))
+        self.regression = RegressionRows(
+            np.r_[0, self.inputs, at(self.y if instruments == "inputs+past" else [], past)],
+            np.r_[0, at(self.u, future)], at(self.y, future))
         mean = statistics.gram[0] / statistics.windows
         self.sizes = np.sqrt(np.maximum(np.diag(statistics.gram) / statistics.windows - mean**2, 0))
         for channel, size in zip((*(healthy.inputs[i] for i in self.input_of), *healthy.outputs), self.sizes[1:]):
@@ -258,7 +271,7 @@ class _Tests:
             raise RankError(f"the inputs of the healthy record do not excite {2 * alpha} block rows (smallest "
                             f"eigenvalue {self.excited:.1e}): use richer inputs or fewer block rows.")
         self.order = self.rank(statistics, LEVEL).order if order is None else order
-        self.outputs, self.healthy = coefficients(statistics, self.z, self.future), dict[str, Array]()
+        self.outputs, self.healthy = coefficients(statistics, self.regression), dict[str, Array]()
         rows, columns, _ = self.channel_tests(statistics)
         self.healthy = {test.name: test.coefficients for test in (*rows, *columns)}
 
@@ -283,8 +296,8 @@ class _Tests:
                 note = f"untestable: {error}"
             else:
                 order, note = test.order, test.reason
-                least = least_order(statistics, self.z, self.phi, self.outputs, test, self.order,
-                                    self.sizes[self.future])
+                least = least_order(statistics, self.regression, self.outputs, test, self.order,
+                                    self.sizes[self.regression.outputs])
         return WindowVerdict(*place, order, note, excitation, *self.channel_tests(statistics), least)
 
     def excitation(self, statistics: HankelStatistics) -> float:
@@ -295,8 +308,8 @@ class _Tests:
         return max(float(np.linalg.eigvalsh(covariance / np.outer(self.sizes[at], self.sizes[at]))[0]), 0.0)
 
     def rank(self, statistics: HankelStatistics, level: float) -> RankTest:
-        return rank_test(statistics, self.z, self.phi, self.future, rows=2 * self.alpha, level=level,
-                         largest=(self.alpha - 1) * len(self.y), scale=self.sizes[self.future])
+        return rank_test(statistics, self.regression, rows=2 * self.alpha, level=level,
+                         largest=(self.alpha - 1) * len(self.y), scale=self.sizes[self.regression.outputs])
 
     def channel_tests(self, statistics: HankelStatistics
                       ) -> tuple[tuple[ZeroTest, ...], tuple[ZeroTest, ...], frozenset[str]]:
@@ -304,37 +317,39 @@ class _Tests:
         alpha, at, rows, columns, moving = self.alpha, statistics.at, [], [], set()
         past, future, now, until = range(alpha), range(alpha, 2 * alpha), [alpha], range(alpha + 1)
 
-        def test(tested: Any, others: Any, y: Any, name: str, healthy: Array | None) -> ZeroTest:
-            return zero_test(statistics, tested, others, y, rows=2 * alpha, level=self.level, name=name,
-                             scale=self.sizes[y], healthy=healthy)
+        def test(regression: ChannelRegression, healthy: Array | None) -> ZeroTest:
+            return zero_test(statistics, regression, rows=2 * alpha, level=self.level,
+                             scale=self.sizes[regression.outputs], healthy=healthy)
 
         for s, name in zip(self.y, self.sensors):
-            rows.append(test(self.inputs, [0], at([s], future), name, self.healthy.get(name)))
-            own = test(at([s], past), np.r_[0, self.inputs], at([s], now), name, None)
-            moving |= {name} if self.white_sensors and own.statistic > own.threshold else set()
+            rows.append(test(ChannelRegression(name, self.inputs, np.array([0]), at([s], future)),
+                             self.healthy.get(name)))
+            own = test(ChannelRegression(name, at([s], past), np.r_[0, self.inputs], at([s], now)), None)
+            moving |= {name} if own.statistic > own.threshold else set()
         seen = [i for i, row in enumerate(rows) if not row.flat]  # a constant sensor shows no actuator
         for j, name in enumerate(self.actuators):
             if not seen:
                 columns.append(ZeroTest(name, healthy=0.0))
                 continue
             mine, healthy = np.equal(self.input_of, j), self.healthy[name][:, seen] if self.healthy else None
-            columns.append(test(at(self.u[mine], until), np.r_[0, at(self.u[~mine], until), at(self.y, past)],
-                                at(self.y[seen], now), name, healthy))
+            others = np.r_[0, at(self.u[~mine], until), at(self.y, past)]
+            regression = ChannelRegression(name, at(self.u[mine], until), others, at(self.y[seen], now))
+            columns.append(test(regression, healthy))
         return tuple(rows), tuple(columns), frozenset(moving)
 
 
 def zero_test(
-    statistics: HankelStatistics, tested: Positions, others: Positions, outputs: Positions, *, rows: int, level: float,
-    name: str = "", scale: Array | None = None, healthy: Array | None = None,
+    statistics: HankelStatistics, regression: ChannelRegression, *, rows: int, level: float,
+    scale: Array | None = None, healthy: Array | None = None,
 ) -> ZeroTest:
     """Test whether the coefficients of y on t are zero, given o, from the moments of windows of `rows` + reach samples.
 
-    t and o are positions within the first `rows` block rows, the constant (0) among o. The scale (y,) is that of the
-    healthy outputs, and `healthy` (t, y) are the coefficients of a healthy record.
+    t and o lie within the first `rows` block rows. The scale (y,) is that of the healthy outputs, and `healthy` (t, y)
+    are the coefficients of a healthy record.
     """
     from scipy.special import chdtrc, chdtri
 
-    t, o, y = (np.asarray(part, dtype=np.intp) for part in (tested, others, outputs))
+    _, t, o, y = regression
     j, width = statistics.windows, 1 + rows * statistics.d
     gram = statistics.gram[:width, :width] / j
     size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
@@ -356,7 +371,7 @@ def zero_test(
     whitener = np.linalg.inv(np.linalg.cholesky((covariance + covariance.T) / 2)).T / spread[:, None]
     shocks, noise = on_t @ normal / size[:, None], (weights[:, t.size :] - on_t @ theta) @ whitener / size[:, None]
     e, z = lagged_covariances(statistics, rows, noise, shocks, o.size + t.size)
-    found = ZeroTest(name, float(np.sum((gains @ whitener) ** 2)), coefficients=theta / size[t, None])
+    found = ZeroTest(regression.name, float(np.sum((gains @ whitener) ** 2)), coefficients=theta / size[t, None])
     flat = float(np.max(variances / spread**2)) <= QUIET**2
     if not kept.any() or flat:
         expected = float("inf") if kept.any() else 0.0
@@ -371,23 +386,24 @@ def zero_test(
     return replace(found, threshold=float(g / j * chdtri(h, level)), p_value=float(chdtrc(h, found.statistic * j / g)))
 
 
-def coefficients(statistics: HankelStatistics, instruments: Positions, outputs: Positions) -> Array:
+def coefficients(statistics: HankelStatistics, regression: RegressionRows) -> Array:
     """Return Pi (y, z), the regression of the outputs on the instruments."""
-    triangle, size = statistics.triangle(np.append(instruments, outputs)), len(instruments)
+    size = len(regression.instruments)
+    triangle = statistics.triangle(np.append(regression.instruments, regression.outputs))
     scale = np.maximum(np.linalg.norm(triangle[:size, :size], axis=0), 1e-300)
     return np.linalg.lstsq(triangle[:size, :size] / scale, triangle[:size, size:], rcond=1e-13)[0].T / scale
 
 
 def least_order(
-    statistics: HankelStatistics, instruments: Positions, regressors: Positions, healthy: Array, test: RankTest,
-    order: int, scale: Array,
+    statistics: HankelStatistics, regression: RegressionRows, healthy: Array, test: RankTest, order: int, scale: Array,
 ) -> int:
     """Return the smallest order that a healthy plant, of this order and with Pi (y, z), may show on a window.
 
     Its outputs are Pi times the instruments and noise, so that Pi L11 Q2 is R22 of the window without noise. An order
     is rejected only where the squares of the singular values after it exceed the threshold.
     """
-    triangle = statistics.triangle(np.asarray(instruments)) / np.sqrt(statistics.windows)
+    instruments, regressors, _ = regression
+    triangle = statistics.triangle(instruments) / np.sqrt(statistics.windows)
     basis = np.linalg.qr(triangle[:, np.isin(instruments, regressors)], mode="complete")[0]
     expected = (healthy @ triangle.T @ basis[:, len(regressors) :]) / scale[:, None]
     squares = np.linalg.svd(expected, compute_uv=False)[:order] ** 2

@@ -6,7 +6,6 @@ the other parameters.
 """
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,6 +18,7 @@ from optid.data.record import Data
 from optid.data.stretches import interpolated
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.faults.repair.curves import Curve, curve_of
+from optid.faults.repair.damage import Damage
 from optid.faults.signatures import Candidate, course_of
 from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models.experiments import in_units_of
@@ -278,23 +278,21 @@ class Refitting:
 
 
 def refitting(
-    model: "HammersteinSS", data: Data, onset: int, *, damaged: Sequence[int] = (),
-    offsets: Sequence[Candidate] = (), whole: bool = False, prior: Prior | None = None, nodes: int = NODES,
-    known_start: bool = True, dead: Sequence[int] = (),
+    model: "HammersteinSS", data: Data, damage: Damage, *, whole: bool = False, prior: Prior | None = None,
+    nodes: int = NODES,
 ) -> Refitting:
     """Prepare a refit from the record after a fault.
 
+    The damaged nonlinearities are open, of the dead ones one value each, and so is what the faults add. The state at
+    the onset is predicted where the plant was healthy before it.
+
     Args:
         model: the healthy model, with noise covariances.
-        data: the record; the fault is in the first experiment from `onset` on and in all of the others.
-        onset: first sample that the fault changes.
-        damaged: indices of the nonlinearities of the inputs that are open.
-        offsets: faults that add something, whose size is estimated as well.
+        data: the record; the fault is in the first experiment from its onset on and in all of the others.
+        damage: what broke, and when.
         whole: open the matrices and the other nonlinearities, too.
         prior: see `Prior`.
         nodes: values of a damaged nonlinearity, where it has no nodes of its own.
-        known_start: whether the plant was healthy before the onset, so that its state there is predicted.
-        dead: those of the damaged that are constant: one value each is estimated.
 
     Raises:
         DataError: a missing input after the fault, an onset beyond the record, other channels than the model's.
@@ -305,12 +303,12 @@ def refitting(
         DataWarning: a record that is longer than what is used.
     """
     steady, raw = predictor(model), in_units_of(model, data)
-    windows = tuple(_cut(model, steady, part.u, part.y, 0 if number else onset, known_start)
+    windows = tuple(_cut(model, steady, part.u, part.y, 0 if number else damage.onset, damage.same_onset)
                     for number, part in enumerate(raw.experiments))
     inputs = np.vstack([w.u[int(w.held) :] for w in windows])
-    curves = tuple(curve_of(model, i, inputs, raw, nodes, i in dead) for i in damaged)
-    found = Refitting(model, steady, windows, curves, tuple(offsets), whole, prior or Prior())
-    needed = sum(curve.values_open for curve in curves) + sum(c.into_state.shape[1] for c in offsets)
+    curves = tuple(curve_of(model, i, inputs, raw, nodes, i in damage.dead) for i in damage.columns)
+    found = Refitting(model, steady, windows, curves, damage.offsets, whole, prior or Prior())
+    needed = sum(curve.values_open for curve in curves) + sum(c.into_state.shape[1] for c in damage.offsets)
     if found.readings < needed:
         raise RankError(
             f"{found.readings} readings after the fault, and {needed} values to estimate: at least "

@@ -86,8 +86,7 @@ def refit(
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.
     """
     try:
-        narrow = refitting(model, data, damage.onset, damaged=damage.columns, offsets=damage.offsets, prior=prior,
-                           nodes=nodes, known_start=damage.same_onset, dead=damage.dead)
+        narrow = refitting(model, data, damage, prior=prior, nodes=nodes)
     except RankError as error:
         warnings.warn(f"{damage.label}: no refit. {error}", DataWarning, stacklevel=3)
         counted = sum(1 if i in damage.dead else nodes for i in damage.columns) + sum(

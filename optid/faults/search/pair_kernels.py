@@ -6,9 +6,24 @@ error that the earlier one causes at k, in its later course, and in the quantiti
 products of N onsets and D columns cost O(N^2 D^2 n).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
+from optid.arrays import Array
 from optid.kernel_cache import cached_njit
+
+LISTED = 1000
+"""Most indistinguishable pairs that are listed."""
+
+
+class Grams(NamedTuple):
+    """What the products of signatures of any two onsets follow from, with the tables of a sweep."""
+
+    products: Array  # (N, D, D) of columns with the same onset
+    states: Array  # (N, n, D) of a unit state with the columns
+    along: Array  # (N, Q, D) the reduction of the products by an uncertain model
+    roots: Array  # (N, R) inverse roots of the products of every candidate
 
 
 @cached_njit
@@ -57,24 +72,25 @@ def joint_energy(first, second, cosines, floor, work):
 
 
 @cached_njit
-def search(tables, products, states, along, roots, tested, z, q, same, floor, best, onsets, alike):
-    """Find the best pair of onsets for every pair of candidates; return the number of indistinguishable pairs.
+def search(tables, grams, tested, z, q, same, floor):
+    """Find the best pair of onsets for every pair of candidates.
 
     Args:
         tables: `optid.faults.search.sweeps.Tables`.
-        products: (N, D, D) of columns with the same onset.
-        states: (N, n, D) of a unit state with the columns.
-        along: (N, Q, D) the reduction of the products by an uncertain model.
-        roots: (N, R) inverse roots of the products.
+        grams: `Grams`.
         tested: (C, N) which onsets count.
         z: (N, D) coordinates of the window along the axes of every candidate.
         q: (C,) thresholds.
         same: whether both faults may be of one candidate.
         floor: see `joint_energy`.
-        best: (C, C) written above the diagonal and on it: largest energy less both thresholds, -inf where none.
-        onsets: (C, C, 2) written: onsets of the first and of the second candidate.
-        alike: (K, 4) written: candidate, onset, candidate, onset of the first K pairs of which only one is seen.
+
+    Returns:
+        best: (C, C) above the diagonal and on it, largest energy less both thresholds, -inf where none.
+        onsets: (C, C, 2) of the first and of the second candidate, -1 where none.
+        alike: (K, 4) candidate, onset, candidate, onset of the first `LISTED` pairs of which only one is seen.
+        found: number of all of these pairs.
     """
+    products, states, along, roots = grams
     of, F, e = tables.of, tables.F, tables.e
     lasting, drifts, helpers = tables.lasting, tables.drifts, tables.helpers
     count, n, columns, candidates = of.size, F.shape[1], e.shape[2], tables.first.size
@@ -84,7 +100,8 @@ def search(tables, products, states, along, roots, tested, z, q, same, floor, be
     x, later = np.zeros((n, columns)), np.zeros((n, columns))
     cross, cosines = np.zeros((columns, columns)), np.zeros((most, most))
     work = np.zeros((most, most + 1))
-    found = 0
+    best, onsets = np.full((candidates, candidates), -np.inf), np.full((candidates, candidates, 2), -1)
+    alike, found = np.zeros((LISTED, 4), dtype=np.int64), 0
     for theta in range(count):
         any_here = False
         for c in range(candidates):
@@ -160,4 +177,4 @@ def search(tables, products, states, along, roots, tested, z, q, same, floor, be
                 for a in range(n):
                     for i in range(columns):
                         x[a, i] = later[a, i]
-    return found
+    return best, onsets, alike[: min(found, LISTED)], found

@@ -29,9 +29,6 @@ MOST = 400_000_000
 MOST_PAIRED = 50_000
 """Largest number of atoms (candidates times onsets) whose pairs are searched."""
 
-LISTED = 1000
-"""Largest number of indistinguishable pairs listed."""
-
 TABLE = 4_000_000
 """Numbers in a table of pairs."""
 
@@ -149,7 +146,7 @@ def pairs(scan: Scan, thresholds: "Thresholds", *, same: bool = True) -> SubsetS
     Raises:
         StructureError: thresholds of other candidates or without some that are tested, too many pairs.
     """
-    from optid.faults.search.pair_kernels import search
+    from optid.faults.search.pair_kernels import Grams, search
     from optid.faults.search.sweep_kernels import grams
 
     q, prepared, tested = thresholds.for_scan(scan), scan.sweep, ~np.isnan(scan.statistic)
@@ -159,18 +156,14 @@ def pairs(scan: Scan, thresholds: "Thresholds", *, same: bool = True) -> SubsetS
             f"{number} candidates and onsets are too many for all pairs ({MOST_PAIRED}): scan a shorter window or "
             "fewer onsets (scan(..., onsets=)), or use the sparse method."
         )
-    n, columns, size = prepared.tables.F.shape[1], prepared.tables.group.size, len(tested)
+    n, columns = prepared.tables.F.shape[1], prepared.tables.group.size
     products, states = np.zeros((prepared.window, columns**2)), np.empty((prepared.window, n, columns))
     grams(prepared.tables, np.arange(columns**2).reshape(columns, columns), products, states)
     z = np.zeros_like(scan.correlations)
     for c in np.flatnonzero(prepared.tables.sizes).tolist():
         z[:, prepared.columns(c)] = prepared.coordinates(scan.correlations, c)
-    best, alike = np.full((size, size), -np.inf), np.zeros((LISTED, 4), dtype=np.int64)
-    onsets = np.full((size, size, 2), -1, dtype=np.int64)
-    same_trace = search(
-        prepared.tables, products.reshape(-1, columns, columns), states, prepared.along, prepared.roots,
-        tested, z, np.nan_to_num(q), same, ALIKE, best, onsets, alike,
-    )
+    known = Grams(products.reshape(-1, columns, columns), states, prepared.along, prepared.roots)
+    best, onsets, alike, same_trace = search(prepared.tables, known, tested, z, np.nan_to_num(q), same, ALIKE)
 
     def pair(i: int, j: int, gain: float, first: int, second: int) -> Subset:
         return Subset((scan.labels[i], scan.labels[j]), (int(first), int(second)), gain, float(gain + q[i] + q[j]))
@@ -180,7 +173,7 @@ def pairs(scan: Scan, thresholds: "Thresholds", *, same: bool = True) -> SubsetS
     return SubsetSearch(
         scan, tuple(sorted(found, key=lambda s: -s.gain)), single,
         np.asarray(tested.any(axis=0)), number * (number - 1) // 2, 2, alike=int(same_trace),
-        indistinguishable=tuple(pair(a, b, np.nan, i, j) for a, i, b, j in alike[:same_trace]),
+        indistinguishable=tuple(pair(a, b, np.nan, i, j) for a, i, b, j in alike),
     )
 
 

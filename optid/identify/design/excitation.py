@@ -1,10 +1,11 @@
 """Design an excitation for a plant of which one record exists, and predict the record taken with it."""
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -81,6 +82,70 @@ class Excitation:
         return path
 
 
+@dataclass(frozen=True)
+class Waveform:
+    """A kind of input signal; its range, shape and seed make it a signal.
+
+    Attributes:
+        kind: one of `KINDS`.
+        n: samples.
+        dt: sampling time.
+        band: lowest and highest frequency, 1/unit of dt.
+        levels: number of equally spaced values; None for any value.
+        hold: samples for which "levels" holds a value.
+        periods: of a multisine.
+    """
+
+    kind: str
+    n: int
+    dt: float
+    band: tuple[float, float]
+    levels: int | None
+    hold: int
+    periods: int
+
+    def signal(self, span: tuple[float, float], weight: Callable[[Array], Array] | None, seed: int) -> Array:
+        """Return one input (n,) that fills its range, weighted over frequency."""
+        (low, high), n, dt = self.band, self.n, self.dt
+        if self.kind == "multisine":
+            return signals.multisine(n, *span, dt=dt, band=self.band, spectrum=weight, phases="random",
+                                     periods=self.periods, seed=seed)
+        if self.kind == "levels":
+            return signals.uniform_levels(n, *span, hold=self.hold, seed=seed)
+        if self.kind == "noise":
+            edge = min(high, 0.499 / dt)
+            return signals.band_limited_noise(n, *span, cutoff=(low, edge) if low > 0 else edge, dt=dt, seed=seed)
+        sweep = -(-n // SWEEPS)
+        # From one period per sweep, so that every sweep starts where the last one ended.
+        first = max(low, 1 / (sweep * dt))
+        x = signals.chirp(SWEEPS * sweep, f0=first, f1=max(high, first), dt=dt, repeats=SWEEPS)[:n]
+        if weight is not None:
+            x = x * weight(first + (high - first) * (np.arange(n) % sweep) / sweep)
+            x = x / np.max(np.abs(x))
+        return sum(span) / 2 + (span[1] - span[0]) / 2 * x
+
+    def on_levels(self, u: Array, span: tuple[float, float]) -> Array:
+        """Round a signal of any shape to the levels of its range."""
+        if self.levels is None:
+            return u
+        low, step = span[0], (span[1] - span[0]) / (self.levels - 1)
+        return low + step * np.round((u - low) / step)
+
+
+class ExpandedRegressor(NamedTuple):
+    """The regressor whose condition number a design keeps small: functions of inputs and outputs at some lags."""
+
+    basis: Bases
+    feedback_basis: FeedbackBases
+    rows: int  # lags of every function
+
+    def expansion(self, record: Data) -> Expansion:
+        """Return the functions of a record."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # outputs that are nearly linear: `rules.check_feedback`
+            return expand(record, self.basis, self.feedback_basis)
+
+
 def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels: int | None = None,
            band: tuple[float, float] | None = None, amplitude: Any = None, shaped: bool = False,
            basis: Bases = "polynomial:4", feedback_basis: FeedbackBases = None, rows: int = 10, hold: int = 5,
@@ -124,7 +189,8 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
     ranges = _ranges(like, amplitude)
     measured = frequency_response(like)
     limits = (0.0, 0.5 / (hold * like.dt)) if kind == "levels" else _band(band, measured)
-    few = rules.FEW_LEVELS if levels is None else 0  # no warning about a given number of levels
+    waveform = Waveform(kind, n, like.dt, limits, levels, hold, periods)
+    regressor = ExpandedRegressor(basis, feedback_basis, rows)
     top = 0.9 * float(measured.frequency[-1])
 
     def weight(c: int, frequency: Array) -> Array:
@@ -132,22 +198,20 @@ def design(like: Data, kind: str = "multisine", *, n: int | None = None, levels:
         return 1 / np.maximum(gain / gain.max(), 1 / BOOST)
 
     def realised(draw: int) -> Excitation:
-        u = np.column_stack([_signal(kind, n, span, like.dt, limits, partial(weight, c) if shaped else None, hold,
-                                     periods, seed + draw * like.m + c) for c, span in enumerate(ranges)])
+        columns = [waveform.signal(span, partial(weight, c) if shaped else None, seed + draw * like.m + c)
+                   for c, span in enumerate(ranges)]
         if kind == "chirp":  # inputs that sweep in step could not be distinguished
-            u = np.column_stack([np.roll(x, c * n // (SWEEPS * like.m)) for c, x in enumerate(u.T)])
-        if levels is not None:
-            low, high = np.transpose(ranges)
-            step = (high - low) / (levels - 1)
-            u = low + step * np.round((u - low) / step)
-        return _expected(u, kind, like, measured, limits, basis, feedback_basis, rows, few, seed + draw)
+            columns = [np.roll(x, c * n // (SWEEPS * like.m)) for c, x in enumerate(columns)]
+        u = np.column_stack([waveform.on_levels(x, span) for x, span in zip(columns, ranges)])
+        return _expected(u, waveform, like, measured, regressor, seed + draw)
 
     while True:
         draws = map(realised, range(1 if kind == "chirp" else candidates))
         found = min(draws, key=lambda excitation: excitation.condition)
-        if found.condition <= WANTED or band is not None or kind == "levels" or limits[1] >= top:
+        low, high = waveform.band
+        if found.condition <= WANTED or band is not None or kind == "levels" or high >= top:
             break
-        limits = limits[0], min(WIDER * limits[1], top)
+        waveform = replace(waveform, band=(low, min(WIDER * high, top)))
     for check in found.checks:
         if check.severity == "error":
             raise StructureError(f"this {kind} breaks a rule of design: {check.sentence}")
@@ -197,38 +261,15 @@ def _band(band: tuple[float, float] | None, measured: FrequencyResponse) -> tupl
     return float(band[0]), float(band[1])
 
 
-def _signal(kind: str, n: int, span: tuple[float, float], dt: float, band: tuple[float, float], weight: Any,
-            hold: int, periods: int, seed: int) -> Array:
-    """Return one input (n,) that fills its range."""
-    low, high = band
-    if kind == "multisine":
-        return signals.multisine(n, *span, dt=dt, band=band, spectrum=weight, phases="random", periods=periods,
-                                 seed=seed)
-    if kind == "levels":
-        return signals.uniform_levels(n, *span, hold=hold, seed=seed)
-    if kind == "noise":
-        edge = min(high, 0.499 / dt)
-        return signals.band_limited_noise(n, *span, cutoff=(low, edge) if low > 0 else edge, dt=dt, seed=seed)
-    sweep = -(-n // SWEEPS)
-    # From one period per sweep, so that every sweep starts where the last one ended.
-    first = max(low, 1 / (sweep * dt))
-    x = signals.chirp(SWEEPS * sweep, f0=first, f1=max(high, first), dt=dt, repeats=SWEEPS)[:n]
-    if weight is not None:
-        x = x * weight(first + (high - first) * (np.arange(n) % sweep) / sweep)
-        x = x / np.max(np.abs(x))
-    return sum(span) / 2 + (span[1] - span[0]) / 2 * x
-
-
-def _expected(u: Array, kind: str, like: Data, measured: FrequencyResponse, band: tuple[float, float], basis: Bases,
-              feedback_basis: FeedbackBases, rows: int, few: int, seed: int) -> Excitation:
+def _expected(u: Array, waveform: Waveform, like: Data, measured: FrequencyResponse, regressor: ExpandedRegressor,
+              seed: int) -> Excitation:
     """Predict a record taken with u (N, m) and check it by the rules."""
     y = _predicted(u, like, measured, seed)
     record = Data(u, y, like.dt, inputs=list(like.inputs), outputs=list(like.outputs))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DataWarning)  # functions of outputs that are nearly linear: `check_feedback`
-        expansion = expand(record, basis, feedback_basis)
+    expansion, rows = regressor.expansion(record), regressor.rows
     condition = expanded_condition(record, expansion, rows)
     channels = list(zip(like.inputs, u.T, expansion.inputs))
+    few = rules.FEW_LEVELS if waveform.levels is None else 0  # no warning about a given number of levels
     checks = (*(rules.check_levels(name, x, one, few) for name, x, one in channels),
               *(rules.check_lines(name, [x], one, rows) for name, x, one in channels),
               *(rules.check_feedback(like.outputs[family.output], family.share) for family in expansion.feedback),
@@ -238,8 +279,8 @@ def _expected(u: Array, kind: str, like: Data, measured: FrequencyResponse, band
         how = (f"from the designed signal and outputs predicted through the frequency response of "
                f"{like.name or 'the record'} ({measured.segments} segments) with its disturbance; a plant that is far "
                "from linear will differ")
-    return Excitation(u, like.dt, like.inputs, kind, condition, rows, expansion.p + expansion.q, band,
-                      tuple(float(s) for s in y.std(axis=0)), checks, how, like.time_unit)
+    return Excitation(u, like.dt, like.inputs, waveform.kind, condition, rows, expansion.p + expansion.q,
+                      waveform.band, tuple(float(s) for s in y.std(axis=0)), checks, how, like.time_unit)
 
 
 def _predicted(u: Array, like: Data, measured: FrequencyResponse, seed: int) -> Array:

@@ -16,19 +16,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from optid.arrays import Array, check_probability
 from optid.errors import RankError, StructureError
 from optid.statistics.expansion import Expansion
-from optid.statistics.hankel import HankelStatistics, hankel_statistics
+from optid.statistics.hankel import HankelStatistics, RegressionRows, hankel_statistics
 from optid.statistics.rq import rq
 
 LEVEL = 0.01
 SPAN = 10.0  # the level of the test is min(0.01, 10 / N): wrong decisions become rarer as the record grows
 FLOOR = 10.0  # singular values below this many roundings of the outputs, times the size of R22, are zero
-
-Positions = Sequence[int] | NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,22 +123,20 @@ def order_test(records: Sequence[Array], expansion: Expansion, alpha: int, *, in
     """
     statistics = hankel_statistics(records, 3 * alpha, expansion, names=expansion.names,
                                    centre="mean" if offset else None)
-    z, phi, y = expansion.positions(statistics.at, instruments, alpha, offset)
+    regression = expansion.positions(statistics.at, instruments, alpha, offset)
     scale = np.tile(statistics.sizes(expansion.y, offset), alpha) if expansion.l > 1 else None
-    return rank_test(statistics, z, phi, y, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l, scale=scale)
+    return rank_test(statistics, regression, rows=2 * alpha, level=level, largest=(alpha - 1) * expansion.l,
+                     scale=scale)
 
 
-def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: Positions, outputs: Positions, *,
-              rows: int, level: float | None = None, largest: int | None = None, scale: Array | None = None
-             ) -> RankTest:
+def rank_test(statistics: HankelStatistics, regression: RegressionRows, *, rows: int, level: float | None = None,
+              largest: int | None = None, scale: Array | None = None) -> RankTest:
     """Test the ranks of R22.
 
     Args:
         statistics: moments of windows of `rows` + reach samples; the reach is the largest lag between windows whose
             correlation counts, at most the number of future block rows.
-        instruments: positions of Z in the first `rows` block rows (`HankelStatistics.at`; 0 is the constant).
-        regressors: of Phi there.
-        outputs: of Y there.
+        regression: where Z, Phi and Y lie in the first `rows` block rows.
         rows: block rows of the instruments, regressors and outputs together.
         level: probability of rejecting the true order; min(0.01, 10 / j) when not given.
         largest: order to be chosen, (alpha - 1) l for alpha future block rows of l outputs.
@@ -156,7 +151,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
     if statistics.rows <= rows:
         raise StructureError(f"The windows have {statistics.rows} block rows and {rows} are used: take windows that "
                              "are longer by the number of future block rows.")
-    z, phi, y = (np.asarray(part, dtype=np.intp) for part in (instruments, regressors, outputs))
+    z, phi, y = regression
     width = 1 + rows * statistics.d
     if max(z.max(), phi.max(), y.max()) >= width:
         raise StructureError(f"Instruments, regressors and outputs must lie within the first {rows} block rows.")
@@ -169,7 +164,7 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
     sizes = np.ones(y.size) if scale is None else np.asarray(scale, dtype=float)
     if sizes.shape != (y.size,) or not (sizes > 0).all():
         raise StructureError(f"scale must be {y.size} positive numbers, one per row of the outputs.")
-    r22, noise, shocks, floor = _projections(statistics, z, phi, y, width, sizes)
+    r22, noise, shocks, floor = _projections(statistics, regression, width, sizes)
     left, values, right = np.linalg.svd(r22)
     covariance_e, covariance_z = lagged_covariances(statistics, rows, noise @ left, shocks @ right.T, z.size)
     tails = np.cumsum((values**2)[::-1])[::-1]
@@ -190,11 +185,12 @@ def rank_test(statistics: HankelStatistics, instruments: Positions, regressors: 
                     values.size if largest is None else largest)
 
 
-def _projections(statistics: HankelStatistics, z: NDArray[np.intp], phi: NDArray[np.intp], y: NDArray[np.intp],
-                 width: int, sizes: Array) -> tuple[Array, Array, Array, float]:
+def _projections(statistics: HankelStatistics, regression: RegressionRows, width: int, sizes: Array
+                 ) -> tuple[Array, Array, Array, float]:
     """R22, the windows' weights (width, .) that give e_t and orthonormal z_t, and the floor, per window."""
     from scipy.linalg import solve_triangular
 
+    z, phi, y = regression
     blocks, j = rq(statistics, z, phi, y), statistics.windows
     regressors, outputs = (part / np.sqrt(j) for part in blocks.projected)
     q2 = np.linalg.qr(regressors.T, mode="complete")[0][:, phi.size :]

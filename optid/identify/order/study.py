@@ -8,7 +8,6 @@ import numpy as np
 
 from optid.arrays import Array, check_integer
 from optid.bases import Bases, FeedbackBases, Linear
-from optid.bases.basis import Basis
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, RankError, StructureError
 from optid.identify.order.lags import LagScan, scan_lags
@@ -94,7 +93,13 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     parts = [hankel_statistics(part.records, 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
              for part in (train, test) if part is not None]
     states = state_criteria(whole, expansion, alpha, max(largest, 1), *parts)
-    lags = _lags(data, train, test, expansion.inputs, na, nb, nk, notes)
+    lags = None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            lags = scan_lags(data if train is None else train, expansion.inputs, na=na, nb=nb, nk=nk, test=test)
+    except RankError as error:
+        notes.append(f"No scan of lags. {error}")
     if ranks.exhausted:
         notes.append("Every order that the block rows can show was rejected: use more block rows, or a basis for the "
                      "inputs if the plant is not linear.")
@@ -161,17 +166,6 @@ def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Da
         notes.append(f"Nothing is held out: the record is too short for it. {error}")
         return None, None
     return train, test
-
-
-def _lags(data: Data, train: Data | None, test: Data | None, bases: Sequence[Basis], na: int, nb: int, nk: int,
-          notes: list[str]) -> LagScan | None:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
-            return scan_lags(data if train is None else train, bases, na=na, nb=nb, nk=nk, test=test)
-    except RankError as error:
-        notes.append(f"No scan of lags. {error}")
-        return None
 
 
 def _reasons(ranks: RankTest, states: StateCriteria, lags: LagScan | None) -> tuple[str, ...]:

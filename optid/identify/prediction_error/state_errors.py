@@ -182,12 +182,12 @@ class StateErrors(Criterion):
 
     def at(self, point: StatePoint) -> HammersteinSS:
         """Build the model of a point."""
-        matrices, levels, offset = (point.A, point.b, point.C, point.d), None, point.offset
+        levels, offset = None, point.offset
         if self.unknowns.levels:
             levels = point.x0[:, self.unknowns.n :] + (0.0 if self.shifts is None else self.shifts)
             offset = levels.mean(axis=0)
-        plain = state_model(self.unknowns.expansion, self.data, matrices, point.mus, point.nus, point.e, K=point.K,
-                            offset=offset)
+        matrices = {"A": point.A, "B": point.b, "C": point.C, "D": point.d, "K": point.K, "offset_y": offset}
+        plain = state_model(self.unknowns.expansion, self.data, matrices, point.mus, point.nus, point.e)
         plain = replace(plain, levels=levels)
         if not self.unknowns.latent:
             return plain

@@ -5,6 +5,8 @@ factor R of [Phi | Y] replaces the covariance P = (R^T R)^-1 of the textbook rec
 stays symmetric and positive definite, and P_0 = infinity is R = 0.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,39 +45,47 @@ def rotate(root: Array, row: Array, first: int, last: int, fade: float) -> float
     return kept
 
 
+class LaggedColumns(NamedTuple):
+    """The n columns of Phi but the last, the constant: each is a signal at a lag."""
+
+    signal: NDArray[np.intp]  # (n - 1,) of [-y | functions of the inputs]
+    lag: NDArray[np.intp]  # (n - 1,)
+
+
 @cached_njit
 def absorb(
-    root: Array, signals: Array, y: Array, source: NDArray[np.intp], lag: NDArray[np.intp], used: NDArray[np.bool_],
-    weights: Array, forgetting: float, rows: int, innovations: Array, marks: NDArray[np.bool_], traced: Array,
-) -> int:
-    """Rotate the rows of one stretch into the factor, and return the number of rows used so far.
+    root: Array, signals: Array, columns: LaggedColumns, weights: Array, forgetting: float, rows: int,
+    marks: NDArray[np.bool_],
+) -> tuple[int, Array, Array]:
+    """Rotate the rows of one stretch into the factor.
 
     Args:
         root: (n + l, n + l) upper triangular, diagonal >= 0; changed in place.
-        signals: (reach + T, s) what the columns of Phi are made of.
-        y: (reach + T, l) outputs.
-        source: (n - 1,) signal of each column but the last, the constant.
-        lag: (n - 1,) lag of each.
-        used: (T,) marks of the rows that are used.
-        weights: (T,) positive where used.
+        signals: (reach + T, s) what the columns of Phi are made of, minus the l outputs first.
+        columns: signal and lag of every column.
+        weights: (T,) of the rows; zero where a row is not used.
         forgetting: factor on all earlier information at every row used.
         rows: rows used before.
-        innovations: (T, l) prediction errors before each update; entries of rows not used stay as they are.
         marks: (T,) samples after which the estimate is recorded.
-        traced: (number of marks, n, l) the recorded estimates.
+
+    Returns:
+        the rows used so far, the prediction errors (T, l) before each update, NaN where a row is not used, and the
+        recorded estimates (number of marks, n, l).
     """
-    n, l = source.size + 1, y.shape[1]  # noqa: E741 - the field's letter
-    size, reach = n + l, len(y) - len(used)
+    source, lag = columns
+    n, size = source.size + 1, len(root)
+    l, reach = size - n, len(signals) - len(weights)  # noqa: E741 - the field's letter
     fade = np.sqrt(forgetting)
+    innovations, traced = np.full((weights.size, l), np.nan), np.empty((np.count_nonzero(marks), n, l))
     row, recorded = np.empty(size), 0
-    for t in range(used.size):
-        if used[t]:
+    for t in range(weights.size):
+        if weights[t] > 0.0:
             now, scale = reach + t, np.sqrt(weights[t])
             for j in range(n - 1):
                 row[j] = scale * signals[now - lag[j], source[j]]
             row[n - 1] = scale
             for o in range(l):
-                row[n + o] = scale * y[now, o]
+                row[n + o] = -scale * signals[now, o]
             kept = rotate(root, row, 0, n, fade)
             for o in range(l):
                 innovations[t, o] = row[n + o] / (kept * scale) if kept > UNDETERMINED else np.nan
@@ -89,7 +99,7 @@ def absorb(
         if marks[t]:
             solve(root, n, traced[recorded])
             recorded += 1
-    return rows
+    return rows, innovations, traced
 
 
 @cached_njit

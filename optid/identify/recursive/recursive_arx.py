@@ -207,27 +207,25 @@ class RecursiveARX(SavedState):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: give as many of each.")
         check_inside(u, layout, "", self.samples)
         weights = row_weights(weights, len(u))
-        source, lag = _columns(layout)
-        innovations = np.full(y.shape, np.nan)
+        columns = recursion_kernel.LaggedColumns(*_columns(layout))
         after = np.arange(self.samples + 1, self.samples + len(u) + 1)
         marks = after % every == 0 if every else np.zeros(len(u), bool)
-        traced, recorded = np.empty((int(marks.sum()), layout.n_columns, layout.l)), 0
+        innovations, traced = [np.empty((0, layout.l))], [np.empty((0, layout.n_columns, layout.l))]
         for start in range(0, len(u), CHUNK):
             part = slice(start, start + CHUNK)
             past_u, past_y = np.concatenate([self.past_u, u[part]]), np.concatenate([self.past_y, y[part]])
-            count, marked = len(past_y) - reach, int(marks[part].sum())
-            used = used_rows(past_u, past_y, layout) & (weights[part] > 0)
+            count, used = len(past_y) - reach, np.where(used_rows(past_u, past_y, layout), weights[part], 0.0)
             signals = np.concatenate([-past_y, *(b.values(x) for b, x in zip(layout.bases, past_u.T))], axis=1)
-            self.rows = recursion_kernel.absorb(
-                self.root, signals, past_y, source, lag, used, weights[part], self.forgetting, self.rows,
-                innovations[part], marks[part], traced[recorded : recorded + marked])
-            recorded += marked
+            self.rows, errors, estimates = recursion_kernel.absorb(
+                self.root, signals, columns, used, self.forgetting, self.rows, marks[part])
+            innovations.append(errors)
+            traced.append(estimates)
             complete = np.arange(self.since_restart, self.since_restart + count) >= reach
             self.candidates += int(np.count_nonzero(complete & (weights[part] > 0)))
             self.samples += count
             self.since_restart += count
             self.past_u, self.past_y = past_u[count:], past_y[count:]
-        return innovations, traced
+        return np.concatenate(innovations), np.concatenate(traced)
 
     @property
     def statistics(self) -> Statistics:

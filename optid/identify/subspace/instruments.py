@@ -1,11 +1,13 @@
 """Outputs simulated from the inputs alone, functions of which are instruments."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from optid.arrays import Array, compact
 from optid.identify.subspace.imputation import clipping_range
+from optid.identify.subspace.realisation import StepMatrices
 from optid.kernel_cache import cached_njit
 from optid.statistics.expansion import Expansion
 
@@ -13,16 +15,26 @@ from optid.statistics.expansion import Expansion
 GRID, CHUNK = 2001, 8192
 
 
-def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, bu: Array, du: Array,
-                     ez: Array, d: Array) -> list[Array]:
+class ClippedFeedback(NamedTuple):
+    """What outputs, clipped to [low, high], add to the next state: sum_o table_o(y_o) + injection y."""
+
+    tables: Array  # (l, G, n) at G points spread evenly over [low, high], interpolated linearly
+    injection: Array  # (n, l)
+    low: Array  # (l,)
+    high: Array  # (l,)
+
+
+def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c: Array, step: StepMatrices
+                     ) -> list[Array]:
     """Simulate the outputs (N, l) of every experiment from the inputs alone, clipped to `clipping_range`.
 
-    The functions of a missing input count as zero. The records are raw channels [u | y]; A (n, n), C (l, n), Bu (n, p),
-    Du (l, p), Ez (n, q) and the offset d (l,) belong to the signals, with or without feedback functions.
+    The functions of a missing input count as zero, and so does the first state. The records are raw channels [u | y];
+    A (n, n), C (l, n) and the matrices belong to the signals, with or without feedback functions.
     """
-    m, l, n = expansion.m, expansion.l, len(a)  # noqa: E741
+    m, l, n, (bu, du, ez, d, _) = expansion.m, expansion.l, len(a), step  # noqa: E741
     low, high = clipping_range(np.vstack(records)[:, m : m + l])
     tables, (injection, constant) = np.zeros((l, GRID, n)), expansion.injection(ez)
+    feedback = ClippedFeedback(tables, injection, low, high)
     start = 0
     for family in expansion.feedback:
         e = ez[:, start : start + family.size]
@@ -37,23 +49,20 @@ def simulate_clipped(records: Sequence[Array], expansion: Expansion, a: Array, c
         for first in range(0, len(record), CHUNK):
             eta = open_loop(record[first : first + CHUNK])[:, : expansion.p]
             eta = np.where(np.isnan(eta), 0.0, eta)
-            clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, tables, injection, low, high, x,
-                        out[first : first + CHUNK])
+            out[first : first + CHUNK] = clipped_run(a, c, eta @ bu.T + constant, eta @ du.T + d, feedback, x)
         simulated.append(out)
     return simulated
 
 
 @cached_njit
-def clipped_run(
-    a: Array, c: Array, drive: Array, direct: Array, tables: Array, injection: Array, low: Array, high: Array,
-    x: Array, out: Array) -> None:
-    """Simulate x+ = A x + drive + sum_o table_o(y_o) + injection y, y = C x + direct, with y clipped to [low, high].
+def clipped_run(a: Array, c: Array, drive: Array, direct: Array, feedback: ClippedFeedback, x: Array) -> Array:
+    """Return the clipped outputs y (T, l) of x+ = A x + drive + feedback(y), y = C x + direct.
 
-    The tables (l, G, n) hold the feedback of every output at G points spread evenly over [low, high], interpolated
-    linearly. The state x (n,) after the last sample and the clipped outputs (T, l) are written.
+    The state x (n,) after the last sample is written.
     """
+    tables, injection, low, high = feedback
     n, l, last = x.size, low.size, tables.shape[1] - 1  # noqa: E741
-    following = np.empty(n)
+    following, out = np.empty(n), np.empty(direct.shape)
     for t in range(drive.shape[0]):
         for i in range(n):
             following[i] = drive[t, i]
@@ -76,3 +85,4 @@ def clipped_run(
         scale = 1.0 if size < 1e12 else 1e12 / size  # a diverging run stays finite; its outputs sit at the limits
         for i in range(n):
             x[i] = following[i] * scale
+    return out

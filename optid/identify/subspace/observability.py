@@ -101,8 +101,8 @@ class Windows:
                                 expansion=self.expansion.without_feedback()).ordered()
             a = found.contracted()
             step = found.step(a)
-            bu, du, ez, d, _ = step.matrices(step.least_squares())
-            outputs = simulate_clipped(raw, found.windows.expansion, a, step.form.c, bu, du, ez, d)
+            outputs = simulate_clipped(raw, found.windows.expansion, a, step.form.c,
+                                       step.matrices(step.least_squares()))
             windows = replace(self, records=[np.hstack([record, y]) for record, y in zip(raw, outputs)],
                               expansion=self.expansion.with_simulated())
         return windows

@@ -6,6 +6,7 @@ its own initial state; those of all but the first run of an experiment are elimi
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,16 @@ from optid.statistics.factors import add_to_root
 from optid.structures.bilinear import starts
 from optid.structures.lifted_regression import leading_pairs
 from optid.structures.rank_one import RankOne
+
+
+class StepMatrices(NamedTuple):
+    """What the step estimates: x+ = A x + Bu eta(u) + Ez zeta(y), y = C x + Du eta(u) + d, from x0."""
+
+    bu: Array  # (n, p)
+    du: Array  # (l, p)
+    ez: Array  # (n, q)
+    d: Array  # (l,)
+    x0: Array  # (experiments, n)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +64,16 @@ class Realisation:
                 found[f"second over first singular value, {name}"] = float(values[1] / values[0])
         return found
 
-    def matrices(self, z: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """Split z into Bu (n, p), Du (l, p), Ez (n, q), d (l,) and x0 (experiments, n)."""
+    def matrices(self, z: Array) -> StepMatrices:
+        """Split z into matrices."""
         form, x, states = self.form, self.form.expansion, self.form.experiments * self.form.n
         thetas = form.thetas(z)
         effects = np.hstack([theta[:, : form.n].T for theta in thetas])
         direct = [theta[:, form.n :].T if direct else np.zeros((form.l, len(theta)))
                   for theta, direct in zip(thetas, form.feedthrough)]
         offset = z[states : form.linear] if form.offset else np.zeros(form.l)
-        return effects[:, : x.p], np.hstack(direct), effects[:, x.p :], offset, z[:states].reshape(-1, form.n)
+        return StepMatrices(effects[:, : x.p], np.hstack(direct), effects[:, x.p :], offset,
+                            z[:states].reshape(-1, form.n))
 
     @property
     def names(self) -> list[tuple[str, str, str]]:
@@ -97,9 +109,10 @@ class Realisation:
         n, l, m = form.n, form.l, x.m  # noqa: E741
         mus, bs = [mu for mu, _ in pairs], [b for _, b in pairs]
         direct = [b[n:] if len(b) > n else np.zeros(l) for b in bs[:m]]
-        matrices = form.a, np.column_stack([b[:n] for b in bs[:m]]), form.c, np.column_stack(direct)
-        found = state_model(x, data, matrices, mus[:m], mus[m:], np.column_stack([np.zeros((n, 0)), *bs[m:]]),
-                            offset=np.asarray(values["offset"]) if form.offset else np.zeros(l))
+        matrices = {"A": form.a, "B": np.column_stack([b[:n] for b in bs[:m]]), "C": form.c,
+                    "D": np.column_stack(direct),
+                    "offset_y": np.asarray(values["offset"]) if form.offset else np.zeros(l)}
+        found = state_model(x, data, matrices, mus[:m], mus[m:], np.column_stack([np.zeros((n, 0)), *bs[m:]]))
         if not any(basis.size > 1 for basis in x.inputs):
             return found
         signs = np.where([isinstance(basis, Linear) for basis in x.inputs], 1.0, found.gain_signs)
@@ -151,20 +164,19 @@ def _oriented(mu: Array, b: Array, *, linear: bool) -> tuple[Array, Array]:
     return mu * length, b / length
 
 
-def state_model(expansion: Expansion, data: Data, matrices: Sequence[Array], mus: Sequence[Array], nus: Sequence[Array],
-                e: Array, *, K: Array | None = None, offset: Array | None = None) -> HammersteinSS:
+def state_model(expansion: Expansion, data: Data, matrices: Mapping[str, Array], mus: Sequence[Array],
+                nus: Sequence[Array], e: Array) -> HammersteinSS:
     """Build the model with the meta data of a record; the linear part of the feedback becomes L and a constant.
 
-    The matrices are A (n, n), B (n, m), C (l, n) and D (l, m); mus are the coefficients of the nonlinearity of every
-    input, nus those of every feedback family in its orthonormal coordinates, with one column of e (n, s) each. K (n, l)
-    and the offset (l,) of the output are zero where None.
+    The matrices are A (n, n), B (n, m), C (l, n) and D (l, m) of `HammersteinSS`, and its K (n, l) and offset_y (l,)
+    where they are not zero; mus are the coefficients of the nonlinearity of every input, nus those of every feedback
+    family in its orthonormal coordinates, with one column of e (n, s) each.
     """
     families = expansion.feedback
     parts = [np.outer(column, nu) for column, nu in zip(e.T, nus)]
     injection, constant = expansion.injection(np.hstack([np.zeros((len(e), 0)), *parts]))
-    A, B, C, D = matrices
     return HammersteinSS(
-        A=A, B=B, C=C, D=D, K=K, E=e if families else None, L=injection,
+        **matrices, E=e if families else None, L=injection,
         nonlinearities=tuple(Nonlinearity(basis, mu) for basis, mu in zip(expansion.inputs, mus)),
         feedback=tuple(Nonlinearity(family.basis, family.vectors @ nu) for family, nu in zip(families, nus)),
-        output_of=tuple(family.output for family in families), offset_x=constant, offset_y=offset, **model_meta(data))
+        output_of=tuple(family.output for family in families), offset_x=constant, **model_meta(data))

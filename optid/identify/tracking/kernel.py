@@ -19,9 +19,11 @@ WEAK = 1e-8  # relative pivot of the Gram matrix of the rows of W present below 
 @cached_njit
 def track(
     basis: Array, root: Array, sums: Array, counts: NDArray[np.int64], x: Array, forgetting: float, orthonormal: bool,
-    residuals: Array,
-) -> None:
-    """Follow the subspace through one stretch of samples; state arrays change in place.
+) -> Array:
+    """Follow the subspace through one stretch of samples, and return the distances from it.
+
+    The distance |x - W y| (T,) is over the entries present and before the update, NaN where a sample is not used. The
+    state arrays change in place.
 
     Args:
         basis: (n, r) W.
@@ -31,12 +33,11 @@ def track(
         x: (T, n) samples; NaN = missing.
         forgetting: in (0, 1].
         orthonormal: whether W is kept orthonormal (OPAST).
-        residuals: (T,) out: |x - W y| over the entries present, before the update; NaN where not used.
     """
     n, r = basis.shape
     fade = np.sqrt(forgetting)
     y, row, g, e = np.empty(r), np.empty(r), np.empty(r), np.empty(n)
-    factor = np.empty((r, r))
+    factor, residuals = np.empty((r, r)), np.empty(len(x))
     for t in range(len(x)):
         counts[0] += 1
         residuals[t] = np.nan
@@ -81,6 +82,7 @@ def track(
                     step += tau * basis[i, j] * g[j]
             for j in range(r):
                 basis[i, j] += step * g[j]
+    return residuals
 
 
 @cached_njit

@@ -93,8 +93,8 @@ class SubspaceTracker(SavedState):
         residuals, start, orthogonal = np.empty(len(block)), 0, self.method == "opast"
         while start < len(block):
             part = slice(start, start + RENEWED - int(self.counts[0]) % RENEWED)
-            track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block[part]), self.forgetting,
-                  orthogonal, residuals[part])
+            residuals[part] = track(self.W, self.root, self.sums, self.counts, np.ascontiguousarray(block[part]),
+                                    self.forgetting, orthogonal)
             if orthogonal and self.counts[0] % RENEWED == 0:
                 columns, triangle = np.linalg.qr(self.W)
                 self.W[:] = columns * np.sign(np.diag(triangle))

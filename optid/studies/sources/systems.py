@@ -71,23 +71,30 @@ def _example(make: Callable[..., examples.Example], ranges: tuple[tuple[float, f
 # -- one input, one output, written as difference equations ------------------------------------------------------------
 
 
-def _equation(a: np.ndarray, b: np.ndarray, c: np.ndarray, f: Callable[[np.ndarray], np.ndarray], samples: int,
-              noise: float, seed: int, *, most: float = 1.0, dt: float = 0.1, gaussian: bool = False,
-              power: float | None = None) -> tuple[Data, Truth]:
-    """A y = B f(u) + C e, or y = (B / A) f(u) + e with c = a; all from rest, u up to ``most``.
+@dataclass(frozen=True, eq=False)
+class DifferenceEquation:
+    """A y = B f(u) + C e, or y = (B / A) f(u) + e with c = a, from rest."""
 
-    The input is uniform, or standard normal; the power is the variance of the noise-free output, by default that of the
-    record.
-    """
-    rng = np.random.default_rng(seed)
-    u = rng.standard_normal(samples) if gaussian else rng.uniform(-most, most, samples)
-    e = rng.standard_normal(samples)
-    poles = np.concatenate([[1.0], a])
-    clean = lfilter(b, poles, f(u))
-    power = float(np.var(clean)) if power is None else power
-    sigma = noise * float(np.sqrt(power / np.sum(_impulse(c, a) ** 2)))
-    data = Data(u, clean + lfilter(sigma * c, poles, e), dt)
-    return data, Truth((f,), ((-most, most),), _impulse(b, a)[:, None, None])
+    a: np.ndarray  # (na,) behind the leading one
+    b: np.ndarray
+    c: np.ndarray
+    f: Callable[[np.ndarray], np.ndarray]
+    most: float = 1.0  # largest input, uniform
+    dt: float = 0.1
+    gaussian: bool = False  # whether the input is standard normal instead
+    power: float | None = None  # variance of the noise-free output; that of the record where None
+
+    def simulate(self, samples: int, noise: float, seed: int) -> tuple[Data, Truth]:
+        """Simulate with a noise relative to the standard deviation of the noise-free output."""
+        rng = np.random.default_rng(seed)
+        u = rng.standard_normal(samples) if self.gaussian else rng.uniform(-self.most, self.most, samples)
+        e = rng.standard_normal(samples)
+        poles = np.concatenate([[1.0], self.a])
+        clean = lfilter(self.b, poles, self.f(u))
+        power = float(np.var(clean)) if self.power is None else self.power
+        sigma = noise * float(np.sqrt(power / np.sum(_impulse(self.c, self.a) ** 2)))
+        data = Data(u, clean + lfilter(sigma * self.c, poles, e), self.dt)
+        return data, Truth((self.f,), ((-self.most, self.most),), _impulse(self.b, self.a)[:, None, None])
 
 
 _NODES = np.linspace(-1.0, 1.0, 9)
@@ -147,7 +154,7 @@ SYSTEMS: dict[str, System] = {
         1000, 22**-0.5, partial(_example, examples.dead_zone, ((-1.0, 1.0),)), _SISO | {"nx": 2}),
     "dead_zone_in_span": System(
         "the same with a dead zone that is linear between nine nodes, so that triangular:8 holds the truth",
-        1000, 22**-0.5, partial(_equation, _A, _B, np.ones(1), _dead_zone_in_span, power=_IN_SPAN_POWER),
+        1000, 22**-0.5, DifferenceEquation(_A, _B, np.ones(1), _dead_zone_in_span, power=_IN_SPAN_POWER).simulate,
         _SISO | {"nx": 2}),
     "thruster": System(
         "a marine thruster rig, current to thrust, noise e / A (optid.examples)",
@@ -159,16 +166,16 @@ SYSTEMS: dict[str, System] = {
         {"na": 2, "nb": 2, "basis": "triangular:8", "nx": 2}),
     "linear": System(
         "second-order dynamics without a nonlinearity, white noise on the output",
-        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], lambda u: u), {"na": 2, "nb": 2, "nx": 2}),
+        1000, 0.1, DifferenceEquation(_A, _B, np.r_[1.0, _A], lambda u: u).simulate, {"na": 2, "nb": 2, "nx": 2}),
     "saturation": System(
         "f(u) = tanh(1.5 u) before second-order dynamics, white noise on the output",
-        1000, 0.1, partial(_equation, _A, _B, np.r_[1.0, _A], lambda u: np.tanh(1.5 * u)),
+        1000, 0.1, DifferenceEquation(_A, _B, np.r_[1.0, _A], lambda u: np.tanh(1.5 * u)).simulate,
         {"na": 2, "nb": 2, "basis": "polynomial:5", "nx": 2}),
     "ding_chen": System(
         "the Hammerstein ARMAX example of Ding and Chen (Automatica 41, 2005), a cubic and coloured noise",
         3000, _DING_NOISE,
-        partial(_equation, _DING_A, _DING_B, _DING_D, lambda u: u + 0.5 * u**2 + 0.25 * u**3, most=2.0, dt=1.0,
-                gaussian=True, power=_DING_POWER),
+        DifferenceEquation(_DING_A, _DING_B, _DING_D, lambda u: u + 0.5 * u**2 + 0.25 * u**3, most=2.0, dt=1.0,
+                           gaussian=True, power=_DING_POWER).simulate,
         {"na": 2, "nb": 2, "nk": 1, "nc": 1, "basis": "polynomial:3", "nx": 2}),
     "vanderpol": System(
         "a driven Van der Pol oscillator: its cubic damping is nonlinear feedback (optid.plants)",
