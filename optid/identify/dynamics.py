@@ -18,8 +18,8 @@ from optid.errors import OptidError, StructureError
 from optid.identify.parameters import Parameter, Parameters
 from optid.models.functions import has_feedback
 from optid.models.model import AT_ONE
+from optid.models.roots import AT_ZERO
 
-AT_ZERO = 1e-6  # modulus of a pole up to which it is a delay of a sample rather than a decay
 DECAYED = 1e-6  # share of their start to which the other modes fall before the slope of an integrator is read
 MOST = 20_000  # most samples of the response of which the slope is read
 
