@@ -296,3 +296,15 @@ def test_a_fitted_plant_is_read_in_seconds():
     assert found.static_gain(0.0) == pytest.approx(2, rel=0.02)
     assert found.pole_table[0].time_constant == pytest.approx(30, rel=0.02)
     assert found.dead_time[0] == pytest.approx(1.24, abs=0.1)
+
+
+@pytest.mark.parametrize("unit", [1e-90, 1e99])
+def test_units_of_signals_and_states_cost_no_digits(unit):
+    A, B, C, D, dt, _ = random_system(5)
+    units = np.logspace(-5, 5, len(A))
+    Phi, Gamma = held_step(A, np.column_stack([B, np.ones(len(A))]), dt)
+    model = HammersteinSS(units[:, None] * Phi / units, unit * units[:, None] * Gamma[:, :-1], C / units, unit * D, dt=dt)
+    u = np.random.default_rng(0).normal(size=(200, B.shape[1]))
+    found, expected = model.to_continuous(), model.simulate(u)
+    assert found.simulate(u, dt) / unit == pytest.approx(expected / unit, abs=1e-11)
+    assert units[:, None] ** -1 * found.B / unit == pytest.approx(B, abs=1e-10)

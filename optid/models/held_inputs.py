@@ -22,9 +22,15 @@ CHUNK = 1024  # matrix exponentials taken at a time
 
 def held_step(A: Array, B: Array, interval: float | Array) -> tuple[Array, Array]:
     """Return Phi (.., n, n) and Gamma (.., n, r): x(t + interval) = Phi x(t) + Gamma w while w is held."""
-    n, r = B.shape
-    block = np.vstack([np.hstack([A, B]), np.zeros((r, n + r))])
-    steps = expm(np.asarray(interval, dtype=float)[..., None, None] * block)
+    n, r = B.shape  # exponentials keep their digits where states and drives have units of one size
+    block, scale = np.zeros((n + r, n + r)), np.ones(n + r)
+    if n:
+        block[:n, :n], (scale[:n], _) = matrix_balance(A, permute=False, separate=True)
+    block[:n, n:] = B / scale[:n, None]
+    size, own = np.abs(block[:n, n:]).max(axis=0, initial=0.0), np.abs(block[:n, :n]).max(initial=0.0)
+    scale[n:] = np.where(size > 0, (own or 1.0) / np.where(size > 0, size, 1.0), 1.0)  # of the drives
+    block[:n, n:] *= scale[n:]
+    steps = expm(np.asarray(interval, dtype=float)[..., None, None] * block) * scale[:, None] / scale
     return steps[..., :n, :n], steps[..., :n, n:]
 
 
