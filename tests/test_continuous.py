@@ -303,7 +303,8 @@ def test_units_of_signals_and_states_cost_no_digits(unit):
     A, B, C, D, dt, _ = random_system(5)
     units = np.logspace(-5, 5, len(A))
     Phi, Gamma = held_step(A, np.column_stack([B, np.ones(len(A))]), dt)
-    model = HammersteinSS(units[:, None] * Phi / units, unit * units[:, None] * Gamma[:, :-1], C / units, unit * D, dt=dt)
+    drive = unit * units[:, None] * Gamma[:, :-1]
+    model = HammersteinSS(units[:, None] * Phi / units, drive, C / units, unit * D, dt=dt)
     u = np.random.default_rng(0).normal(size=(200, B.shape[1]))
     found, expected = model.to_continuous(), model.simulate(u)
     assert found.simulate(u, dt) / unit == pytest.approx(expected / unit, abs=1e-11)

@@ -138,8 +138,8 @@ def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
     if not isinstance(name, str) or not re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in KEYWORDS:
         raise StructureError(f"name={name!r} cannot begin the names of C functions: use letters, digits and single "
                              "underscores, a letter first, and no word of the language")
-    notes = "\n".join(f" * {_commented(line)}" for line in description(model))
-    up, (kernel, states) = name.upper(), c_kernel(model, name)
+    notes = "\n".join(f" * {comment_line(line)}" for line in description(model))
+    up, (kernel, states) = name.upper(), c_kernel(model, f"{name}_sample")
     path = Path(path)
     path.write_text(f"""/*
 {notes}
@@ -163,11 +163,11 @@ void {name}_step(double *x, const double *u, double *y) {{
 
 
 def c_kernel(model: Any, name: str) -> tuple[str, int]:
-    """Return the C function NAME_sample(x, u, next, y) of a step, and the number of states."""
+    """Return the C function name(x, u, next, y) of a step, and the number of states."""
     body = straight_line(model, C, [f"u[{c}]" for c in range(model.m)], [f"y[{o}]" for o in range(model.l)], "x",
                          "next")
     lines = "\n".join(f"  {line}" for line in body.lines)
-    return f"""static void {name}_sample(const double *x, const double *u, double *next, double *y) {{
+    return f"""static void {name}(const double *x, const double *u, double *next, double *y) {{
   double w[{body.work}];
   (void)w, (void)x, (void)u, (void)next, (void)y;
 {lines}
@@ -197,7 +197,7 @@ def to_st(model: Any, path: str | Path, name: str = "model") -> Path:
     inputs = identifiers(model.inputs, "u", taken)
     outputs = identifiers(model.outputs, "y", taken | {word.lower() for word in inputs})
     body = straight_line(model, STRUCTURED_TEXT, inputs, outputs, "x", "following")
-    notes = "\n".join(f" * {_commented(line, '*', '()')}" for line in description(model))
+    notes = "\n".join(f" * {comment_line(line, '*', '()')}" for line in description(model))
 
     def declare(kind: str, names: Iterable[str], more: str = "") -> str:
         return f"VAR{kind}\n" + "".join(f"    {word} : {more}LREAL;\n" for word in names) + "END_VAR\n"
@@ -249,7 +249,7 @@ def identifiers(names: Iterable[str], letter: str, taken: Iterable[str] = ()) ->
     return found
 
 
-def _commented(line: str, star: str = "*", ends: str = "//") -> str:
+def comment_line(line: str, star: str = "*", ends: str = "//") -> str:
     """Return a line that stays inside a comment: no end, start, trigraph, continued line or hidden character."""
     shown = "".join(c if c.isprintable() else f"(U+{ord(c):04X})" for c in line)
     begin, end = map(re.escape, ends)
