@@ -105,6 +105,11 @@ class ContinuousModel(Ports):
         return roots.invariant_zeros(self.A, self.B, self.C, self.D)
 
     @property
+    def f(self) -> Nonlinearity | tuple[Nonlinearity, ...]:
+        """The nonlinearity of the input; a tuple when there are several."""
+        return self.nonlinearities[0] if len(self.nonlinearities) == 1 else self.nonlinearities
+
+    @property
     def pole_table(self) -> PoleTable:
         """Time constant, natural frequency and damping of every mode."""
         return PoleTable.of_continuous(self.poles, self.time_unit)
