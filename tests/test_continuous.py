@@ -287,15 +287,22 @@ def test_parts_that_do_not_agree_are_refused(change, words):
     refuses(StructureError, words, ContinuousModel, **{**given, "outputs": (), "output_units": (), **change})
 
 
-def test_a_fitted_plant_is_read_in_seconds():
-    """A first-order plant with 0.24 samples more than one of dead time, from a record."""
-    r = np.random.default_rng(0)
-    u = np.repeat(r.normal(size=100), 8)
-    y = first_order(1.24).simulate(u) + 0.01 * r.normal(size=800)
-    found = optid.fit(optid.Data(u, y, dt=1.0), "oe.exact", na=1, nb=2, nk=2).model.to_continuous()
-    assert found.static_gain(0.0) == pytest.approx(2, rel=0.02)
-    assert found.pole_table[0].time_constant == pytest.approx(30, rel=0.02)
-    assert found.dead_time[0] == pytest.approx(1.24, abs=0.1)
+def test_a_fitted_plant_is_read_in_seconds_and_its_dead_time_has_an_error():
+    """Records of a plant whose dead time is half a sample more than one; the errors are those of the scatter."""
+    found = []
+    for seed in range(12):
+        r = np.random.default_rng(seed)
+        u = np.repeat(r.normal(size=60), 8)
+        y = first_order(1.5).simulate(u) + 0.02 * r.normal(size=u.size)
+        fit = optid.fit(optid.Data(u, y, dt=1.0), "oe.exact", na=1, nb=2, nk=2)
+        rows = {row.name: row for row in fit.dynamics}
+        model = fit.model.to_continuous()
+        assert rows["dead time"].estimate == pytest.approx(model.dead_time[0], abs=1e-9)
+        assert rows["time constant"].estimate == pytest.approx(model.pole_table[0].time_constant, rel=1e-9)
+        assert rows["static gain"].estimate == pytest.approx(model.static_gain(0.0), rel=1e-9)
+        found.append([(rows[name].estimate - true) / rows[name].error for name, true in (
+            ("dead time", 1.5), ("time constant", 30), ("static gain", 2))])
+    assert np.all(np.abs(found) < 3.5) and np.all(np.abs(np.std(found, axis=0) - 1) < 0.5)
 
 
 @pytest.mark.parametrize("unit", [1e-90, 1e99])
