@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import refuses
-from sample_fits import feedback_fit
+from sample_fits import example_fit, feedback_fit
 from systems import BASES, mimo, siso
 from test_physical import CUBIC, bent, quiet
+from typer.testing import CliRunner
 
 from optid.bases import UserFunctions
+from optid.cli.app import app
 from optid.errors import StructureError
 from optid.models import HammersteinSS, Nonlinearity
 from optid.models.generated_code import identifiers
@@ -108,3 +110,13 @@ def test_a_number_that_is_none_is_refused(tmp_path):
     model = HammersteinSS([[0.5]], [[1.0]], [[1.0]])
     object.__setattr__(model, "offset_y", np.array([np.inf]))
     refuses(StructureError, "contains inf", model.to_st, tmp_path / "a.st")
+
+
+def test_the_command_line_writes_by_the_ending(tmp_path):
+    for name in ("int.st", "2 plants.c"):
+        done = CliRunner().invoke(app, ["fit", "--example", "thruster", "--model", str(tmp_path / name)])
+        assert done.exit_code == 0, done.output
+    model = example_fit("thruster").model
+    block, u = Block(tmp_path / "int.st"), example_fit("thruster").data.u[:50]
+    assert block.name == "int_2" and "model_2_plants_step(" in (tmp_path / "2 plants.c").read_text(encoding="utf-8")
+    assert np.array([block(row) for row in u]) == pytest.approx(model.simulate(u), abs=1e-9)
