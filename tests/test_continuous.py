@@ -87,6 +87,8 @@ def test_linear_output_injection_is_part_of_the_equations():
     model = HammersteinSS([[0.5]], [[1.0]], [[2.0]], [[0.3]], L=[[0.1]], offset_x=[0.2], offset_y=[0.4], dt=0.1)
     u = np.random.default_rng(0).normal(size=50)
     assert model.to_continuous().simulate(u, 0.1) == pytest.approx(model.simulate(u), abs=1e-12)
+    assert model.pole_table[0].time_constant == pytest.approx(-0.1 / np.log(0.7))
+    assert model.to_continuous().pole_table[0].time_constant == pytest.approx(-0.1 / np.log(0.7))
 
 
 @pytest.mark.parametrize("theta", [0.0, 1e-4, 0.3, 1.24, 2.0, 2.7])
@@ -103,6 +105,14 @@ def sampled_with_delay(true):
     a = np.real(np.poly(np.exp(true.poles)))
     b = np.convolve(true.simulate(np.eye(1, 30)[0], 1.0), a)[int(theta) + 1 :][: n + bool(theta % 1)]
     return HammersteinTF(a[1:], (b,), (LINE,), (int(theta) + 1,), [0.0])
+
+
+def test_every_input_has_its_own_part_of_a_sample():
+    first, second = first_order(1.24), first_order(3.7, gain=-1.0)
+    model = HammersteinTF(first.a, (*first.b, *second.b), (LINE, nonlinearity(BASES[0])), (2, 4), [0.3])
+    found, u = model.to_continuous(), inputs(model)
+    assert found.dead_time == pytest.approx([1.24, 3.7], abs=1e-9)
+    assert found.simulate(u, 1.0) == pytest.approx(model.simulate(u), abs=1e-10)
 
 
 @pytest.mark.parametrize("lead", [0.5, 2.0])

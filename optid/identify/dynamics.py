@@ -18,7 +18,7 @@ from optid.errors import OptidError, StructureError
 from optid.identify.parameters import Parameter, Parameters
 from optid.models.functions import has_feedback
 from optid.models.model import AT_ONE
-from optid.models.roots import AT_ZERO
+from optid.models.roots import AT_ZERO, poles_of
 
 DECAYED = 1e-6  # share of their start to which the other modes fall before the slope of an integrator is read
 SAME = 1e-9  # of a sample: a smaller part is rounding
@@ -89,14 +89,6 @@ def integrating_pole(model: Any, known: Any = None) -> tuple[float, str]:
                 return pole, (f"The record does not tell the pole {pole:.5g} (from {float(found.lower):.5g} to "
                               f"{float(found.upper):.5g}) from 1: the model may integrate, no level of rest is known")
     return np.nan, ""
-
-
-def poles_of(model: Any) -> Array:
-    """Return the poles of the plant, largest first, linear feedback of the output included."""
-    if model.structure != "ss" or not np.any(model.L):
-        return np.asarray(model.poles)
-    found = np.linalg.eigvals(model.A + model.L @ model.C).astype(complex)
-    return found[np.argsort(-np.abs(found), kind="stable")]
 
 
 def real_poles(poles: Array) -> list[float]:

@@ -142,5 +142,8 @@ def zeros(model: Any) -> Any:
 
 
 def pole_table(model: Any) -> PoleTable:
-    """Time constant, natural frequency and damping of every mode, the slowest first."""
-    return PoleTable.of_sampled(model.poles, model.dt, model.time_unit)
+    """Time constant, natural frequency and damping of every mode, the slowest first.
+
+    Linear feedback of outputs is part of the modes; nonlinear feedback, which moves them with its level, is not.
+    """
+    return PoleTable.of_sampled(roots.poles_of(model), model.dt, model.time_unit)

@@ -27,6 +27,14 @@ def spectral_radius(matrix: Array) -> float:
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
 
 
+def poles_of(model: Any) -> Array:
+    """Return the poles of the plant, largest first, linear feedback of the output included."""
+    if model.structure != "ss" or not np.any(model.L):
+        return np.asarray(model.poles)
+    found = np.linalg.eigvals(model.A + model.L @ model.C).astype(complex)
+    return found[np.argsort(-np.abs(found), kind="stable")]
+
+
 def modal_weight(matrix: Array) -> Array:
     """Return ``P = T T*`` (n, n) of the eigenvectors T of A, which stays definite where T is singular.
 
