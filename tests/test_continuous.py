@@ -178,6 +178,8 @@ def test_at_rest_nothing_moves():
     model = process(delay=4.2)
     assert model.simulate(np.full(30, 1.5), 1.0, x0="rest") == pytest.approx(3.0, abs=1e-12)
     refuses(StructureError, "integrator", process((0.0,)).simulate, np.ones(5), 1.0, x0="rest")
+    refuses(StructureError, "integrator", process((-0.5, 0.0)).static_gain, 0.0)
+    assert process((-1e7, -1e-5)).static_gain(0.0) == pytest.approx(2, rel=1e-12)
     refuses(StructureError, "'zero', 'rest'", model.simulate, np.ones(5), 1.0, x0="fit")
 
 
