@@ -3,6 +3,7 @@
 import io
 import pickle
 import warnings
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from random_calls import limited
 
 import optid
-from optid.errors import DataError, DataWarning, OptidError
+from optid.errors import DataError, DataWarning, OptidError, StructureError
 from optid.registry import FORMULATIONS, registered
 from optid.show.documents import fit_document
 from optid.show.page import render
@@ -126,9 +127,11 @@ def uses(fit: Any, folder: Path, seed: int) -> dict[str, Any]:
         return ""  # of a model that predicts nothing `validate` says so
 
     def exported() -> None:
-        model.to_c(folder / "model.c"), model.to_casadi()
-        if fit.formulation != "physical":  # which has no linear part of its own
-            model.to_dlti(), model.to_control() if find_spec("control") else None
+        model.to_c(folder / "model.c"), model.to_st(folder / "model.st"), model.to_casadi()
+        model.to_dlti(), model.to_control() if find_spec("control") else None
+        str(model.pole_table), model.zeros
+        with suppress(StructureError):  # a pole at 0, a negative real one, nonlinear feedback
+            model.to_continuous()
 
     return {"text": text, "repr": lambda: repr(fit) + repr(model) and "", "page": page, "figure": figure, "load": load,
             "pickle": pickled, "validation": validation, "export": exported}

@@ -12,6 +12,7 @@ from refusals import refuses
 from sample_fits import feedback_fit
 from scipy import signal, special
 from systems import BASES, inputs, mimo, nonlinearity, siso
+from test_physical import CUBIC, bent, quiet
 
 from optid.bases import UserFunctions
 from optid.errors import OptidError, StructureError
@@ -44,6 +45,15 @@ def test_control_has_the_frequency_response(model):
     for k, frequency in enumerate(w):
         value = np.reshape(system(np.exp(1j * frequency * model.dt)), (model.l, model.m))
         assert value == pytest.approx(response[k], abs=1e-10)
+
+
+def test_a_physical_model_is_exported_about_its_operating_point():
+    pytest.importorskip("control")
+    model, w = quiet(bent(), CUBIC).model, 0.7
+    system, other, expected = model.to_control(), model.to_dlti(), model.frequency_response(w).ravel()
+    assert np.ravel(system(np.exp(1j * w * model.dt))) == pytest.approx(expected, abs=1e-12)
+    assert all(np.array_equal(a, b) for a, b in zip((other.A, other.B, other.C, other.D), model.matrices))
+    assert system.input_labels == list(model.inputs)
 
 
 def test_control_missing_names_the_remedy(monkeypatch):

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import command_line, reading_for, working
+from optid.cli.results import command_line, reading_for, save_model, working
 
 ZERO = "INPUT=VALUE, the input at which the actuator has no effect"
 
@@ -159,7 +159,7 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
         seed: Seed of the draws, the probes and the example.
     The result:
         target (Y...): Check whether these constant outputs are attainable; one number per output.
-        saved (--model -m FILE): Write the model of the damaged system (JSON).
+        saved (--model -m FILE): Write the model of the damaged system; formats as of optid fit.
     """
     with working(saved, report, picture) as work:
         from optid.cli import arguments as words
@@ -176,7 +176,7 @@ def reformulate(model: Path, diagnosis: Path, data: Paths = None, *, example: st
             stage=stage, nodes=nodes, low=words.numbers(low, "--low"), high=words.numbers(high, "--high"),
             if_ambiguous=if_ambiguous, solver=solver, seed=seed,
         )
-        work.write("model", saved, lambda path: built.model.save(path))
+        work.write("model", saved, lambda path: save_model(built.model, path))
         work.text = str(built)
         if target is not None:
             work.text += f"\ntarget {built.attainable(words.numbers(target, '--target') or [])}"

@@ -9,7 +9,7 @@ import typer
 
 from optid.cli.derived import DEFAULT
 from optid.cli.options import File, Paths, Words
-from optid.cli.results import Work, check_names, reading_for, solver_choice, working
+from optid.cli.results import Work, check_names, reading_for, save_model, solver_choice, working
 from optid.cli.terminal import STOPPED
 from optid.errors import DataError
 from optid.lazy import import_cvxpy
@@ -126,7 +126,7 @@ def _save(work: Work, found: Any, held_out: Any, saved: Path | None, data: Paths
     if data and held_out is None:
         named = {key: words.listed(value) if isinstance(value, list) else value for key, value in how.items()}
         record = {**named, "files": [str(Path(name).resolve()) for name in data]}
-    work.write("model", saved, lambda path: found.model.save(path, record))
+    work.write("model", saved, lambda path: save_model(found.model, path, record))
 
 
 def _check(work: Work, found: Any, record: Any, held_out: Any, what: str) -> None:

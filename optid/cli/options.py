@@ -68,7 +68,7 @@ The solver:
     solver (-s NAME): Solver, or STEP=NAME,... for steps of the formulation; optid solvers lists them.
 The result:
     report (-o FILE): Write a self-contained HTML report.
-    saved (--model -m FILE): Write the model (JSON).
+    saved (--model -m FILE): Write the model: JSON, or an FMU, structured text or C by the ending .fmu, .st or .c.
     picture (-p FILE): Write a figure (PNG, PDF).
 Options:
     title (--study TITLE): Study to use, if the database holds several.

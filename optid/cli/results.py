@@ -64,6 +64,17 @@ def check_folders(*paths: Path | None) -> None:
                             "read-only; give a file in another folder")
 
 
+def save_model(model: Any, path: Path, record: Mapping[str, Any] | None = None) -> None:
+    """Write a model as JSON, or by the ending .fmu, .st or .c as an FMU, structured text or C."""
+    from optid.models.generated_code import KEYWORDS, ST_KEYWORDS, identifiers
+
+    name = identifiers([path.stem], "model", KEYWORDS | ST_KEYWORDS)[0]
+    if path.suffix in (".fmu", ".st", ".c"):
+        getattr(model, f"to_{path.suffix[1:]}")(path, name)
+    else:
+        model.save(path, record)
+
+
 class Work(Waiting):
     """The progress of a command, and what it prints at the end, also where an error ends it.
 

@@ -18,9 +18,10 @@ from optid.errors import OptidError, StructureError
 from optid.identify.parameters import Parameter, Parameters
 from optid.models.functions import has_feedback
 from optid.models.model import AT_ONE
+from optid.models.roots import AT_ZERO, poles_of
 
-AT_ZERO = 1e-6  # modulus of a pole up to which it is a delay of a sample rather than a decay
 DECAYED = 1e-6  # share of their start to which the other modes fall before the slope of an integrator is read
+SAME = 1e-9  # of a sample: a smaller part is rounding
 MOST = 20_000  # most samples of the response of which the slope is read
 
 Levels = Sequence[tuple[float, float]]
@@ -32,9 +33,10 @@ def dynamics(model: Any, levels: Levels, known: Any = None, reason: str = "", le
 
     The dead time of an input is nk - 1 samples, and zero for nk = 0 and nk = 1: an input held over its sampling time
     acts on the next sample (lag 1) without any dead time. A true dead time that is no multiple of the sampling time is
-    longer by less than one sample. Where f is nonlinear the static gain is the slope of the static characteristic over
-    the middle half of the input's range, between two levels that a note states. A model that integrates has a slope
-    instead: how fast the output moves for a unit of the input.
+    longer by less than one sample; where B has the coefficient that it takes (nb = na + 1) and determines that part, it
+    is included, with its error (see `optid.models.conversion.to_continuous`). Where f is nonlinear the static gain is
+    the slope of the static characteristic over the middle half of the input's range, between two levels that a note
+    states. A model that integrates has a slope instead: how fast the output moves for a unit of the input.
 
     Args:
         model: the model.
@@ -87,14 +89,6 @@ def integrating_pole(model: Any, known: Any = None) -> tuple[float, str]:
                 return pole, (f"The record does not tell the pole {pole:.5g} (from {float(found.lower):.5g} to "
                               f"{float(found.upper):.5g}) from 1: the model may integrate, no level of rest is known")
     return np.nan, ""
-
-
-def poles_of(model: Any) -> Array:
-    """Return the poles of the plant, largest first, linear feedback of the output included."""
-    if model.structure != "ss" or not np.any(model.L):
-        return np.asarray(model.poles)
-    found = np.linalg.eigvals(model.A + model.L @ model.C).astype(complex)
-    return found[np.argsort(-np.abs(found), kind="stable")]
 
 
 def real_poles(poles: Array) -> list[float]:
@@ -254,16 +248,32 @@ class _Reading:
         if not hasattr(model, "nk"):
             return []
         direct = [name for name, nk in zip(model.inputs, model.nk) if nk == 0]
-        self.notes.append("Dead time: nk - 1 samples, as given" + (
-            f"; with nk = 0 {', '.join(direct)} acts on the same sample." if direct else "."))
-        found = []
+        found, with_part = [], self._with_part_of_sample()
+        if not with_part.all():
+            self.notes.append("Dead time: nk - 1 samples, as given" + (
+                f"; with nk = 0 {', '.join(direct)} acts on the same sample." if direct else "."))
         for c, (name, nk) in enumerate(zip(model.inputs, model.nk)):
+            if with_part[c]:
+                self.notes.append(f"Dead time{self._of(name)}: nk - 1 samples, as given, and the part of a sample that "
+                                  "explains the last coefficient of B.")
+                row = self.limits("dead time", lambda model, c=c: model.to_continuous().dead_time[[c]])[0]
+                found.append(_parameter(f"dead time{self._of(name)}", row, self.time))
+                continue
             more = self._insignificant(c)
             if more:
                 self.notes.append(f"The first coefficients of B of {name} are not significant ({more}): the dead time "
                                   f"may be up to {self._time(max(nk + more - 1, 0))}.")
             found.append(Parameter(f"dead time{self._of(name)}", max(nk - 1, 0) * model.dt, unit=self.time))
         return found
+
+    def _with_part_of_sample(self) -> Any:
+        """Tell for every input (m,) whether its dead time exceeds nk - 1 samples by a part that B determines."""
+        model = self.model
+        try:
+            late = model.to_continuous().dead_time / model.dt
+        except StructureError:  # there is no such model
+            return np.full(model.m, False)
+        return late - np.maximum(np.array(model.nk) - 1, 0) > SAME
 
     def _insignificant(self, c: int) -> int:
         """Count the first coefficients of B whose intervals contain zero."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.errors import DataError, DataWarning, OptidError, StructureError
-from optid.identify.dynamics import Levels, integrating_pole, jumps, poles_of, slope_samples
+from optid.identify.dynamics import Levels, integrating_pole, jumps, slope_samples
 from optid.models.functions import has_feedback
-from optid.models.model import AT_ONE
+from optid.models.roots import AT_ONE, poles_of
 
 POINTS, SAMPLES = 41, 121
 """Points of a characteristic besides the nodes of f, and most places of a step response."""

@@ -1,9 +1,7 @@
-"""Models for other tools: SciPy, python-control, CasADi for predictive control, and C."""
+"""Models for other tools: SciPy, python-control, and CasADi for predictive control."""
 
-import re
 import warnings
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -14,29 +12,26 @@ from optid.models.feedback_tables import CELLS, FREE, LEGENDRE, LINEAR, USER, ta
 from optid.models.nonlinearity import Nonlinearity
 
 DROPPED = 1e-14  # leading coefficients of a numerator that SciPy takes for zero
-KEYWORDS = frozenset("""
-alignas alignof auto bool break case char const constexpr continue default do double else enum extern false float for
-goto if inline int long main nullptr register restrict return short signed sizeof static struct switch thread_local true
-typedef typeof union unsigned void volatile while""".split())  # of C99 to C23, without those that begin with "_"
+STATES = ("ss", "physical")  # structures whose linear part is given by its states
 
 
 def to_dlti(model: Any, output: int | str = 0, input: int | str = 0) -> Any:
     """Return the linear part as a `scipy.signal.dlti` with the model's dt.
 
     The nonlinearity and the constant are not part of it. A state-space model is returned whole, from every f to every
-    output. Of a transfer function it is the part from one f to one output: with one output a transfer function, with
-    several, or a leading coefficient so small that SciPy would drop it, a state-space system. An unknown channel, a
-    name or an index, raises a `StructureError`.
+    output, and a physical one about its operating point. Of a transfer function it is the part from one f to one
+    output: with one output a transfer function, with several, or a leading coefficient so small that SciPy would drop
+    it, a state-space system. An unknown channel, a name or an index, raises a `StructureError`.
     """
     from scipy.signal import dlti
 
     o, c = _position(output, model.outputs, "output"), _position(input, model.inputs, "input")
-    if model.structure != "ss" and model.l == 1:
+    if model.structure not in STATES and model.l == 1:
         numerator, denominator = _polynomials(model, c)
         if abs(numerator[0]) > DROPPED or not numerator.any():
             return dlti(numerator, denominator, dt=model.dt)
     a, b, c_matrix, d = state_space(model)
-    if model.structure == "ss":
+    if model.structure in STATES:
         return dlti(a, b, c_matrix, d, dt=model.dt)
     return dlti(a, b[:, [c]], c_matrix[[o]], d[[o]][:, [c]], dt=model.dt)
 
@@ -46,24 +41,35 @@ def to_control(model: Any) -> Any:
 
     Its inputs are the values of the nonlinearities, "f(u)" of an input "u" (a linear one keeps its name); the constants
     are not part of it. A transfer-function model with one output is a transfer function, every other one a state-space
-    system. The outputs keep their names; a full stop, which python-control reserves, becomes an underscore.
+    system; dead times are poles at 0. The outputs keep their names; a full stop, which python-control reserves, becomes
+    an underscore.
 
     Raises:
         OptidError: python-control is not installed.
     """
+    control, names = control_package(), control_names(model)
+    if model.structure in STATES or model.l > 1:
+        return control.ss(*state_space(model), model.dt, **names)
+    pairs = [_polynomials(model, c) for c in range(model.m)]
+    return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt, **names)
+
+
+def control_package() -> Any:
+    """Return python-control; refuse where it is not installed (`OptidError`)."""
     try:
         import control
     except ImportError as error:
         raise OptidError("to_control needs python-control: pip install 'optid[control]'") from error
+    return control
+
+
+def control_names(model: Any) -> dict[str, list[str]]:
+    """Return the names of the inputs and outputs of a python-control system; see `to_control`."""
     places = list(getattr(model, "input_of", range(model.m)))
     drives = [model.inputs[i] if f.is_linear else f"f{places[:k].count(i) + 1 if places.count(i) > 1 else ''}"
               f"({model.inputs[i]})" for k, (f, i) in enumerate(zip(model.nonlinearities, places))]
-    names = {"inputs": [name.replace(".", "_") for name in drives],
-             "outputs": [name.replace(".", "_") for name in model.outputs]}
-    if model.structure == "ss" or model.l > 1:
-        return control.ss(*state_space(model), model.dt, **names)
-    pairs = [_polynomials(model, c) for c in range(model.m)]
-    return control.tf([[num for num, _ in pairs]], [[den for _, den in pairs]], model.dt, **names)
+    return {"inputs": [name.replace(".", "_") for name in drives or model.inputs],
+            "outputs": [name.replace(".", "_") for name in model.outputs]}
 
 
 def to_casadi(model: Any) -> Any:
@@ -103,79 +109,12 @@ def to_casadi(model: Any) -> Any:
     return ca.Function(name, [x, u], [following, y], ["x", "u"], ["x_next", "y"])
 
 
-def to_c(model: Any, path: str | Path, name: str = "model") -> Path:
-    """Write a model as one C file without dependencies, for a control loop: the free run, one sample a call.
-
-    ``NAME_step(x, u, y)`` computes the outputs y of a sample from its inputs u and takes the state x to the next one;
-    NAME_STATES, NAME_INPUTS and NAME_OUTPUTS are their lengths, NAME_DT is the sampling time. The state is that of
-    `to_casadi`; zeros are a start at rest. Iterating equals `model.simulate`. The code allocates nothing.
-
-    Args:
-        model: the model.
-        path: the file, replaced when it exists.
-        name: prefix of the names in C.
-
-    Raises:
-        StructureError: a name that C does not take, or as `to_casadi`.
-    """
-    import casadi as ca
-
-    if not isinstance(name, str) or not re.fullmatch("[A-Za-z](_?[A-Za-z0-9])*", name) or name.lower() in KEYWORDS:
-        raise StructureError(f"name={name!r} cannot begin the names of C functions: use letters, digits and single "
-                             "underscores, a letter first, and no word of the language")
-    function = model.to_casadi()
-    x, u = (ca.SX.sym(word, function.size1_in(i)) for i, word in enumerate("xu"))
-    kernel = ca.Function(f"{name}_kernel", [x, u], list(function(x, u)))
-    code = ca.CodeGenerator(f"{name}.c", {"with_header": False})
-    code.add(kernel)
-    channels = [f"{kind} {k}: {channel}{f' ({unit})' if unit else ''}" for kind, names, units in (
-        ("u", model.inputs, model.input_units), ("y", model.outputs, model.output_units))
-        for k, (channel, unit) in enumerate(zip(names, units))]
-    lines = [model.title, *channels, *model.equation().splitlines(), model.sampling]
-    notes = "\n".join(f" * {_commented(line)}" for line in lines)
-    up = name.upper()
-    path = Path(path)
-    path.write_text(f"""/*
-{notes}
- */
-#define {up}_STATES {x.numel()}
-#define {up}_INPUTS {u.numel()}
-#define {up}_OUTPUTS {model.l}
-#define {up}_DT {model.dt!r}
-
-#ifdef __GNUC__
-#pragma GCC diagnostic push
-#pragma GCC diagnostic ignored "-Wunused-parameter"
-#endif
-{code.dump()}
-#ifdef __GNUC__
-#pragma GCC diagnostic pop
-#endif
-
-/* Compute y (of {up}_OUTPUTS) from x and u (of {up}_STATES, {up}_INPUTS), and take x to the next sample. */
-void {name}_step(double *x, const double *u, double *y) {{
-  const double *arg[{max(kernel.sz_arg(), 2)}] = {{x, u}};
-  double next[{max(x.numel(), 1)}], w[{max(kernel.sz_w(), 1)}];
-  double *res[{max(kernel.sz_res(), 2)}] = {{next, y}};
-  casadi_int iw[{max(kernel.sz_iw(), 1)}];
-  {name}_kernel(arg, res, iw, w, 0);
-  for (int i = 0; i < {x.numel()}; i++) x[i] = next[i];
-}}
-""", encoding="utf-8")
-    return path
-
-
-def _commented(line: str) -> str:
-    """Return a line that stays inside a C comment: no end, start, trigraph, continued line or hidden character."""
-    shown = "".join(c if c.isprintable() else f"(U+{ord(c):04X})" for c in line)
-    apart = re.sub(r"\*(?=/)|/(?=\*)|\?(?=\?)", r"\g<0> ", shown)
-    return f"{apart}." if apart.rstrip().endswith("\\") else apart
-
-
 def state_space(model: Any) -> tuple[Array, Array, Array, Array]:
     """Return A, B, C, D of the linear part, of a transfer function in observer form with n l states."""
     if model.structure == "ss":
         return model.A, model.B, model.C, model.D
+    if model.structure == "physical":
+        return model.matrices
     n, outputs = model.largest_lag, model.l
     rows = model.numerators.copy()
     a, b = np.eye(n * outputs, k=outputs), rows[1:].reshape(n * outputs, model.m)

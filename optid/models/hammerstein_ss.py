@@ -10,6 +10,7 @@ from optid.data.record import Data
 from optid.errors import DataError
 from optid.models import state_simulation as simulation
 from optid.models import text
+from optid.models.continuous import ContinuousModel
 from optid.models.experiments import Record, records_of
 from optid.models.files import KINDS
 from optid.models.state_space import StateSpace
@@ -69,3 +70,4 @@ class HammersteinSS(StateSpace):
 
 
 KINDS["HammersteinSS"] = HammersteinSS.from_dict
+ContinuousModel.SAMPLED = HammersteinSS

@@ -15,13 +15,13 @@ from optid.data.channels import Ports, Transform, check_texts, interval_text, nu
 from optid.data.record import Data
 from optid.data.stretches import runs_of
 from optid.errors import DataError, DataWarning, StructureError
-from optid.models import export, files, roots
+from optid.models import conversion, export, files, fmu, generated_code, roots
 from optid.models.experiments import Record, records_of, state_like
 from optid.models.nonlinearity import Nonlinearity
+from optid.models.roots import AT_ONE
 
 TITLES = {"oe": "output-error", "arx": "ARX", "armax": "ARMAX", "bj": "Box-Jenkins", "ss": "state-space"}
 ROUNDING = 1e-12  # of a pole on the unit circle
-AT_ONE = 1e-8  # distance from 1 within which a pole integrates: descents end 1e-9 before it
 
 
 class Model(Ports):
@@ -352,7 +352,10 @@ class Model(Ports):
 
     # -- other tools and files -----------------------------------------------------------------------------------
 
-    to_dlti, to_control, to_casadi, to_c = export.to_dlti, export.to_control, export.to_casadi, export.to_c
+    to_continuous, to_discrete = conversion.to_continuous, conversion.to_discrete
+    zeros, pole_table = property(conversion.zeros), property(conversion.pole_table)
+    to_dlti, to_control, to_casadi = export.to_dlti, export.to_control, export.to_casadi
+    to_c, to_st, to_fmu = generated_code.to_c, generated_code.to_st, fmu.to_fmu
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""

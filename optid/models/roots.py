@@ -7,6 +7,9 @@ import numpy as np
 from optid.arrays import Array
 
 DEFINITE = 1e-9  # share of the identity in a modal weight
+AT_ONE = 1e-8  # distance from 1 within which a pole integrates: descents end 1e-9 before it
+AT_ZERO = 1e-6  # modulus of a pole up to which it is a delay of a sample rather than a decay
+RANK = 1e-10  # singular values below this share of the largest entry of a system count as zero
 
 
 def roots_of(coefficients: Array) -> Any:
@@ -22,6 +25,14 @@ def radius(coefficients: Array) -> float:
 def spectral_radius(matrix: Array) -> float:
     """Largest modulus of the eigenvalues of a matrix; zero without rows."""
     return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
+def poles_of(model: Any) -> Array:
+    """Return the poles of the plant, largest first, linear feedback of the output included."""
+    if model.structure != "ss" or not np.any(model.L):
+        return np.asarray(model.poles)
+    found = np.linalg.eigvals(model.A + model.L @ model.C).astype(complex)
+    return found[np.argsort(-np.abs(found), kind="stable")]
 
 
 def modal_weight(matrix: Array) -> Array:
@@ -82,3 +93,35 @@ def contained(coefficients: Array, limit: float = np.inf) -> Array:
     roots = roots_of(coefficients)
     roots = roots / np.maximum(np.abs(roots), 1.0) ** 2
     return with_roots(roots * np.minimum(limit / np.maximum(np.abs(roots), 1e-300), 1.0), len(coefficients))
+
+
+def invariant_zeros(A: Array, B: Array, C: Array, D: Array) -> Any:
+    """Return the zeros (k,), complex, largest first: the values at which [A - zI, B; C, D] loses rank.
+
+    The part of the system at infinity is removed by rank decisions (Emami-Naeini and Van Dooren, Automatica 18, 1982),
+    so that inputs and outputs may differ in number. Modes that an input cannot reach, or no output shows, are zeros.
+    """
+    size = max((float(np.abs(matrix).max(initial=0.0)) for matrix in (A, B, C, D)), default=0.0)
+    if not B.shape[1] or not len(C) or size == 0:
+        return np.zeros(0, dtype=complex)
+    A, B, C, D = _without_surplus_outputs(A, B, C, D, RANK * size)
+    A, C, B, D = (matrix.T for matrix in _without_surplus_outputs(A.T, C.T, B.T, D.T, RANK * size))
+    found = np.linalg.eigvals(A - B @ np.linalg.solve(D, C)) if len(D) else np.linalg.eigvals(A)
+    return largest_first(found.astype(complex))
+
+
+def _without_surplus_outputs(A: Array, B: Array, C: Array, D: Array, tolerance: float
+                             ) -> tuple[Array, Array, Array, Array]:
+    """Return a system with the same zeros whose D has full row rank: an output without D holds its states at zero."""
+    while True:
+        left, values, _ = np.linalg.svd(D)
+        rank = int(np.sum(values > tolerance))
+        D, C = left.T @ D, left.T @ C
+        D, C, free = D[:rank], C[:rank], C[rank:]
+        turn, values, _ = np.linalg.svd(free.T)
+        held = int(np.sum(values > tolerance))
+        if held == 0:
+            return A, B, C, D
+        A, B, C = turn.T @ A @ turn, turn.T @ B, C @ turn
+        C, D = np.vstack([C[:, held:], A[:held, held:]]), np.vstack([D, B[:held]])
+        A, B = A[held:, held:], B[held:]

@@ -153,14 +153,36 @@ def density(samples: Array, low: float, high: float) -> Series:
     return Series("density of the samples", edges[:-1], counts / max(counts.max(), 1), "bars", "muted", aside=True)
 
 
+def frequencies(model: Any, count: int = 300) -> Array:
+    """Return frequencies in radians per unit of time: up to the Nyquist frequency, or around continuous poles."""
+    if hasattr(model, "dt"):
+        return np.geomspace(np.pi / model.dt * 1e-3, np.pi / model.dt, count)
+    sizes = np.concatenate([np.abs(model.poles), [1 / delay for delay in model.dead_time if delay]])
+    sizes = sizes[sizes > 1e-12 * sizes.max(initial=0.0)]
+    low, high = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
+    return np.geomspace(low / 100, 10 * high, count)
+
+
+def ratio_unit(model: Any) -> str:
+    """Return the unit of the responses, where all have the same and it is known; otherwise ""."""
+    units = {f"{y or 1}/{u}" if u else y for y in model.output_units for u in model.input_units}
+    return units.pop() if len(units) == 1 else ""
+
+
 def dynamics_charts(models: dict[str, Any], levels: Levels, known: Any = None) -> list[Chart]:
-    """Bode magnitude and phase from input to output, with bands where the uncertainty is known, and poles.
+    """Return `bode_charts` and the poles."""
+    return [*bode_charts(models, levels, known), pole_chart({label: model.poles for label, model in models.items()})]
+
+
+def bode_charts(models: dict[str, Any], levels: Levels, known: Any = None, hertz: bool = False) -> list[Chart]:
+    """Bode magnitude and phase from input to output, with bands where the uncertainty is known.
 
     A nonlinear f counts with its range over that of its input, between two levels of every input, so that the scale
     between f and B has no effect.
     """
     first = next(iter(models.values()))
-    w = np.geomspace(np.pi / first.dt * 1e-3, np.pi / first.dt, 300)
+    w = frequencies(first)
+    at = w / (2 * np.pi) if hertz else w
     pairs = response_pairs(first)
     size, turn = (None, None) if known is None else known.frequency_response(
         w, lambda model: mean_slopes(model, levels))
@@ -172,19 +194,21 @@ def dynamics_charts(models: dict[str, Any], levels: Levels, known: Any = None) -
             name = " ".join(part for part in (label, f"{u} to {y}" if len(pairs) > 1 else "") if part) or "response"
             if size is not None and turn is not None:
                 lower, upper = (edge.reshape(w.size, -1)[:, k] for edge in (size.lower, size.upper))
-                magnitude.append(Series("95 % band" if len(pairs) == 1 else "", w, decibels(upper), "area", colour,
+                magnitude.append(Series("95 % band" if len(pairs) == 1 else "", at, decibels(upper), "area", colour,
                                         decibels(lower)))
                 lower, upper = (np.degrees(edge.reshape(w.size, -1)[:, k]) for edge in (turn.lower, turn.upper))
-                phase.append(Series("95 % band" if len(pairs) == 1 else "", w, upper, "area", colour, lower))
-            magnitude.append(Series(name, w, decibels(np.abs(curves[:, k])), colour=colour, width=2.0))
-            phase.append(Series(name, w, np.degrees(np.unwrap(np.angle(curves[:, k]))), colour=colour, width=2.0))
-    frequency = Axis(frequency_title(first), log=True, low=float(w[0]), high=float(w[-1]))
+                phase.append(Series("95 % band" if len(pairs) == 1 else "", at, upper, "area", colour, lower))
+            magnitude.append(Series(name, at, decibels(np.abs(curves[:, k])), colour=colour, width=2.0))
+            phase.append(Series(name, at, np.degrees(np.unwrap(np.angle(curves[:, k]))), colour=colour, width=2.0))
+    frequency = Axis(frequency_title(first, hertz), log=True, low=float(at[0]), high=float(at[-1]))
     bent = any(not function.is_linear for model in models.values() for function in static_functions(model))
-    caption = ("From input to output, up to the Nyquist frequency" + ", with the mean slope of f" * bent
+    reach = ", up to the Nyquist frequency" * hasattr(first, "dt")
+    caption = (f"From input to output{reach}" + ", with the mean slope of f" * bent
                + ("; shaded: 95 % bands." if known is not None else "."))
-    return [Chart("Bode diagram: magnitude", caption, frequency, Axis("magnitude (dB)", unit="dB"), magnitude, "bode"),
-            Chart("Bode diagram: phase", caption, frequency, Axis("phase (degrees)", unit="degrees"), phase, "bode"),
-            pole_chart({label: model.poles for label, model in models.items()})]
+    unit = ratio_unit(first)
+    size_axis = Axis(f"magnitude (dB of {unit})" if unit else "magnitude (dB)", unit="dB")
+    return [Chart("Bode diagram: magnitude", caption, frequency, size_axis, magnitude, "bode"),
+            Chart("Bode diagram: phase", caption, frequency, Axis("phase (degrees)", unit="degrees"), phase, "bode")]
 
 
 def pole_chart(poles: dict[str, Array]) -> Chart:

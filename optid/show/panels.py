@@ -63,7 +63,7 @@ COLOURS = {f"c{k}": LINES[k % len(LINES)] for k in range(10)} | {
     "ink": (INK, "-"), "muted": (MUTED, "-"), "red": (RED, "-")}
 """Colour and dash of the curves that a chart names by the variables of the style sheet."""
 
-MARKERS = {"stems": "o", "diamonds": "D", "dots": "o", "poles": "x"}
+MARKERS = {"stems": "o", "diamonds": "D", "dots": "o", "poles": "x", "zeros": "o"}
 """Signs of the series of a chart that are no lines."""
 
 CLOSEUP = 200
@@ -172,7 +172,8 @@ def draw_chart(ax: Axes, chart: Chart, legend: bool = True, title: str = "") -> 
         elif one.kind in MARKERS:
             if one.kind in ("stems", "diamonds"):
                 ax.vlines(xs, 0, ys, color=colour, linewidth=1.3)
-            ax.plot(xs, ys, MARKERS[one.kind], color=colour, markersize=6 if one.kind == "poles" else 4, label=name)
+            ax.plot(xs, ys, MARKERS[one.kind], color=colour, markersize=6 if one.kind in ("poles", "zeros") else 4,
+                    label=name, fillstyle="none" if one.kind == "zeros" else "full")
         else:
             style: Any = (0, tuple(map(float, one.dash.split()))) if one.dash else dash
             ax.plot(*thinned(xs, ys), color=colour, linestyle=style, linewidth=0.85 * one.width, label=name)

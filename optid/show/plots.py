@@ -15,7 +15,7 @@ from optid.identify.dynamics import input_levels
 from optid.identify.validation import Validation
 from optid.lazy import public_names
 from optid.models.functions import static_functions
-from optid.show import charts, panels, responses
+from optid.show import charts, frequency, panels, responses
 from optid.show.estimates import uncertainty
 from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, styled
 from optid.show.sections import Chart
@@ -121,6 +121,56 @@ def poles_and_response(fit: "Fit") -> Figure:
     steps = [one.chart for one in _drawn(fit) if one.curve.kind == "step"]
     _panels(figure, [*_dynamics(fit), *steps])
     return figure
+
+
+@styled
+def bode(result: Any, hertz: bool = False) -> Figure:
+    """Draw magnitude and phase from every input to every output, of a fit with 95 % bands.
+
+    Args:
+        result: a fit, or a model, sampled or continuous.
+        hertz: frequencies in Hz (cycles per unit of time) instead of radians per unit of time.
+    """
+    model, levels, known = _linear_part(result)
+    figure = Figure(figsize=(7.2, 5.6), layout="constrained")
+    for ax, chart in zip(figure.subplots(2, 1, sharex=True), charts.bode_charts({"": model}, levels, known, hertz)):
+        panels.draw_chart(ax, chart)
+        ax.label_outer()
+    return figure
+
+
+@styled
+def nyquist(result: Any) -> Figure:
+    """Draw the frequency response of a fit or model in the complex plane, of a fit with 95 % ellipses."""
+    return _plane(frequency.nyquist_chart(*_linear_part(result)))
+
+
+@styled
+def poles_and_zeros(result: Any) -> Figure:
+    """Draw poles (crosses) and zeros (circles) of a fit or model, of a fit with 95 % ellipses, and bars of real ones.
+
+    Those of a sampled model lie beside the unit circle, those of a continuous one in the plane of s.
+    """
+    model, _, known = _linear_part(result)
+    return _plane(frequency.pole_zero_chart(model, known))
+
+
+def _plane(chart: Chart) -> Figure:
+    """Draw a chart of the complex plane with its axes."""
+    figure = Figure(figsize=(5.6, 5.2), layout="constrained")
+    ax = figure.subplots()
+    ax.axhline(0, color=MUTED, linewidth=0.6, zorder=0)
+    ax.axvline(0, color=MUTED, linewidth=0.6, zorder=0)
+    panels.draw_chart(ax, chart)
+    return figure
+
+
+def _linear_part(result: Any) -> tuple[Any, Any, Any]:
+    """Return the model of a fit or a model, the range of every input, and the uncertainty where it is known."""
+    if not hasattr(result, "model"):
+        return result, input_levels(result), None
+    record = result.data.raw() if isinstance(result.data, Data) else None
+    return result.model, input_levels(result.model, record), uncertainty(result)[0]
 
 
 @styled

@@ -60,7 +60,8 @@ class Series:
     name: str  # of the legend; "" for none
     xs: Any  # (n,) places, ascending but for "line-only"
     ys: Any  # (n,) values, NaN where there are none; (n,) upper ends of an area
-    # "curve", "line-only" (any order), "area", "stems", "diamonds", "dots", "poles" or "bars" (heights 0 to 1)
+    # "curve", "line-only" (any order), "area", "stems", "diamonds", "dots", "poles", "bars" (heights 0 to 1), and of
+    # figures, not of pages, "zeros"
     kind: str = "curve"
     colour: str = "c0"  # variable of the style sheet
     lows: Any = None  # (n,) lower ends of an area

@@ -26,10 +26,14 @@ def time_title(time_unit: str, counts_samples: bool = True) -> str:
     return f"time ({time_unit})" if time_unit else "sample" if counts_samples else "time"
 
 
-def frequency_title(model: Any) -> str:
-    """Return the title of an axis of frequencies of a model, with their unit."""
-    unit = model.time_unit or ("sample" if model.dt == 1 else "unit of time")
-    return f"frequency (rad{'/' if model.time_unit or model.dt == 1 else ' per '}{unit})"
+def frequency_title(model: Any, hertz: bool = False) -> str:
+    """Return the title of an axis of frequencies of a model, with their unit: radians, or Hz (cycles)."""
+    counts = getattr(model, "dt", 0) == 1 and not model.time_unit
+    if hertz and model.time_unit == "s":
+        return "frequency (Hz)"
+    word = "cycles" if hertz else "rad"
+    per = f"/{model.time_unit}" if model.time_unit else "/sample" if counts else " per unit of time"
+    return f"frequency ({word}{per})"
 
 
 def percent(values: Any) -> str:
