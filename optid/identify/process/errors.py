@@ -236,17 +236,35 @@ class ProcessErrors(Criterion):
 
     def _between(self, x: Array, errors: Array) -> Array:
         """Return `slopes`; a dead time at a kink has a derivative between those of both sides."""
-        slopes, position = self.slopes(x), 0
+        slopes = self.slopes(x)
         for c, structure in enumerate(self.unknowns.structures):
-            position += len(structure.names)
-            theta = x[self.unknowns.slices[f"dynamics{c}"]][-1] if structure.delay else 0.0
+            theta, place = x[self.unknowns.slices[f"dynamics{c}"]][-1] if structure.delay else 0.0, self._place(c)
             if not structure.delay or self.kinks(c, theta)[1] > theta + AT_KINK:
                 continue
-            less, more = slopes[:, position - 1], self.slopes(x, late=False)[:, position - 1]
+            less, more = slopes[:, place], self.slopes(x, late=False)[:, place]
             down, up = less @ errors, more @ errors
             share = float(np.clip(down / (down - up), 0.0, 1.0)) if down < 0 < up else 1.0 * (up < 0)
-            slopes[:, position - 1] = (1 - share) * less + share * more
+            slopes[:, place] = (1 - share) * less + share * more
         return slopes
+
+    def cell(self, x: Array, c: int) -> tuple[float, float]:
+        """Return the dead times of input c between which the errors are as smooth as from x; at a kink the better side.
+
+        Both are that of x where it is the best one near it.
+        """
+        theta = float(x[self.unknowns.slices[f"dynamics{c}"]][-1])
+        low, high = self.kinks(c, theta)
+        if high > theta + AT_KINK:
+            return low, high
+        errors, place = self.simulated(x) - self.y, self._place(c)
+        down, up = (self.slopes(x, late)[:, place] @ errors for late in (True, False))
+        if up < 0:
+            return theta, self.kinks(c, theta + 10 * AT_KINK)[1]
+        return (theta, theta) if down < 0 else (low, theta)
+
+    def _place(self, c: int) -> int:
+        """Return the place of the dead time of input c among the numbers of all processes."""
+        return sum(len(one.names) for one in self.unknowns.structures[: c + 1]) - 1
 
     def rows(self, x: Array) -> Callable[[int], Iterator[tuple[Array, int]]]:
         """Return a generator of the rows [x0 | shared | error] of experiment i, zero where an output is missing."""

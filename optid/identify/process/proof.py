@@ -1,0 +1,2 @@
+"""Proof."""
+def certificate(errors): return None
