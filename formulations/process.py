@@ -23,7 +23,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from optid.bases import Bases
+from optid.bases import Bases, Linear
 from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.channels import model_meta
@@ -104,7 +104,7 @@ def _signals(errors: ProcessErrors, variables: Mapping[str, Any], _: Any) -> dic
             entry = cp.hstack([numbers[i]])
             found[errors.key(word, c)] = (entry if name == "zeta" else entry + np.log(dt)
                                           if structure.logarithmic[i] else dt * entry)
-        if unknowns.sizes[c] == 1 and errors.bases[c].interval is None:
+        if isinstance(errors.bases[c], Linear):
             found[errors.key("K", c)] = errors.units.y_scale[0] / errors.units.u_scale[c] * mu
         if not structure.integrator:
             found[errors.key("Theta", c)] = cp.reshape(mu, (mu.size, 1), order="F")
@@ -127,6 +127,6 @@ def _model(errors: ProcessErrors, values: Mapping[str, Array]) -> ProcessModel:
     levels = states[-1:].T if unknowns.levels else None
     level = np.asarray(values.get("offset", np.zeros(1) if levels is None else levels.mean(axis=0)))
     drift = float(np.sum(values.get("drift", 0.0))) / (errors.length * dt)
-    model = ProcessModel(tuple(one.in_unit(1 / dt) for one in errors.dynamics(x)), curves, level, drift,
+    model = ProcessModel(tuple(one.in_unit(1 / dt) for one in errors.processes(x)), curves, level, drift,
                          "first" if errors.straight else "zero", levels=levels, **model_meta(errors.data))
     return model.with_transform(errors.units)

@@ -159,14 +159,14 @@ class ProcessErrors(Criterion):
 
     # -- responses ---------------------------------------------------------------------------------------------------
 
-    def dynamics(self, x: Array) -> list[ProcessDynamics]:
+    def processes(self, x: Array) -> list[ProcessDynamics]:
         """Return the dynamics of every input in x, times in sampling times."""
         return [ProcessDynamics(one, one.parameters(x[self.unknowns.slices[f"dynamics{c}"]]))
                 for c, one in enumerate(self.unknowns.structures)]
 
     def columns(self, x: Array, late: bool = True) -> Array:
         """Return what the output is linear in (rows, L) for the dynamics in x, in the order of x without these."""
-        dynamics, u = self.dynamics(x), self.unknowns
+        dynamics, u = self.processes(x), self.unknowns
         found = np.zeros((len(self.y), u.size - len(u.dynamic)))
         position = 0
         for c, one in enumerate(dynamics):
@@ -201,7 +201,7 @@ class ProcessErrors(Criterion):
     def slopes(self, x: Array, late: bool = True) -> Array:
         """Return the derivatives (rows, k) of the output by the numbers of all processes."""
         u, found = self.unknowns, []
-        for c, one in enumerate(self.dynamics(x)):
+        for c, one in enumerate(self.processes(x)):
             mu, parts = x[u.slices[f"mu{c}"]], []
             for t, drives in zip(self.read_at, self.drives):
                 drive = drives[c]
@@ -213,7 +213,10 @@ class ProcessErrors(Criterion):
         if u.free:  # the free motion is smooth in the poles, and there are few
             linear = np.delete(x, u.dynamic)
             first = len(linear) - u.n * u.experiments
+            names = [name for one in u.structures for name in one.names]
             for j, place in enumerate(u.dynamic):
+                if names[j] == "dead_time":  # which does not delay it
+                    continue
                 ends = [self.columns(x + sign * STEP * np.eye(u.size)[place], late)[:, first:] for sign in (1, -1)]
                 slopes[:, j] += (ends[0] - ends[1]) @ linear[first:] / (2 * STEP)
         return slopes
@@ -238,7 +241,7 @@ class ProcessErrors(Criterion):
         """Return `slopes`; a dead time at a kink has a derivative between those of both sides."""
         slopes = self.slopes(x)
         for c, structure in enumerate(self.unknowns.structures):
-            theta, place = x[self.unknowns.slices[f"dynamics{c}"]][-1] if structure.delay else 0.0, self._place(c)
+            theta, place = x[self.unknowns.slices[f"dynamics{c}"]][-1] if structure.delay else 0.0, self.place(c)
             if not structure.delay or self.kinks(c, theta)[1] > theta + AT_KINK:
                 continue
             less, more = slopes[:, place], self.slopes(x, late=False)[:, place]
@@ -256,13 +259,13 @@ class ProcessErrors(Criterion):
         low, high = self.kinks(c, theta)
         if high > theta + AT_KINK:
             return low, high
-        errors, place = self.simulated(x) - self.y, self._place(c)
+        errors, place = self.simulated(x) - self.y, self.place(c)
         down, up = (self.slopes(x, late)[:, place] @ errors for late in (True, False))
         if up < 0:
             return theta, self.kinks(c, theta + 10 * AT_KINK)[1]
         return (theta, theta) if down < 0 else (low, theta)
 
-    def _place(self, c: int) -> int:
+    def place(self, c: int) -> int:
         """Return the place of the dead time of input c among the numbers of all processes."""
         return sum(len(one.names) for one in self.unknowns.structures[: c + 1]) - 1
 

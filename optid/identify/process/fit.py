@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import cvxpy as cp
 import numpy as np
 
 from optid.arrays import Array
@@ -124,7 +125,7 @@ def read_box(problem: Problem, errors: ProcessErrors, box: ProcessBox) -> tuple[
 
 
 def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
-    """Keep every dead time within its cell about the point where the constraints are read."""
+    """Keep every dead time in its cell about the point where the constraints are read, other numbers at usual sizes."""
     names = [errors.key("dynamics", c) for c in range(errors.data.m)]
     x = np.zeros(errors.unknowns.size)
     for name in (*view.inner,):
@@ -135,12 +136,13 @@ def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
                 x[errors.unknowns.slices[part]] = view.reference[name]
     if "x0" in view.reference:
         x[errors.unknowns.shared :] = np.ravel(view.reference["x0"], order="F")
-    found = []
-    for c, (name, structure) in enumerate(zip(names, errors.unknowns.structures)):
+    box = usual_box(errors)
+    low, high = box.low.copy(), box.high.copy()
+    for c, structure in enumerate(errors.unknowns.structures):
         if structure.delay:
-            low, high = errors.cell(x, c)
-            found += [view.inner[name][-1] >= low, view.inner[name][-1] <= high]
-    return {CELL: found} if found else {}
+            low[errors.place(c)], high[errors.place(c)] = errors.cell(x, c)
+    numbers = cp.hstack([view.inner[name] for name in names])
+    return {CELL: [numbers >= low, numbers <= high]}
 
 
 def _at_bounds(errors: ProcessErrors, x: Array) -> list[tuple[str, int, float, float]]:
@@ -214,7 +216,7 @@ def refuse_inseparable(errors: ProcessErrors, best: ProcessPoint) -> None:
 def _determined(errors: ProcessErrors, best: ProcessPoint) -> str:
     """Say which sum of times the record determines all the same, and what to do."""
     found = []
-    for c, one in enumerate(errors.dynamics(best.x)):
+    for c, one in enumerate(errors.processes(best.x)):
         lag = one.in_unit(1 / errors.data.dt)
         total = lag.p[: one.structure.real].sum() + 2 * lag.value("zeta") * lag.value("T") + lag.dead_time
         found.append(f"{total - lag.value('tau_zero'):.4g}" + (f" ({errors.data.inputs[c]})" if errors.data.m > 1 else ""))
