@@ -16,8 +16,9 @@ from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
-from optid.identify.process.descent import ProcessBox, ProcessPoint, search_cells
+from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
 from optid.identify.process.errors import ProcessErrors
+from optid.identify.process.proof import better_start
 from optid.identify.process.starts import best_descents, usual_box
 from optid.program.solution import Bound
 from optid.solving.solve import Procedure
@@ -25,6 +26,7 @@ from optid.solving.solve import Procedure
 CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
 BOUNDS = "bounds"  # of the constraint that keeps numbers at their usual bounds
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
+ROUNDS = 3  # times that a better start is looked for over boxes
 ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
 Certify = Callable[[ProcessErrors, ProcessBox, float], Bound]
@@ -50,6 +52,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
     best = min((search_cells(errors, one, box) for one in points[:2]), key=lambda one: one.value)
     figures: dict[str, Any] = {"starts": _agreement(points, best)}
     if complete:
+        best = _past_the_grid(errors, box, best)
         refuse_silence(errors, best)
         refuse_inseparable(errors, best)
         bound = partial(_proved, errors, box, best, certify)
@@ -66,6 +69,21 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
         x = fit.places.pack(end.values or {})
         ends.append((fit.excess(x) > INSIDE, end.objective, x))
     return (yield from _confirmed(errors, pose, constraints, min(ends, key=lambda one: one[:2])[2], figures))
+
+
+def _past_the_grid(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> ProcessPoint:
+    """Go on from what a coarse search over boxes finds to be better, if anything."""
+    for _ in range(ROUNDS):
+        point = better_start(errors, box, best.value)
+        if point is None:
+            break
+        x = best.x.copy()
+        x[errors.unknowns.dynamic] = point
+        end = search_cells(errors, descend(errors, x, box)[0], box)
+        if end.value >= best.value:
+            break
+        best = end
+    return best
 
 
 def _confirmed(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], Problem], constraints: Sequence[Any],
