@@ -28,9 +28,11 @@ from optid.core.problem import Problem
 from optid.core.terms import Errors
 from optid.data.channels import model_meta
 from optid.data.record import Data
+from optid.errors import StructureError
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.fit import fit_processes
+from optid.identify.process.order import choose_type
 from optid.identify.process.proof import certificate
 from optid.identify.process.record import Terms, process_errors, process_type
 from optid.models import Nonlinearity
@@ -75,9 +77,14 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
         RankError: too few samples, an output that does not respond, time constants and dead time that the record does
             not separate.
     """
+    if order not in ("", "auto"):
+        raise StructureError(f"order={order!r} must be 'auto', or be left out where process names a type")
+    if order and process:
+        raise StructureError(f"order='auto' chooses the type, which process={process!r} names already: give one of both")
     chosen = process or process_type(poles, zero, delay, integrator)
     errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial), times)
-    return (yield from fit_processes(errors, partial(_problem, errors), tuple(constraints), certificate(errors)))
+    errors, figures = choose_type(errors) if order else (errors, {})
+    return (yield from fit_processes(errors, partial(_problem, errors), tuple(constraints), certificate(errors), figures))
 
 
 def _problem(errors: ProcessErrors, x: Array, constraints: Sequence[Any]) -> Problem:

@@ -5,7 +5,7 @@ the cells around its end are searched one by one, with the derivative of their i
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from optid.arrays import Array
 from optid.identify.process.errors import ProcessErrors
 
 STEPS, ARRIVED = 60, 1e-10  # steps of a descent; relative gain of a full step that is none
+SHARP = 1e-15  # the same of a point that is reported
 LARGEST = 2.0  # largest change of the logarithm of a time constant in a step
 RANK = 1e-11  # singular value of the columns of the linear unknowns, relative to the largest, that counts as zero
 NEAR = 8  # cells on either side that are searched
@@ -113,6 +114,14 @@ def search_cells(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) ->
     return best
 
 
+def sharpened(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> ProcessPoint:
+    """Return the optimum of the cells of a point to the last digits."""
+    for c, place in _delays(errors):
+        box = box.within(place, *errors.cell(start.x, c))
+    end = descend(errors, start.x, box, steps=20, tolerance=SHARP)[0]
+    return min(start, end, key=lambda one: one.value)
+
+
 def _delays(errors: ProcessErrors) -> Iterator[tuple[int, int]]:
     """Yield inputs with dead time, and the place of it among the numbers of all processes."""
     place = -1
@@ -180,12 +189,3 @@ def _valley(errors: ProcessErrors, here: ProcessPoint, place: int) -> Array:
     direction = np.ones(slopes.shape[1])
     direction[others] = -np.linalg.lstsq(slopes[:, others], slopes[:, place], rcond=1e-10)[0]
     return direction
-
-
-def sorted_point(errors: ProcessErrors, point: ProcessPoint) -> ProcessPoint:
-    """Return the same point with the largest time constant of every process first."""
-    x = point.x.copy()
-    for c, structure in enumerate(errors.unknowns.structures):
-        first = errors.unknowns.slices[f"dynamics{c}"].start
-        x[first : first + structure.real] = np.sort(x[first : first + structure.real])[::-1]
-    return replace(point, x=x)

@@ -16,16 +16,18 @@ from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
-from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
+from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells, sharpened
 from optid.identify.process.errors import ProcessErrors
+from optid.identify.process.profile import profile_intervals
 from optid.identify.process.proof import better_start
 from optid.identify.process.starts import best_descents, usual_box
 from optid.program.solution import Bound
-from optid.solving.solve import Procedure
+from optid.solving.solve import Evidence, Procedure
 
 CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
 BOUNDS = "bounds"  # of the constraint that keeps numbers at their usual bounds
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
+PROFILED = 5_000  # outputs up to which profiles are worth their time; with more of them errors are all but quadratic
 ROUNDS = 3  # times that a better start is looked for over boxes
 ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
@@ -33,7 +35,7 @@ Certify = Callable[[ProcessErrors, ProcessBox, float], Bound]
 
 
 def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], Problem], constraints: Sequence[Any],
-                  certify: Certify | None = None) -> Procedure:
+                  certify: Certify | None = None, known: Mapping[str, Any] | None = None) -> Procedure:
     """Search for the best optimum within the bounds that single constraints give, and confirm it under all.
 
     Args:
@@ -41,6 +43,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
         pose: states the problem of the fit about a point, with constraints.
         constraints: of the user.
         certify: returns a lower bound on the sum of squares within a box; None where there is no method.
+        known: figures that are known already.
 
     Raises:
         RankError: too few samples, no visible response, or parameters that the record does not separate.
@@ -50,14 +53,17 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
     box, complete = read_box(pose(middle, constraints), errors, usual_box(errors))
     points = best_descents(errors, box)
     best = min((search_cells(errors, one, box) for one in points[:2]), key=lambda one: one.value)
-    figures: dict[str, Any] = {"starts": _agreement(points, best)}
+    figures: dict[str, Any] = {**(known or {}), "starts": _agreement(points, best)}
     if complete:
-        best = _past_the_grid(errors, box, best)
+        best = sharpened(errors, _past_the_grid(errors, box, best), box)
         refuse_silence(errors, best)
-        refuse_inseparable(errors, best)
+        refuse_inseparable(errors, box, best)
         bound = partial(_proved, errors, box, best, certify)
         evidence = yield from _confirmed(errors, pose, constraints, best.x, figures)
-        return evidence if evidence is None or certify is None else replace(evidence, bound=bound)
+        if evidence is None:
+            return None
+        evidence = replace(evidence, extend=partial(_with_profiles, errors, box, best.x, evidence))
+        return evidence if certify is None else replace(evidence, bound=bound)
     ends = []
     for point in [best, *points][: 1 + len(points)]:
         within = pose(point.x, (*constraints, partial(_cell, errors)))
@@ -205,9 +211,10 @@ def refuse_silence(errors: ProcessErrors, best: ProcessPoint) -> None:
         "larger step")
 
 
-def refuse_inseparable(errors: ProcessErrors, best: ProcessPoint) -> None:
+def refuse_inseparable(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
     """Refuse time constants and dead times that the record shows only together (`RankError`)."""
     u, at = errors.unknowns, errors.unknowns.dynamic
+    _refuse_instant(errors, box, best)
     basis = np.linalg.qr(best.columns)[0]
     slopes = errors.slopes(best.x)
     left = slopes - basis @ (basis.T @ slopes)
@@ -231,6 +238,27 @@ def refuse_inseparable(errors: ProcessErrors, best: ProcessPoint) -> None:
                     f"them. {_determined(errors, best)}")
 
 
+def _refuse_instant(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
+    """Refuse a time constant below a sampling time that is not told from zero beside a dead time (`RankError`)."""
+    from scipy.stats import f as fisher
+
+    dof = len(errors.y) - errors.unknowns.size
+    for c, one in enumerate(errors.unknowns.structures):
+        first = errors.unknowns.slices[f"dynamics{c}"].start
+        place = errors.place(c) - len(one.names) + 1
+        if one.names != ("tau", "dead_time") or best.x[first] > 0 or box.low[place] == box.high[place]:
+            continue
+        x = best.x.copy()
+        x[first + 1] += np.exp(best.x[first])
+        x[first] = box.low[place]
+        held = box.within(place, box.low[place], box.low[place])
+        found = search_cells(errors, descend(errors, x, held)[0], held)
+        if found.value <= best.value * (1 + fisher.ppf(0.95, 1, dof) / dof):
+            name = errors.key("tau", c)
+            raise RankError(f"{name} lies below a sampling time and is not told from zero: it does not separate from "
+                            f"{errors.key('dead_time', c)}. {_determined(errors, best)}")
+
+
 def _determined(errors: ProcessErrors, best: ProcessPoint) -> str:
     """Say which sum of times the record determines all the same, and what to do."""
     found = []
@@ -240,6 +268,15 @@ def _determined(errors: ProcessErrors, best: ProcessPoint) -> str:
         found.append(f"{total - lag.value('tau_zero'):.4g}" + (f" ({errors.data.inputs[c]})" if errors.data.m > 1 else ""))
     return (f"Determined is their sum, the mean delay of the response: {', '.join(found)} {errors.data.time_unit}".rstrip()
             + ". Sample faster, choose fewer poles, or hold one by a constraint such as dead_time:0")
+
+
+def _with_profiles(errors: ProcessErrors, box: ProcessBox, x: Array, evidence: Evidence) -> tuple[Any, dict[str, Any]]:
+    """Return the model, and the intervals of dead times by profile likelihood as figures."""
+    unit = errors.data.time_unit
+    if len(errors.y) > PROFILED:
+        return evidence.model, {}
+    return evidence.model, {f"{name}, 95 % by profile likelihood": f"{low:.4g} to {high:.4g} {unit}".rstrip()
+                            for name, (low, high) in profile_intervals(errors, box, x).items()}
 
 
 def _proved(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint, certify: Certify) -> Bound:

@@ -57,11 +57,11 @@ def process_errors(data: Data, process: Any, basis: Any, terms: Terms, times: An
                             "held, or leave those samples out of the record and of the times")
         data, free = with_whole_inputs(data, SHORTEST), True  # no stretch but the first may begin at rest
         instants = read_times(data, None)
+    refuse_still_inputs(data)
     bases = fitted_bases(data, basis)
     linear = [isinstance(one, Linear) for one in bases]
     if terms.hold == "first" and not all(linear):
         raise StructureError("hold='first' is exact for straight static curves only: use hold='zero' with a basis")
-    refuse_still_inputs(data)
     units = replace(own_units(data, linear, bool(constants)), u_offset=(0.0,) * data.m)
     bases = tuple(inner_bases(bases, units))
     unknowns = ProcessUnknowns(structures, tuple(one.size for one in bases), data.n_experiments, constants is True,
