@@ -80,11 +80,12 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
     if order not in ("", "auto"):
         raise StructureError(f"order={order!r} must be 'auto', or be left out where process names a type")
     if order and process:
-        raise StructureError(f"order='auto' chooses the type, which process={process!r} names already: give one of both")
+        raise StructureError(f"order='auto' chooses the type, which process={process!r} names: give one of both")
     chosen = process or process_type(poles, zero, delay, integrator)
     errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial), times)
     errors, figures = choose_type(errors) if order else (errors, {})
-    return (yield from fit_processes(errors, partial(_problem, errors), tuple(constraints), certificate(errors), figures))
+    pose = partial(_problem, errors)
+    return (yield from fit_processes(errors, pose, tuple(constraints), certificate(errors), figures))
 
 
 def _problem(errors: ProcessErrors, x: Array, constraints: Sequence[Any]) -> Problem:

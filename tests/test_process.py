@@ -1,4 +1,4 @@
-"""Fits of processes in continuous time: found, confirmed, constrained, priced, proved, saved; bad input refused by name."""
+"""Fits of processes in continuous time: found, constrained, priced, proved, saved; bad input is refused by name."""
 
 import re
 import warnings
@@ -220,7 +220,8 @@ def test_poles_and_zero_may_be_named_instead_of_a_type():
 
 
 @pytest.mark.parametrize(("word", "name", "value"), [
-    ("tau:high=25", "tau", 25.0), ("dead_time:15.4", "dead_time", 15.4), ("gain:2.2", "K", 2.2), ("K:high=1.9", "K", 1.9)])
+    ("tau:high=25", "tau", 25.0), ("dead_time:15.4", "dead_time", 15.4), ("gain:2.2", "K", 2.2),
+    ("K:high=1.9", "K", 1.9)])
 def test_words_hold_and_their_prices_are_those_of_refits(word, name, value):
     data = record()
     found = fit(data, constraints=[word])
@@ -288,14 +289,12 @@ def test_bounds_of_boxes_lie_below_every_point(seed):
     u = np.repeat(rng.normal(size=8), 10)
     errors = errors_of(record(process_model("P1D", K=2.0, tau=12.0, dead_time=4.4), u, 0.3, seed), offset=seed % 2 == 0)
     search = BranchAndBound(errors, usual_box(errors))
-    s, w, base, edges, kinks = search._moves
-    still, y = search._projected
-    t = np.concatenate(errors.read_at)
+    moves, values, edges, kinks = search.compiled
     low = np.column_stack([rng.uniform(0, 4, 200), rng.uniform(0, 20, 200)])
     size = 10 ** rng.uniform(-3, 0.3, (200, 2))
     boxes = np.column_stack([low[:, 0], low[:, 0] + size[:, 0], low[:, 1], low[:, 1] + size[:, 1]])
     inside = np.searchsorted(kinks, boxes[:, 3] - 1e-10) - np.searchsorted(kinks, boxes[:, 2] + 1e-10)
-    found = box_bounds(boxes, inside == 0, t, s, w, still, y, base, edges)
+    found = box_bounds(boxes, inside == 0, values, moves, edges)
     assert np.sum(found[:, 0] > 0.3 * found[:, 1]) > 30  # they say something
     for (l1, l2, a, b), bound in zip(boxes, found[:, 0]):
         for share in rng.uniform(0, 1, (6, 2)):

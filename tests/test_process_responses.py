@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from optid.errors import StructureError
-from optid.models.process_dynamics import TYPES, ProcessDynamics, ProcessStructure, thinned
+from optid.models.process_dynamics import TYPES, ProcessDynamics, ProcessStructure, thin_out
 
 VALUES = {"tau": 12.0, "tau1": 12.0, "tau2": 5.0, "tau3": 2.0, "T": 7.0, "zeta": 0.4, "tau_zero": -3.0,
           "dead_time": 4.37}
@@ -152,9 +152,9 @@ def test_free_motion_and_poles():
 
 
 def test_repeated_steps_are_thinned_but_not_straight_ones():
-    changes, values = thinned(np.arange(4.0), np.array([[0.0], [0], [1], [1]]), False)
+    changes, values = thin_out(np.arange(4.0), np.array([[0.0], [0], [1], [1]]), False)
     assert changes.tolist() == [0, 2] and values.ravel().tolist() == [0, 1]
-    assert len(thinned(np.arange(4.0), np.array([[0.0], [0], [1], [1]]), True)[0]) == 4
+    assert len(thin_out(np.arange(4.0), np.array([[0.0], [0], [1], [1]]), True)[0]) == 4
 
 
 def test_the_callers_inputs_stay():

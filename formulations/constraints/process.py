@@ -1,8 +1,8 @@
 """Constraints on gain, time constants, damping, zero and dead time of processes, in the units of the record.
 
-They apply to `formulations.process` alone; another formulation refuses them by name. Time constants are unknown by their
-logarithms, in which bounds on them stay bounds: a price is per unit of the bound as it was written. ``channel`` is the
-name of an input, needed where there are several.
+They apply to `formulations.process` alone; another formulation refuses them by name. The unknowns are the logarithms of
+time constants, in which bounds on them stay bounds: a price is per unit of the bound as it was written. ``channel`` is
+the name of an input, needed where there are several.
 """
 
 from collections.abc import Sequence

@@ -175,9 +175,9 @@ class _Reading:
     # -- processes -------------------------------------------------------------------------------------------------
 
     def of_process(self) -> list[Parameter]:
-        """Return time constants, damping, dead time and gain of a model in continuous time, which are its parameters."""
+        """Return time constants, damping, dead time and gain of a process model: its parameters."""
         units, found = self.model.coefficient_units(), []
-        times = {"tau": "time constant", "tau1": "time constant 1", "tau2": "time constant 2", "tau3": "time constant 3",
+        times = {"tau": "time constant", **{f"tau{i}": f"time constant {i}" for i in (1, 2, 3)},
                  "tau_zero": "time constant of the zero", "zeta": "damping", "dead_time": "dead time"}
         for place, (name, _) in enumerate(self.model.coefficients()):
             word, bracket, channel = name.partition("[")
@@ -187,11 +187,13 @@ class _Reading:
             elif word == "T":
                 rows = self.limits(name, lambda model, place=place: 1 / model.coefficients()[place][1])
                 found.append(_parameter(f"natural frequency{bracket}{channel}", rows[0], f"rad/{units[name] or 1}"))
-        for c, (one, f, channel) in enumerate(zip(self.model.processes, self.model.nonlinearities, self.model.inputs)):
+        model = self.model
+        for c, (one, f, channel) in enumerate(zip(model.processes, model.nonlinearities, model.inputs)):
             name, (low, high) = "slope" if one.structure.integrator else "static gain", middle(*self.levels[c])
+            ends = np.array([low, high])
             if not f.is_linear:
                 self.notes.append(f"{name.capitalize()} between {channel} = {low:g} and {high:g}.")
-            rows = self.limits(name, lambda model, c=c, ends=np.array([low, high]): (
+            rows = self.limits(name, lambda model, c=c, ends=ends: (
                 np.diff(model.nonlinearities[c](ends)) / np.diff(ends)))
             found.append(_parameter(name + self._of(channel), rows[0], units["K" + self._of(channel)]))
         return found

@@ -14,7 +14,7 @@ from optid.errors import DataError, StructureError
 from optid.models.experiments import Record, check_inputs, scaled_least_squares
 from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
-from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thinned
+from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
 
 HOLDS = ("zero", "first")
 
@@ -59,7 +59,7 @@ class ProcessModel(Model):
         if self.hold not in HOLDS:
             raise StructureError(f"hold={self.hold!r} must be one of {', '.join(map(repr, HOLDS))}")
         level = np.atleast_1d(finite(self.level, "level"))
-        given = {"nonlinearities": self.nonlinearities, "processes": tuple(one.ordered() for one in self.processes),
+        given = {"nonlinearities": self.nonlinearities, "processes": tuple(one.sort() for one in self.processes),
                  "level": level, "drift": float(self.drift)}
         self._fix(given, len(self.processes), 1)
 
@@ -118,7 +118,7 @@ class ProcessModel(Model):
     def equation(self) -> str:
         """Return the equation as text."""
         terms = []
-        for c, (one, f, name) in enumerate(zip(self.processes, self.nonlinearities, self.inputs)):
+        for one, f, name in zip(self.processes, self.nonlinearities, self.inputs):
             gain = f"{f.mu[0]:.4g} {name}" if f.is_linear else f"f{'' if self.m == 1 else f'_{name}'}({name})"
             terms.append(f"{one.equation()} {gain}")
         drift = f" + {self.drift:.4g} t" if self.drift else ""
@@ -132,8 +132,8 @@ class ProcessModel(Model):
         return np.stack([one.in_unit(self.dt).response(t, np.array([-1.0, 0.0, 1.0]), pulse)[:, :, 0]
                          for one in self.processes], axis=2)
 
-    def frequency_response(self, w: ArrayLike) -> Array:
-        """Return that of the linear part at w (radians per unit of time), dead time included, complex (len(w), 1, m)."""
+    def frequency_response(self, w: ArrayLike) -> Any:
+        """Return that of the linear part at w (radians per unit of time), with dead time, complex (len(w), 1, m)."""
         s = 1j * np.atleast_1d(np.asarray(w, dtype=float))
         return np.stack([one.transfer(s) for one in self.processes], axis=1)[:, None]
 
@@ -177,7 +177,7 @@ class ProcessModel(Model):
         at = t if read_at is None else np.asarray(read_at, dtype=float) / self.dt
         found = self.level[0] + self.drift * self.dt * (at - t[0])
         for c, (one, f) in enumerate(zip(self._scaled, self.nonlinearities)):
-            changes, values = thinned(t, f(u[:, c])[:, None], self.hold == "first")
+            changes, values = thin_out(t, f(u[:, c])[:, None], self.hold == "first")
             found = found + one.response(at, changes, values - values[0], straight=self.hold == "first")[:, 0, 0]
             found = found if one.structure.integrator else found + values[0, 0]
         return found

@@ -70,8 +70,8 @@ class ProcessStructure:
     @property
     def word(self) -> str:
         """The name that procest has for it."""
-        letters = [letter for letter, there in zip("DIZU", (self.delay, self.integrator, self.zero, self.pair)) if there]
-        return f"P{self.real + 2 * self.pair}{''.join(letters)}"
+        there = {"D": self.delay, "I": self.integrator, "Z": self.zero, "U": self.pair}
+        return f"P{self.real + 2 * self.pair}{''.join(letter for letter, has in there.items() if has)}"
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -133,7 +133,7 @@ class ProcessDynamics:
         """Return the same with times in multiples of a unit."""
         return replace(self, p=np.where(self.structure.temporal, self.p / unit, self.p))
 
-    def ordered(self) -> "ProcessDynamics":
+    def sort(self) -> "ProcessDynamics":
         """Return the same with the largest time constant first."""
         real = self.structure.real
         return replace(self, p=np.concatenate([np.sort(self.p[:real])[::-1], self.p[real:]]))
@@ -216,16 +216,16 @@ class ProcessDynamics:
             sensitive: whether the derivatives by all parameters are returned, too.
         """
         f, c = self.sensitive if sensitive else self.plain
-        return run(f, c, instants, changes + self.dead_time, np.ascontiguousarray(inputs), straight, late,
-                   np.zeros((len(f), inputs.shape[1])))
+        return run(f, c, instants, changes + self.dead_time, np.ascontiguousarray(inputs),
+                   (straight, late), np.zeros((len(f), inputs.shape[1])))
 
     def free_response(self, instants: Array, first: float) -> Array:
         """Return the responses (N, n) of the output to unit states of all sections at a first time, without input."""
         (f, c), n = self.plain, self.structure.order
         start = np.vstack([np.zeros((2, n)), np.eye(n)])
-        return run(f, c, instants, np.array([first]), np.zeros((1, n)), False, True, start)[:, 0]
+        return run(f, c, instants, np.array([first]), np.zeros((1, n)), (False, True), start)[:, 0]
 
-    def transfer(self, s: Array) -> Array:
+    def transfer(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return G(s) exp(-theta s) at complex s."""
         found = (self.value("tau_zero") * s + 1) * np.exp(-self.dead_time * s)
         for tau in self.p[: self.structure.real]:
@@ -273,7 +273,7 @@ def _second_order(f: Array, at: int, drive: Array, size: float, zeta: float) -> 
     return at + 2, np.eye(len(f))[at]
 
 
-def thinned(changes: Array, inputs: Array, straight: bool) -> tuple[Array, Array]:
+def thin_out(changes: Array, inputs: Array, straight: bool) -> tuple[Array, Array]:
     """Leave out the times (J,) at which inputs (J, M) take no new value; where they go straight, all are kept."""
     if straight or len(changes) < 2:
         return changes, inputs

@@ -85,7 +85,7 @@ def _series(F, h, norm, z, term, into):  # noqa: N803
 
 
 @cached_njit
-def run(F, C, instants, changes, inputs, straight, late, start):  # noqa: N803
+def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
     """Run a system over the changes of its input, and read it at instants.
 
     Args:
@@ -94,13 +94,14 @@ def run(F, C, instants, changes, inputs, straight, late, start):  # noqa: N803
         instants: (N,) not decreasing.
         changes: (J,) times at which the input takes its values, increasing; before the first the state is zero.
         inputs: (J, M) values of the input from there on, of M runs.
-        straight: whether the input goes straight to its next value, and stays at the last; otherwise it is held.
-        late: whether a change at an instant counts for what is read there; the state is continuous, its slope is not.
+        sides: two marks: whether the input goes straight to its next value, and stays at the last, or is held; and
+            whether a change at an instant counts for what is read there: the state is continuous, its slope is not.
         start: (n, M) state at the first change, without its input.
 
     Returns:
         (N, o, M).
     """
+    straight, late = sides
     n, m, outputs, count = len(F), inputs.shape[1], len(C), len(instants)
     out, z, into, term = np.zeros((count, outputs, m)), start.copy(), np.zeros((n, m)), np.zeros((n, m))
     kept, lengths, recent = np.zeros((SLOTS, n, n)), np.full(SLOTS, -1.0), np.full(SLOTS, -1.0)

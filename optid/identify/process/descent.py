@@ -114,7 +114,7 @@ def search_cells(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) ->
     return best
 
 
-def sharpened(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> ProcessPoint:
+def sharpen(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> ProcessPoint:
     """Return the optimum of the cells of a point to the last digits."""
     for c, place in _delays(errors):
         box = box.within(place, *errors.cell(start.x, c))

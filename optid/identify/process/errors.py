@@ -8,19 +8,20 @@ the input meets a sample: there the derivative is the one of a side, or between 
 stationary in the dead time.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from optid.arrays import Array
 from optid.bases import Basis
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.identify.prediction_error.descent import Criterion
-from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thinned
+from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
 from optid.program.units import energy_unit
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.unknowns import Unknowns
@@ -56,14 +57,14 @@ class ProcessUnknowns(Unknowns):
         return found | {"offset": (int(self.constant),), "drift": (int(self.drift),)}
 
     @cached_property
-    def dynamic(self) -> Array:
+    def dynamic(self) -> NDArray[np.intp]:
         """Places in x of the numbers of all processes, in which the errors are nonlinear."""
         every = np.arange(self.size)
         return np.concatenate([every[self.slices[f"dynamics{c}"]] for c in range(len(self.structures))])
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class InputCourse:
     """An input of an experiment: the values (J, M) of its functions from the times (J,) on at which they change."""
 
     changes: Array
@@ -102,7 +103,7 @@ class ProcessErrors(Criterion):
     # -- the record --------------------------------------------------------------------------------------------------
 
     @cached_property
-    def places(self) -> list[Array]:
+    def places(self) -> list[NDArray[np.intp]]:
         """Samples of every experiment that count: those with an output."""
         return [np.flatnonzero(np.isfinite(e.y[:, 0]))[:: self.every] for e in self.data.experiments]
 
@@ -123,12 +124,12 @@ class ProcessErrors(Criterion):
         return [slice(a, b) for a, b in zip(edges, edges[1:])]
 
     @cached_property
-    def drives(self) -> list[list[Drive]]:
+    def drives(self) -> list[list[InputCourse]]:
         """The functions of the inputs, [experiment][input]."""
-        return [[Drive(*thinned(t, basis.values(e.u[:, c]), self.straight)) for c, basis in enumerate(self.bases)]
+        return [[InputCourse(*thin_out(t, one.values(e.u[:, c]), self.straight)) for c, one in enumerate(self.bases)]
                 for e, t in zip(self.data.experiments, self.instants)]
 
-    def reduced(self, most: int, changes: int) -> "ProcessErrors":
+    def first_part(self, most: int, changes: int) -> "ProcessErrors":
         """Return the errors of about so many samples of every experiment, of its beginning if inputs change more."""
         sizes = [min([len(t), *(int(np.searchsorted(t, drive.changes[changes])) for drive in drives
                                 if len(drive.changes) > changes and not self.straight)])
@@ -160,9 +161,14 @@ class ProcessErrors(Criterion):
     # -- responses ---------------------------------------------------------------------------------------------------
 
     def processes(self, x: Array) -> list[ProcessDynamics]:
-        """Return the dynamics of every input in x, times in sampling times."""
-        return [ProcessDynamics(one, one.parameters(x[self.unknowns.slices[f"dynamics{c}"]]))
-                for c, one in enumerate(self.unknowns.structures)]
+        """Return the dynamics of every input in x, in sampling times; a dead time below zero by rounding is none."""
+        found = []
+        for c, one in enumerate(self.unknowns.structures):
+            p = one.parameters(x[self.unknowns.slices[f"dynamics{c}"]])
+            if one.delay and -AT_KINK <= p[-1] < 0:
+                p[-1] = 0.0
+            found.append(ProcessDynamics(one, p))
+        return found
 
     def columns(self, x: Array, late: bool = True) -> Array:
         """Return what the output is linear in (rows, L) for the dynamics in x, in the order of x without these."""
@@ -221,7 +227,7 @@ class ProcessErrors(Criterion):
                 slopes[:, j] += (ends[0] - ends[1]) @ linear[first:] / (2 * STEP)
         return slopes
 
-    def simulated(self, x: Array) -> Array:
+    def simulate(self, x: Array) -> Array:
         """Return the outputs (rows,) of the model."""
         return self.columns(x) @ np.delete(x, self.unknowns.dynamic)
 
@@ -259,7 +265,7 @@ class ProcessErrors(Criterion):
         low, high = self.kinks(c, theta)
         if high > theta + AT_KINK:
             return low, high
-        errors, place = self.simulated(x) - self.y, self.place(c)
+        errors, place = self.simulate(x) - self.y, self.place(c)
         down, up = (self.slopes(x, late)[:, place] @ errors for late in (True, False))
         if up < 0:
             return theta, self.kinks(c, theta + 10 * AT_KINK)[1]
@@ -290,31 +296,22 @@ class ProcessErrors(Criterion):
 
     def value(self, x: Array) -> float:
         """Return the sum of squared errors at x."""
-        return float(np.sum((self.simulated(x) - self.y) ** 2))
+        return float(np.sum((self.simulate(x) - self.y) ** 2))
 
     def admissible(self, x: Array) -> bool:
         """Whether the numbers are those of a process: finite, no dead time negative."""
         if not np.all(np.isfinite(x)) or np.max(np.abs(x[self.unknowns.dynamic]), initial=0.0) > 1e7:
             return False
-        return all(not one.delay or x[self.unknowns.slices[f"dynamics{c}"]][-1] >= 0
+        return all(not one.delay or x[self.unknowns.slices[f"dynamics{c}"]][-1] >= -AT_KINK
                    for c, one in enumerate(self.unknowns.structures)) and all(
             np.max(np.abs(x[self.unknowns.slices[f"dynamics{c}"]][one.logarithmic]), initial=0.0) < 100
             for c, one in enumerate(self.unknowns.structures))
-
-    def confined(self, x: Array) -> Array:
-        """Return x with dead times that are not negative."""
-        x = np.array(x)
-        for c, one in enumerate(self.unknowns.structures):
-            place = self.unknowns.slices[f"dynamics{c}"].stop - 1
-            if one.delay and -1.0 < x[place] < 0:
-                x[place] = 0.0
-        return x
 
     def gauge_rows(self, x: Array) -> Array:
         """Return no directions."""
         return np.zeros((0, self.unknowns.shared))
 
-    def with_linear(self, x: Array, linear: Sequence[float]) -> Array:
+    def with_linear(self, x: Array, linear: ArrayLike) -> Array:
         """Return the dynamics of x with other linear unknowns."""
         found = np.array(x, dtype=float)
         found[np.setdiff1d(np.arange(x.size), self.unknowns.dynamic)] = linear

@@ -10,26 +10,24 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.core.problem import Problem
-from optid.errors import RankError
 from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
-from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells, sharpened
+from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.profile import profile_intervals
 from optid.identify.process.proof import better_start
+from optid.identify.process.separation import refuse_inseparable, refuse_silence
 from optid.identify.process.starts import best_descents, usual_box
 from optid.program.solution import Bound
 from optid.solving.solve import Evidence, Procedure
 
 CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
 BOUNDS = "bounds"  # of the constraint that keeps numbers at their usual bounds
-CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
 PROFILED = 5_000  # outputs up to which profiles are worth their time; with more of them errors are all but quadratic
 ROUNDS = 3  # times that a better start is looked for over boxes
-ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
 Certify = Callable[[ProcessErrors, ProcessBox, float], Bound]
 
@@ -55,15 +53,14 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
     best = min((search_cells(errors, one, box) for one in points[:2]), key=lambda one: one.value)
     figures: dict[str, Any] = {**(known or {}), "starts": _agreement(points, best)}
     if complete:
-        best = sharpened(errors, _past_the_grid(errors, box, best), box)
+        best = sharpen(errors, _past_the_grid(errors, box, best), box)
         refuse_silence(errors, best)
         refuse_inseparable(errors, box, best)
-        bound = partial(_proved, errors, box, best, certify)
         evidence = yield from _confirmed(errors, pose, constraints, best.x, figures)
         if evidence is None:
             return None
         evidence = replace(evidence, extend=partial(_with_profiles, errors, box, best.x, evidence))
-        return evidence if certify is None else replace(evidence, bound=bound)
+        return evidence if certify is None else replace(evidence, bound=partial(certify, errors, box, best.value))
     ends = []
     for point in [best, *points][: 1 + len(points)]:
         within = pose(point.x, (*constraints, partial(_cell, errors)))
@@ -155,7 +152,8 @@ def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
     for name in (*view.inner,):
         if name in view.reference:
             part = {**{errors.key("mu", c): f"mu{c}" for c in range(errors.data.m)},
-                    **{one: f"dynamics{c}" for c, one in enumerate(names)}, "offset": "offset", "drift": "drift"}.get(name)
+                    **{one: f"dynamics{c}" for c, one in enumerate(names)}, "offset": "offset", "drift": "drift"}
+            part = part.get(name)
             if part is not None:
                 x[errors.unknowns.slices[part]] = view.reference[name]
     if "x0" in view.reference:
@@ -187,90 +185,8 @@ def _bounds(held: Sequence[tuple[str, int, float, float]], view: Any) -> dict[st
     return {BOUNDS: [sign * (view.inner[name][i] - bound) >= 0 for name, i, sign, bound in held]}
 
 
-# -- what the record does not determine ----------------------------------------------------------------------------
-
-
-def refuse_silence(errors: ProcessErrors, best: ProcessPoint) -> None:
-    """Refuse a record in which the output shows no response to any input (`RankError`)."""
-    from scipy.stats import f as fisher
-
-    u = errors.unknowns
-    still = best.columns[:, sum(u.sizes) :]
-    rest = errors.y - still @ np.linalg.lstsq(still, errors.y, rcond=None)[0] if still.shape[1] else errors.y
-    used, dof = len(u.dynamic) + sum(u.sizes), len(errors.y) - u.size
-    before = float(rest @ rest)
-    ratio = (before - best.value) / used / max(best.value / dof, 1e-300)
-    if fisher.sf(ratio, used, dof) < CHANCE:
-        return
-    level = errors.units.y_offset[0] + errors.units.y_scale[0] * float(np.mean(errors.y))
-    size = errors.units.y_scale[0] * np.sqrt(before / len(errors.y))
-    raise RankError(
-        f"output {errors.data.outputs[0]!r} shows no response to {', '.join(errors.data.inputs)} (p = "
-        f"{fisher.sf(ratio, used, dof):.2g}): the dead time may be longer than the record, or the gain small beside the "
-        f"noise. Determined is its level alone, {level:.4g} (standard deviation {size:.2g}). Use a longer record or a "
-        "larger step")
-
-
-def refuse_inseparable(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
-    """Refuse time constants and dead times that the record shows only together (`RankError`)."""
-    u, at = errors.unknowns, errors.unknowns.dynamic
-    _refuse_instant(errors, box, best)
-    basis = np.linalg.qr(best.columns)[0]
-    slopes = errors.slopes(best.x)
-    left = slopes - basis @ (basis.T @ slopes)
-    names = [errors.key(name, c) for c, one in enumerate(u.structures) for name in one.names]
-    sizes, box = np.linalg.norm(left, axis=0), usual_box(errors)
-    inner = (best.x[at] > box.low + 1e-9) & (best.x[at] < box.high - 1e-9)
-    whole = np.linalg.norm(slopes, axis=0)
-    silent = [name for name, size, much, free in zip(names, sizes, whole, inner) if free and size <= ALIKE * much]
-    if silent:
-        raise RankError(f"{', '.join(silent)} {'have' if silent[1:] else 'has'} no effect on this record that the gain "
-                        f"does not have as well. {_determined(errors, best)}")
-    used = left[:, inner & (sizes > 0)] / sizes[inner & (sizes > 0)]
-    if used.shape[1] < 2:
-        return
-    values, vectors = np.linalg.svd(used, full_matrices=False)[1:]
-    if values[-1] > ALIKE * values[0]:
-        return
-    kept = [name for name, there in zip(names, inner & (sizes > 0)) if there]
-    parts = [name for name, part in zip(kept, np.abs(vectors[-1])) if part > 0.1]
-    raise RankError(f"{', '.join(parts)} can change together without any effect on this record: it does not separate "
-                    f"them. {_determined(errors, best)}")
-
-
-def _refuse_instant(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
-    """Refuse a time constant below a sampling time that is not told from zero beside a dead time (`RankError`)."""
-    from scipy.stats import f as fisher
-
-    dof = len(errors.y) - errors.unknowns.size
-    for c, one in enumerate(errors.unknowns.structures):
-        first = errors.unknowns.slices[f"dynamics{c}"].start
-        place = errors.place(c) - len(one.names) + 1
-        if one.names != ("tau", "dead_time") or best.x[first] > 0 or box.low[place] == box.high[place]:
-            continue
-        x = best.x.copy()
-        x[first + 1] += np.exp(best.x[first])
-        x[first] = box.low[place]
-        held = box.within(place, box.low[place], box.low[place])
-        found = search_cells(errors, descend(errors, x, held)[0], held)
-        if found.value <= best.value * (1 + fisher.ppf(0.95, 1, dof) / dof):
-            name = errors.key("tau", c)
-            raise RankError(f"{name} lies below a sampling time and is not told from zero: it does not separate from "
-                            f"{errors.key('dead_time', c)}. {_determined(errors, best)}")
-
-
-def _determined(errors: ProcessErrors, best: ProcessPoint) -> str:
-    """Say which sum of times the record determines all the same, and what to do."""
-    found = []
-    for c, one in enumerate(errors.processes(best.x)):
-        lag = one.in_unit(1 / errors.data.dt)
-        total = lag.p[: one.structure.real].sum() + 2 * lag.value("zeta") * lag.value("T") + lag.dead_time
-        found.append(f"{total - lag.value('tau_zero'):.4g}" + (f" ({errors.data.inputs[c]})" if errors.data.m > 1 else ""))
-    return (f"Determined is their sum, the mean delay of the response: {', '.join(found)} {errors.data.time_unit}".rstrip()
-            + ". Sample faster, choose fewer poles, or hold one by a constraint such as dead_time:0")
-
-
-def _with_profiles(errors: ProcessErrors, box: ProcessBox, x: Array, evidence: Evidence) -> tuple[Any, dict[str, Any]]:
+def _with_profiles(errors: ProcessErrors, box: ProcessBox, x: Array, evidence: Evidence
+                   ) -> tuple[Any, dict[str, Any]]:
     """Return the model, and the intervals of dead times by profile likelihood as figures."""
     unit = errors.data.time_unit
     if len(errors.y) > PROFILED:
@@ -279,6 +195,4 @@ def _with_profiles(errors: ProcessErrors, box: ProcessBox, x: Array, evidence: E
                             for name, (low, high) in profile_intervals(errors, box, x).items()}
 
 
-def _proved(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint, certify: Certify) -> Bound:
-    return certify(errors, box, best.value)
 

@@ -21,7 +21,7 @@ FLOOR = 1e-20  # share of the energy of the output below which errors are roundi
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class RankedType:
     """A type that was tried, with its criterion and the point where it is best."""
 
     structure: ProcessStructure
@@ -37,14 +37,14 @@ class Candidate:
         return replace(self.structure, real=self.structure.real + 2, pair=False)
 
 
-def try_type(errors: ProcessErrors, structure: ProcessStructure) -> Candidate:
+def try_type(errors: ProcessErrors, structure: ProcessStructure) -> RankedType:
     """Return a type for all inputs with its Bayesian information criterion."""
     tried = replace(errors, unknowns=replace(errors.unknowns, structures=(structure,) * errors.data.m))
     box = usual_box(tried)
     best = search_cells(tried, best_descents(tried, box)[0], box)
     count = len(errors.y)
     value = max(best.value, FLOOR * errors.energy)
-    return Candidate(structure, count * np.log(value / count) + tried.unknowns.size * np.log(count), best)
+    return RankedType(structure, count * np.log(value / count) + tried.unknowns.size * np.log(count), best)
 
 
 def choose_type(errors: ProcessErrors) -> tuple[ProcessErrors, dict[str, Any]]:
@@ -53,7 +53,7 @@ def choose_type(errors: ProcessErrors) -> tuple[ProcessErrors, dict[str, Any]]:
     Raises:
         RankError: too few samples for the smallest type and its runner-up.
     """
-    found, reasons = list[Candidate](), list[str]()
+    found, reasons = list[RankedType](), list[str]()
     for word in CANDIDATES:
         structure = ProcessStructure.read(word)
         if len(errors.y) < 2 * (len(structure.names) * errors.data.m + errors.unknowns.size):
@@ -63,8 +63,8 @@ def choose_type(errors: ProcessErrors) -> tuple[ProcessErrors, dict[str, Any]]:
         except (StructureError, np.linalg.LinAlgError) as error:
             reasons.append(f"{word}: {error}")
     if len(found) < 2:
-        raise RankError(f"{len(errors.y)} output samples are too few to compare process types{'; '.join(['', *reasons])}:"
-                        " name one (process='P1D')")
+        raise RankError(f"{len(errors.y)} output samples are too few to compare process types"
+                        f"{'; '.join(['', *reasons])}: name one (process='P1D')")
     found.sort(key=lambda one: one.criterion)
     best, second = found[:2]
     behind = second.criterion - best.criterion

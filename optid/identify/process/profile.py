@@ -16,7 +16,7 @@ EXACT = 1e-3  # of the width of an interval, to which its ends are found
 
 
 def profile_intervals(errors: ProcessErrors, box: ProcessBox, x: Array) -> dict[str, tuple[float, float]]:
-    """Return the 95 % interval of the dead time of every input that has one, in units of time; errors count as white."""
+    """Return the 95 % interval of the dead time of every input that has one, in units of time, for white errors."""
     best, found = ProcessPoint.of(errors, x), dict[str, tuple[float, float]]()
     for c, structure in enumerate(errors.unknowns.structures):
         place = errors.place(c)

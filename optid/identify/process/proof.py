@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.identify.process.descent import ProcessBox
@@ -31,25 +32,24 @@ PIECES = 8  # of the range of either unknown at the beginning
 SECONDS = 20.0  # after which a proof is given up
 WORK = 2e6  # responses to single moves that the coarse pass may compute
 METHOD = "branch and bound over time constant and dead time"
-REASON = ("for one pole with dead time, a held input, a straight static curve and a start at rest alone is a lower bound "
-          "known; elsewhere several starts are compared")
+REASON = ("a lower bound is known for one pole with dead time, a held input, a straight static curve and a start at "
+          "rest alone; elsewhere several starts are compared")
 
 
 @cached_njit
-def box_bounds(boxes, smooth, t, s, w, still, y, base, edges):
+def box_bounds(boxes, smooth, record, moves, edges):
     """Return (lower bound, V at the middle, effects of both halves) of boxes.
 
     Args:
         boxes: (B, 4) log tau from, to; theta from, to.
         smooth: (B,) whether no kink lies inside.
-        t: (N,) instants of all experiments one after another.
-        s: (J,) times of the moves, by experiment.
-        w: (J,) their sizes.
-        still: (N, c) orthonormal columns that are projected out.
-        y: (N,) outputs, projected.
-        base: (N,) response before the moves.
+        record: of all experiments one after another: instants (N,), outputs (N,) and orthonormal columns (N, c), which
+            are projected out of the outputs already, response (N,) before the moves.
+        moves: times (J,) and sizes (J,) of the moves, by experiment.
         edges: (E + 1, 2) first sample, and first move, of every experiment.
     """
+    t, y, still, base = record
+    s, w = moves
     count, n, columns = len(boxes), len(t), still.shape[1]
     found = np.zeros((count, 4))
     x, envelope = np.zeros((3, n)), np.zeros(n)
@@ -186,8 +186,8 @@ class BranchAndBound:
     box: ProcessBox
 
     @cached_property
-    def _moves(self) -> tuple[Array, Array, Array, Array, Array]:
-        """Times and sizes of the moves, response before them, edges, kinks."""
+    def compiled(self) -> tuple[tuple[Array, ...], tuple[Array, ...], NDArray[np.intp], Array]:
+        """Moves, record and edges as `box_bounds` takes them, and the dead times at which a move meets a sample."""
         s, w, edges, base = [], [], [(0, 0)], []
         for t, drives in zip(self.errors.read_at, self.errors.drives):
             drive = drives[0]
@@ -200,9 +200,10 @@ class BranchAndBound:
         inside = (kinks > self.box.low[1]) & (kinks < self.box.high[1])
         kinks = kinks[inside]
         kept = np.concatenate([[True], np.diff(kinks) > 1e-9]) if len(kinks) else np.zeros(0, dtype=bool)
-        return np.concatenate(s), np.concatenate(w), np.concatenate(base), np.array(edges), kinks[kept]
+        still, y = self._projected()
+        record = np.concatenate(self.errors.read_at), y, still, np.concatenate(base)
+        return (np.concatenate(s), np.concatenate(w)), record, np.array(edges), kinks[kept]
 
-    @cached_property
     def _projected(self) -> tuple[Array, Array]:
         """Orthonormal columns that do not move, and the outputs without them."""
         errors = self.errors
@@ -214,7 +215,7 @@ class BranchAndBound:
     @property
     def work(self) -> int:
         """Responses to single moves in one bound."""
-        return len(self.errors.y) * max(len(self._moves[0]) // len(self.errors.instants), 1)
+        return len(self.errors.y) * max(len(self.compiled[0][0]) // len(self.errors.instants), 1)
 
     def search(self, value: float, gap: float, seconds: float, most: float = np.inf) -> Search:
         """Discard boxes whose bound lies above (1 - gap) times a value, or times a better one found on the way.
@@ -225,9 +226,7 @@ class BranchAndBound:
             seconds: after which it ends.
             most: boxes after which it ends.
         """
-        s, w, base, edges, kinks = self._moves
-        still, y = self._projected
-        t = np.concatenate(self.errors.read_at)
+        moves, record, edges, kinks = self.compiled
         ends = [np.linspace(low, high, PIECES + 1) for low, high in zip(self.box.low, self.box.high)]
         l1, a = (one.ravel() for one in np.meshgrid(ends[0][:-1], ends[1][:-1]))
         l2, b = (one.ravel() for one in np.meshgrid(ends[0][1:], ends[1][1:]))
@@ -238,7 +237,7 @@ class BranchAndBound:
                 break
             part, boxes = boxes[-2000:], boxes[:-2000]
             inside = np.searchsorted(kinks, part[:, 3] - 1e-10) - np.searchsorted(kinks, part[:, 2] + 1e-10)
-            found = box_bounds(part, inside == 0, t, s, w, still, y, base, edges)
+            found = box_bounds(part, inside == 0, record, moves, edges)
             count += len(part)
             k = int(np.argmin(found[:, 1]))
             if found[k, 1] < best:
@@ -254,8 +253,8 @@ class BranchAndBound:
         found = self.search(value, GAP, SECONDS)
         words = f"{found.boxes} boxes in {time.perf_counter() - begun:.2g} s"
         if len(found.left):
-            return Bound(0.0, False, METHOD, f"given up after {words}: {len(found.left)} boxes are left, down to a dead "
-                         f"time of {self._time(found.left[:, 2].min())}")
+            return Bound(0.0, False, METHOD, f"given up after {words}: {len(found.left)} boxes are left, down to a "
+                         f"dead time of {self._time(found.left[:, 2].min())}")
         gap = max(0.0, 1 - found.bound / value) if value > 0 else 0.0
         if found.best < value * (1 - GAP):
             return Bound(found.bound, False, METHOD, f"a better point was found by the proof ({words}): time constant "
@@ -263,13 +262,14 @@ class BranchAndBound:
                          "constraints, or fit again from there")
         return Bound(found.bound, True, METHOD, "proved up to rounding for time constants from "
                      f"{self._time(np.exp(self.box.low[0]))} to {self._time(np.exp(self.box.high[0]))} and dead times "
-                     f"from {self._time(self.box.low[1])} to {self._time(self.box.high[1])}: {words}, relative gap {gap:.1e}")
+                     f"from {self._time(self.box.low[1])} to {self._time(self.box.high[1])}: {words}, relative gap "
+                     f"{gap:.1e}")
 
     def _time(self, samples: float) -> str:
         return f"{samples * self.errors.data.dt:.4g} {self.errors.data.time_unit}".rstrip()
 
 
-def _halves(boxes: Array, found: Array, inside: Array, kinks: Array) -> Array:
+def _halves(boxes: Array, found: Array, inside: NDArray[np.intp], kinks: Array) -> Array:
     """Return both halves of boxes: of the unknown that changes more, a dead time at the kink next to the middle."""
     if not len(boxes):
         return boxes

@@ -1,6 +1,5 @@
 """A record as the errors of processes need it: its instants, its units, and what it cannot tell refused by name."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -95,9 +94,9 @@ def read_times(data: Data, times: Any) -> tuple[Array, ...]:
         if np.any(steps <= 0):
             k = int(np.argmax(steps <= 0)) + 1
             word = "runs backwards" if steps[k - 1] < 0 else "stands still"
-            raise DataError(f"{where}the time {word} at sample {k} ({t[k - 1]:g}, then {t[k]:g}; {int(np.sum(steps <= 0))} "
-                            "such samples in all). Sort the record by time and drop what stands twice, or read it by its "
-                            "sampling time")
+            raise DataError(f"{where}the time {word} at sample {k} ({t[k - 1]:g}, then {t[k]:g}; "
+                            f"{int(np.sum(steps <= 0))} such samples in all). Sort the record by time and drop what "
+                            "stands twice, or read it by its sampling time")
         found.append((t - t[0]) / data.dt)
     return tuple(found)
 
@@ -109,12 +108,8 @@ def refuse_still_inputs(data: Data) -> None:
         if np.ptp(values) > 0 and any(np.ptp(e.u[:, c]) > 0 for e in data.experiments):
             continue
         y = np.concatenate([e.y[:, 0] for e in data.experiments])
-        raise DataError(f"input {name!r} never moves within an experiment (it stays at {values[0]:g}), so that gain and "
-                        "dead time are not determined, nor is a step before the record began. Determined is the course "
-                        f"of {data.outputs[0]!r} alone, from {_edge(y, 0):.4g} to {_edge(y, -1):.4g}: begin the record "
-                        "before the step, or leave the input out")
-
-
-def _edge(y: Sequence[float], at: int) -> float:
-    values = np.asarray(y)
-    return float(values[np.isfinite(values)][at])
+        y = y[np.isfinite(y)]
+        raise DataError(f"input {name!r} never moves within an experiment (it stays at {values[0]:g}), so that gain "
+                        "and dead time are not determined, nor is a step before the record began. Determined is the "
+                        f"course of {data.outputs[0]!r} alone, from {y[0]:.4g} to {y[-1]:.4g}: begin the record before "
+                        "the step, or leave the input out")

@@ -25,19 +25,21 @@ KEPT = 4  # starts that descend
 
 
 @cached_njit
-def gram_matrices(F, C, instants, changes, inputs, thetas, still, settings):  # noqa: N803
+def gram_matrices(F, C, instants, course, thetas, still, settings):  # noqa: N803
     """Return the Gram matrices (D, M + s, M + s) of [responses, still columns] for all dead times (D,).
 
-    The still columns (N, s) end with the output; the first M rows of `settings` (M + 1,) are what is added to every
-    response, the last says whether the input goes straight.
+    The course are the times (J,) and values (J, M) of the input. The still columns (N, s) end with the output; the
+    first M rows of `settings` (M + 1,) are what is added to every response, the last says whether the input goes
+    straight.
     """
+    changes, inputs = course
     m, s = inputs.shape[1], still.shape[1]
     found = np.zeros((len(thetas), m + s, m + s))
     block = np.zeros((len(instants), m + s))
     block[:, m:] = still
     start = np.zeros((len(F), m))
     for i in range(len(thetas)):
-        response = run(F, C, instants, changes + thetas[i], inputs, settings[m] > 0, True, start)
+        response = run(F, C, instants, changes + thetas[i], inputs, (settings[m] > 0, True), start)
         for c in range(m):
             block[:, c] = response[:, 0, c] + settings[c]
         found[i] = block.T @ block
@@ -45,15 +47,16 @@ def gram_matrices(F, C, instants, changes, inputs, thetas, still, settings):  # 
 
 
 def usual_box(errors: ProcessErrors) -> ProcessBox:
-    """Return usual bounds: time constants from a twentieth of a sample to ten records, dead times up to the last change.
+    """Return usual bounds: time constants from a twentieth of a sample to ten records, and dead times.
 
-    A dead time leaves at least a quarter of what follows the first change of its input.
+    These leave at least a quarter of what follows the first change of the input.
     """
     low, high, span = [], [], errors.length
     for c, structure in enumerate(errors.unknowns.structures):
         after = max((float(t[-1] - drives[c].changes[1]) for t, drives in zip(errors.instants, errors.drives)
                      if len(drives[c].changes) > 1), default=0.0)
-        ends = {"zeta": (np.log(0.02), np.log(20.0)), "tau_zero": (-3 * span, 3 * span), "dead_time": (0.0, 0.75 * after)}
+        ends = {"zeta": (np.log(0.02), np.log(20.0)), "tau_zero": (-3 * span, 3 * span),
+                "dead_time": (0.0, 0.75 * after)}
         for name in structure.names:
             one = ends.get(name, (np.log(0.05), np.log(10 * span)))
             low.append(one[0])
@@ -67,7 +70,8 @@ def grid(structure: ProcessStructure, low: Array, high: Array) -> Iterator[Array
     ends = (max(low[i] for i in logs), min(high[i] for i in logs)) if logs else (0.0, 0.0)
     inner = min(0.7, (ends[1] - ends[0]) / 2)
     scales = np.linspace(ends[0] + inner, ends[1] - inner, SCALES) if logs else [0.0]
-    for scale, zeta, zero in product(scales, DAMPINGS if structure.pair else (1.0,), ZEROS if structure.zero else (0.0,)):
+    dampings, zeros = DAMPINGS if structure.pair else (1.0,), ZEROS if structure.zero else (0.0,)
+    for scale, zeta, zero in product(scales, dampings, zeros):
         value = dict(zip(("tau1", "tau2", "tau3"), scale + np.log(RATIOS))) | {
             "tau": scale, "T": scale + np.log(RATIOS[min(structure.real, 2)]), "zeta": np.log(zeta),
             "tau_zero": zero * np.exp(scale)}
@@ -89,8 +93,8 @@ def scan(errors: ProcessErrors, c: int, box: ProcessBox, others: Array) -> list[
             drive = drives[c]
             level = np.zeros(m) if structure.integrator else drive.values[0]
             settings = np.append(level, float(errors.straight))
-            total += gram_matrices(f, row, t, drive.changes, np.ascontiguousarray(drive.about_rest), thetas,
-                                   np.ascontiguousarray(still[span]), settings)
+            course = drive.changes, np.ascontiguousarray(drive.about_rest)
+            total += gram_matrices(f, row, t, course, thetas, np.ascontiguousarray(still[span]), settings)
         for theta, value in zip(thetas, _least(total)):
             point = numbers.copy()
             if structure.delay:
@@ -119,7 +123,7 @@ def starts(errors: ProcessErrors, box: ProcessBox) -> list[Array]:
     chosen: list[Array] = []
     for _ in range(1 if m == 1 else 2):
         for c in range(m):
-            others = [constant]
+            others: list[Array] = [constant]
             for i, numbers in done.items():
                 if i != c:
                     x[u.slices[f"dynamics{i}"]] = numbers
@@ -147,7 +151,7 @@ def starts(errors: ProcessErrors, box: ProcessBox) -> list[Array]:
 
 def best_descents(errors: ProcessErrors, box: ProcessBox, more: tuple[Array, ...] = ()) -> list[ProcessPoint]:
     """Descend from all starts, on part of a long record first, and return different ends, the best first."""
-    coarse = errors.reduced(COARSE, CHANGES)
+    coarse = errors.first_part(COARSE, CHANGES)
     ends = sorted((descend(coarse, x, box, steps=30, tolerance=1e-7)[0] for x in (*starts(coarse, box), *more)),
                   key=lambda one: one.value)
     kept: list[ProcessPoint] = []

@@ -1,0 +1,93 @@
+"""What a record does not determine about a process: refused by name, with what it determines all the same."""
+
+import numpy as np
+
+from optid.errors import RankError
+from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
+from optid.identify.process.errors import ProcessErrors
+from optid.identify.process.starts import usual_box
+
+CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
+ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
+
+
+def refuse_silence(errors: ProcessErrors, best: ProcessPoint) -> None:
+    """Refuse a record in which the output shows no response to any input (`RankError`)."""
+    from scipy.stats import f as fisher
+
+    u = errors.unknowns
+    still = best.columns[:, sum(u.sizes) :]
+    rest = errors.y - still @ np.linalg.lstsq(still, errors.y, rcond=None)[0] if still.shape[1] else errors.y
+    used, dof = len(u.dynamic) + sum(u.sizes), len(errors.y) - u.size
+    before = float(rest @ rest)
+    ratio = (before - best.value) / used / max(best.value / dof, 1e-300)
+    if fisher.sf(ratio, used, dof) < CHANCE:
+        return
+    level = errors.units.y_offset[0] + errors.units.y_scale[0] * float(np.mean(errors.y))
+    size = errors.units.y_scale[0] * np.sqrt(before / len(errors.y))
+    raise RankError(
+        f"output {errors.data.outputs[0]!r} shows no response to {', '.join(errors.data.inputs)} (p = "
+        f"{fisher.sf(ratio, used, dof):.2g}): the dead time may be longer than the record, or the gain small beside "
+        f"the noise. Determined is its level alone, {level:.4g} (standard deviation {size:.2g}). Use a longer record "
+        "or a larger step")
+
+
+def refuse_inseparable(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
+    """Refuse time constants and dead times that the record shows only together (`RankError`)."""
+    u, at = errors.unknowns, errors.unknowns.dynamic
+    _refuse_instant(errors, box, best)
+    basis = np.linalg.qr(best.columns)[0]
+    slopes = errors.slopes(best.x)
+    left = slopes - basis @ (basis.T @ slopes)
+    names = [errors.key(name, c) for c, one in enumerate(u.structures) for name in one.names]
+    sizes, box = np.linalg.norm(left, axis=0), usual_box(errors)
+    inner = (best.x[at] > box.low + 1e-9) & (best.x[at] < box.high - 1e-9)
+    whole = np.linalg.norm(slopes, axis=0)
+    silent = [name for name, size, much, free in zip(names, sizes, whole, inner) if free and size <= ALIKE * much]
+    if silent:
+        raise RankError(f"{', '.join(silent)} {'have' if silent[1:] else 'has'} no effect on this record that the gain "
+                        f"does not have as well. {_determined(errors, best)}")
+    used = left[:, inner & (sizes > 0)] / sizes[inner & (sizes > 0)]
+    if used.shape[1] < 2:
+        return
+    values, vectors = np.linalg.svd(used, full_matrices=False)[1:]
+    if values[-1] > ALIKE * values[0]:
+        return
+    kept = [name for name, there in zip(names, inner & (sizes > 0)) if there]
+    parts = [name for name, part in zip(kept, np.abs(vectors[-1])) if part > 0.1]
+    raise RankError(f"{', '.join(parts)} can change together without any effect on this record: it does not separate "
+                    f"them. {_determined(errors, best)}")
+
+
+def _refuse_instant(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
+    """Refuse a time constant below a sampling time that is not told from zero beside a dead time (`RankError`)."""
+    from scipy.stats import f as fisher
+
+    dof = len(errors.y) - errors.unknowns.size
+    for c, one in enumerate(errors.unknowns.structures):
+        first = errors.unknowns.slices[f"dynamics{c}"].start
+        place = errors.place(c) - len(one.names) + 1
+        if one.names != ("tau", "dead_time") or best.x[first] > 0 or box.low[place] == box.high[place]:
+            continue
+        x = best.x.copy()
+        x[first + 1] += np.exp(best.x[first])
+        x[first] = box.low[place]
+        held = box.within(place, box.low[place], box.low[place])
+        found = search_cells(errors, descend(errors, x, held)[0], held)
+        if found.value <= best.value * (1 + fisher.ppf(0.95, 1, dof) / dof):
+            name = errors.key("tau", c)
+            raise RankError(f"{name} lies below a sampling time and is not told from zero: it does not separate from "
+                            f"{errors.key('dead_time', c)}. {_determined(errors, best)}")
+
+
+def _determined(errors: ProcessErrors, best: ProcessPoint) -> str:
+    """Say which sum of times the record determines all the same, and what to do."""
+    found = []
+    for c, one in enumerate(errors.processes(best.x)):
+        lag = one.in_unit(1 / errors.data.dt)
+        total = lag.p[: one.structure.real].sum() + 2 * lag.value("zeta") * lag.value("T") + lag.dead_time
+        of = f" ({errors.data.inputs[c]})" if errors.data.m > 1 else ""
+        found.append(f"{total - lag.value('tau_zero'):.4g}{of}")
+    sums = f"{', '.join(found)} {errors.data.time_unit}".rstrip()
+    return (f"Determined is their sum, the mean delay of the response: {sums}. Sample faster, choose fewer poles, or "
+            "hold one by a constraint such as dead_time:0")
