@@ -94,7 +94,7 @@ def order(data: Data, *, basis: Bases | None = None, feedback_basis: FeedbackBas
     parts = [hankel_statistics(part.records, 2 * alpha, expansion, names=expansion.names, centre=whole.centre)
              for part in (train, test) if part is not None]
     states = state_criteria(whole, expansion, alpha, max(largest, 1), *parts)
-    lags = _lags(data, train, test, expansion.inputs, na, nb, nk, notes)
+    lags = _lags(data if train is None else train, test, expansion.inputs, (na, nb, nk), notes)
     if ranks.exhausted:
         notes.append("Every order that the block rows can show was rejected: use more block rows, or a basis for the "
                      "inputs if the plant is not linear.")
@@ -163,12 +163,13 @@ def _parts(data: Data, holdout: float, alpha: int, notes: list[str]) -> tuple[Da
     return train, test
 
 
-def _lags(data: Data, train: Data | None, test: Data | None, bases: Sequence[Basis], na: int, nb: int, nk: int,
-          notes: list[str]) -> LagScan | None:
+def _lags(data: Data, test: Data | None, bases: Sequence[Basis], most: tuple[int, int, int], notes: list[str]
+          ) -> LagScan | None:
+    na, nb, nk = most
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)
-            return scan_lags(data if train is None else train, bases, na=na, nb=nb, nk=nk, test=test)
+            return scan_lags(data, bases, na=na, nb=nb, nk=nk, test=test)
     except RankError as error:
         notes.append(f"No scan of lags. {error}")
         return None
