@@ -10,7 +10,7 @@ import numpy as np
 
 from optid.kernel_cache import cached_njit
 
-SLOTS = 4  # exponentials that are kept; regular records have three lengths of steps
+SLOTS = 12  # exponentials that are kept; regular records have few lengths of steps
 REACH = 4.0  # norm of F h up to which the series is applied to the state itself
 TERMS = 24  # of a series, at most, for a norm of one
 
@@ -115,7 +115,7 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
         largest = max(abs(instants[0]), abs(instants[-1]))
     if len(changes):
         largest = max(largest, abs(changes[0]), abs(changes[-1]))
-    close = 4e-16 * largest
+    close = 1e-15 * largest  # a few times the rounding of a difference of two times
     k = 0
     while k < count and (instants[k] < changes[0] - close or (not late and instants[k] <= changes[0] + close)):
         k += 1

@@ -15,8 +15,10 @@ from optid.identify.process.errors import ProcessErrors
 STEPS, ARRIVED = 60, 1e-10  # steps of a descent; relative gain of a full step that is none
 SHARP = 1e-15  # the same of a point that is reported
 LARGEST = 2.0  # largest change of the logarithm of a time constant in a step
+SHORT, GRAM = 1000, 1e-6  # rows up to which columns are factorised; least eigenvalue of a scaled Gram matrix
 RANK = 1e-11  # singular value of the columns of the linear unknowns, relative to the largest, that counts as zero
 NEAR = 8  # cells on either side that are searched
+LONG = 2000  # outputs beyond which a cell is looked at in its middle alone, and two cells are searched
 BETTER = 1e-9  # relative gain by which another cell is better
 
 
@@ -30,14 +32,23 @@ class ProcessPoint:
     errors: Array  # (rows,) record less model
 
     @classmethod
-    def of(cls, errors: ProcessErrors, x: Array, held: tuple[Array, Array] | None = None) -> "ProcessPoint":
+    def of(cls, errors: ProcessErrors, x: Array) -> "ProcessPoint":
         """Fit the linear unknowns to the dynamics in x."""
         columns = errors.columns(x)
-        sizes = np.linalg.norm(columns, axis=0)
-        sizes = np.where(sizes > 0, sizes, 1.0)
-        linear = np.linalg.lstsq(columns / sizes, errors.y, rcond=RANK)[0] / sizes
+        linear = _least_squares(columns, errors.y)
         rest = errors.y - columns @ linear
         return cls(errors.with_linear(x, linear), float(rest @ rest), columns, rest)
+
+
+def _least_squares(columns: Array, y: Array) -> Array:
+    """Solve for the coefficients (L,) of columns: by their Gram matrix where it has the digits, which is faster."""
+    gram = columns.T @ columns
+    sizes = np.sqrt(np.diag(gram))
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    scaled = gram / np.outer(sizes, sizes)
+    if len(y) > SHORT and np.linalg.eigvalsh(scaled)[0] > GRAM:
+        return np.linalg.solve(scaled, columns.T @ y / sizes) / sizes
+    return np.linalg.lstsq(columns / sizes, y, rcond=RANK)[0] / sizes
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,13 +151,13 @@ def _best_cell(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox, c: i
     promising = []
     for low, high in cells:
         values = []
-        for theta in np.array([0.1, 0.5, 0.9]) * (high - low) + low:
+        for theta in np.array([0.1, 0.5, 0.9] if len(errors.y) <= LONG else [0.5]) * (high - low) + low:
             x = start.x.copy()
             x[at] = np.clip(x[at] + valley * (theta - x[at[place]]), box.low, box.high)
             values.append((ProcessPoint.of(errors, x).value, x))
         promising.append((*min(values, key=lambda one: one[0]), low, high))
     promising.sort(key=lambda one: one[0])
-    for value, x, low, high in promising[:4]:
+    for value, x, low, high in promising[: 4 if len(errors.y) <= LONG else 2]:
         inside = box.within(place, low, high)
         for late in (False, True):  # at the lower edge the right side is inside, at the upper edge the left one
             end = descend(errors, x, inside, late=late)[0]

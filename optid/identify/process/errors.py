@@ -57,6 +57,11 @@ class ProcessUnknowns(Unknowns):
         return found | {"offset": (int(self.constant),), "drift": (int(self.drift),)}
 
     @cached_property
+    def linear(self) -> NDArray[np.intp]:
+        """Places in x of everything else, in which they are linear."""
+        return np.setdiff1d(np.arange(self.size), self.dynamic)
+
+    @cached_property
     def dynamic(self) -> NDArray[np.intp]:
         """Places in x of the numbers of all processes, in which the errors are nonlinear."""
         every = np.arange(self.size)
@@ -217,7 +222,7 @@ class ProcessErrors(Criterion):
             found.append(np.vstack(parts))
         slopes = np.hstack(found)
         if u.free:  # the free motion is smooth in the poles, and there are few
-            linear = np.delete(x, u.dynamic)
+            linear = x[u.linear]
             first = len(linear) - u.n * u.experiments
             names = [name for one in u.structures for name in one.names]
             for j, place in enumerate(u.dynamic):
@@ -229,17 +234,16 @@ class ProcessErrors(Criterion):
 
     def simulate(self, x: Array) -> Array:
         """Return the outputs (rows,) of the model."""
-        return self.columns(x) @ np.delete(x, self.unknowns.dynamic)
+        return self.columns(x) @ x[self.unknowns.linear]
 
     # -- what descents and programmes need ---------------------------------------------------------------------------
 
     def _matrix(self, x: Array) -> tuple[Array, Array]:
         """Return the derivatives (rows, size) of the output in the order of x, and the errors."""
         u, linear = self.unknowns, self.columns(x)
-        rest = np.setdiff1d(np.arange(u.size), u.dynamic)
-        errors = linear @ x[rest] - self.y
+        errors = linear @ x[u.linear] - self.y
         matrix = np.zeros((len(errors), u.size))
-        matrix[:, rest] = linear
+        matrix[:, u.linear] = linear
         matrix[:, u.dynamic] = self._between(x, errors)
         return matrix, errors
 
@@ -314,5 +318,5 @@ class ProcessErrors(Criterion):
     def with_linear(self, x: Array, linear: ArrayLike) -> Array:
         """Return the dynamics of x with other linear unknowns."""
         found = np.array(x, dtype=float)
-        found[np.setdiff1d(np.arange(x.size), self.unknowns.dynamic)] = linear
+        found[self.unknowns.linear] = linear
         return found

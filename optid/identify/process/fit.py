@@ -15,7 +15,7 @@ from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
-from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells, sharpen
+from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.profile import profile_intervals
 from optid.identify.process.proof import better_start
@@ -50,7 +50,8 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
     middle = _middle(errors, usual_box(errors))
     box, complete = read_box(pose(middle, constraints), errors, usual_box(errors))
     points = best_descents(errors, box)
-    best = min((search_cells(errors, one, box) for one in points[:2]), key=lambda one: one.value)
+    several = points[: 2 if len(errors.y) <= LONG else 1]
+    best = min((search_cells(errors, one, box) for one in several), key=lambda one: one.value)
     figures: dict[str, Any] = {**(known or {}), "starts": _agreement(points, best)}
     if complete:
         best = sharpen(errors, _past_the_grid(errors, box, best), box)

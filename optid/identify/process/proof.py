@@ -30,7 +30,8 @@ GAP = 1e-6  # relative gap at which a fit counts as proved
 COARSE = 1e-2  # gap of the pass that looks for better starts before a fit is confirmed
 PIECES = 8  # of the range of either unknown at the beginning
 SECONDS = 20.0  # after which a proof is given up
-WORK = 2e6  # responses to single moves that the coarse pass may compute
+WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may compute; boxes that it needs at least
+MOST = 5e6  # responses to single moves in one bound beyond which no proof is tried
 METHOD = "branch and bound over time constant and dead time"
 REASON = ("a lower bound is known for one pole with dead time, a held input, a straight static curve and a start at "
           "rest alone; elsewhere several starts are compared")
@@ -215,7 +216,8 @@ class BranchAndBound:
     @property
     def work(self) -> int:
         """Responses to single moves in one bound."""
-        return len(self.errors.y) * max(len(self.compiled[0][0]) // len(self.errors.instants), 1)
+        moves = sum(len(t) * (len(drives[0].changes) - 1) for t, drives in zip(self.errors.read_at, self.errors.drives))
+        return max(moves, 1)
 
     def search(self, value: float, gap: float, seconds: float, most: float = np.inf) -> Search:
         """Discard boxes whose bound lies above (1 - gap) times a value, or times a better one found on the way.
@@ -249,6 +251,9 @@ class BranchAndBound:
 
     def certify(self, value: float) -> Bound:
         """Return the lower bound on V within the box for a point with this value."""
+        if self.work > MOST:
+            return Bound.none(f"{self.work:.1e} pairs of a sample and a move of the input: a proof would take too long; "
+                              "several starts are compared")
         begun = time.perf_counter()
         found = self.search(value, GAP, SECONDS)
         words = f"{found.boxes} boxes in {time.perf_counter() - begun:.2g} s"
@@ -299,6 +304,8 @@ def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array 
     if not applies(errors):
         return None
     bound = BranchAndBound(errors, box)
+    if bound.work > WORK / LEAST:
+        return None
     found = bound.search(value, COARSE, 0.5, WORK / bound.work)
     return found.point if found.best < value * (1 - GAP) else None
 
