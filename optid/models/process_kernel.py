@@ -10,7 +10,7 @@ import numpy as np
 
 from optid.kernel_cache import cached_njit
 
-SLOTS = 12  # exponentials that are kept; regular records have few lengths of steps
+SLOTS = 32  # exponentials that are kept; regular records have few lengths of steps
 REACH = 4.0  # norm of F h up to which the series is applied to the state itself
 TERMS = 24  # of a series, at most, for a norm of one
 
