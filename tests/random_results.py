@@ -126,6 +126,8 @@ def uses(fit: Any, folder: Path, seed: int) -> dict[str, Any]:
         return ""  # of a model that predicts nothing `validate` says so
 
     def exported() -> None:
+        if fit.formulation == "process.exact":  # in continuous time, with a dead time that no sampled model has
+            return
         model.to_c(folder / "model.c"), model.to_casadi()
         if fit.formulation != "physical":  # which has no linear part of its own
             model.to_dlti(), model.to_control() if find_spec("control") else None

@@ -205,6 +205,16 @@ class ProcessModel(Model):
             raise DataError(f"{label}Output {self.outputs[0]!r} has no sample: no initial state can be estimated.")
         return scaled_least_squares(self._motion(len(u))[here], rest[here])
 
+    # -- other tools ---------------------------------------------------------------------------------------------------
+
+    def _export(self, *_: Any, **__: Any) -> Any:
+        """Refuse: a dead time is no finite state in continuous time (`StructureError`)."""
+        raise StructureError("a process model in continuous time is not exported as a sampled one: its dead time need "
+                             "not be a multiple of the sampling time. Use model.simulate, its parameters "
+                             "(model.coefficients()) and its transfer function (model.equation())")
+
+    to_dlti = to_control = to_casadi = to_c = _export  # pyright: ignore[reportAssignmentType]
+
     # -- gauge, units, files -------------------------------------------------------------------------------------------
 
     def _regauged(self, gauge: str, signs: bool) -> Self:
