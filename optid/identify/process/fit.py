@@ -19,7 +19,7 @@ from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, desce
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.profile import profile_intervals
 from optid.identify.process.proof import better_start
-from optid.identify.process.separation import refuse_inseparable, refuse_silence
+from optid.identify.process.separation import refuse_inseparable, refuse_silence, warn_of_motion
 from optid.identify.process.starts import best_descents, usual_box
 from optid.program.solution import Bound
 from optid.solving.solve import Evidence, Procedure
@@ -57,6 +57,8 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
         best = sharpen(errors, _past_the_grid(errors, box, best), box)
         refuse_silence(errors, best)
         refuse_inseparable(errors, box, best)
+        if motion := warn_of_motion(errors, best):
+            figures["start"] = motion
         evidence = yield from _confirmed(errors, pose, constraints, best.x, figures)
         if evidence is None:
             return None

@@ -252,8 +252,8 @@ class BranchAndBound:
     def certify(self, value: float) -> Bound:
         """Return the lower bound on V within the box for a point with this value."""
         if self.work > MOST:
-            return Bound.none(f"{self.work:.1e} pairs of a sample and a move of the input: a proof would take too long; "
-                              "several starts are compared")
+            return Bound.none(f"{self.work:.1e} pairs of a sample and a move of the input: a proof would take too "
+                              "long; several starts are compared")
         begun = time.perf_counter()
         found = self.search(value, GAP, SECONDS)
         words = f"{found.boxes} boxes in {time.perf_counter() - begun:.2g} s"

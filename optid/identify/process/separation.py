@@ -1,13 +1,17 @@
 """What a record does not determine about a process: refused by name, with what it determines all the same."""
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 
-from optid.errors import RankError
+from optid.errors import DataWarning, RankError
 from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.starts import usual_box
 
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
+MOVING, EXACT = 1e-4, 1e-12  # p value, and share of the energy of the output, below which a motion counts as none
 ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
 
@@ -57,6 +61,36 @@ def refuse_inseparable(errors: ProcessErrors, box: ProcessBox, best: ProcessPoin
     parts = [name for name, part in zip(kept, np.abs(vectors[-1])) if part > 0.1]
     raise RankError(f"{', '.join(parts)} can change together without any effect on this record: it does not separate "
                     f"them. {_determined(errors, best)}")
+
+
+def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
+    """Warn where experiments do not begin at rest: a score test of motions of their own; return its finding or ""."""
+    from scipy.stats import f as fisher
+
+    u = errors.unknowns
+    if u.free:
+        return ""
+    free = replace(errors, unknowns=replace(u, free=True))
+    x = np.concatenate([best.x[: u.shared], np.zeros(free.unknowns.size - u.shared)])
+    every = free.columns(x)
+    known = np.column_stack([best.columns, errors.slopes(best.x)])
+    motions = every[:, len(u.linear) - u.n * u.experiments :]
+    basis = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))[0]
+    left = motions - basis @ (basis.T @ motions)
+    sizes = np.linalg.norm(left, axis=0)
+    left = left[:, sizes > 1e-6 * np.linalg.norm(motions, axis=0)] if left.size else left
+    dof = len(errors.y) - known.shape[1] - left.shape[1]
+    if not left.shape[1] or dof < 1:
+        return ""
+    gain = float(np.sum((np.linalg.qr(left)[0].T @ best.errors) ** 2))
+    p = float(fisher.sf(gain / left.shape[1] / max((best.value - gain) / dof, 1e-300), left.shape[1], dof))
+    if p >= MOVING or gain <= EXACT * errors.energy:
+        return ""
+    found = f"not at rest (p = {p:.1g})"
+    warnings.warn(f"the record does not begin at rest under its first inputs (p = {p:.1g}): initial='free' estimates a "
+                  "motion of its own for every experiment; gain and time constants are biased without it", DataWarning,
+                  stacklevel=2)
+    return found
 
 
 def _refuse_instant(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
