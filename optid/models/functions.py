@@ -109,6 +109,10 @@ def free_parameters(model: Any) -> int:
     """Return the number of parameters of a model, less those that repeat others (gauge)."""
     if hasattr(model, "parameters"):  # state equations of the user
         return len(model.parameters)
+    if model.structure == "process":
+        dynamics = sum(one.p.size for one in model.processes)
+        levels = 1 if model.levels is None else model.levels.size
+        return int(dynamics + sum(f.mu.size for f in model.nonlinearities) + levels + (model.drift != 0))
     shapes = sum(f.basis.size - 1 for f in model.nonlinearities)
     constants = model.l if model.levels is None else model.levels.size
     if model.structure != "ss":
