@@ -61,7 +61,7 @@ def draw(name, seed, noise):
             keep = rng.random(200) > 0.1
             keep[40:55] = keep[90:120] = False
         else:
-            u, options = LEVELS, {"basis": "triangular:9"}
+            u, options = LEVELS, {"basis": "triangular:8"}
             curve = np.clip(u, -0.5, 0.5) if kind == "saturation" else np.sign(u) * np.maximum(np.abs(u) - 0.25, 0)
     t = options.get("times", np.arange(float(len(u))))
     clean = truth.respond((u if curve is None else curve)[:, None], instants=t)
@@ -80,8 +80,8 @@ def bounds(truth, u, t, keep, sigma, curve):
     static = 0.0 if one.structure.integrator else f[0]
     linear = [moved[:, 0] + static]
     if curve is not None:
-        nodes = np.linspace(-1, 1, 10)
-        hats = np.array([np.interp(u, nodes, row) for row in np.eye(10)[1:]]).T
+        nodes = np.linspace(-1, 1, 9)
+        hats = np.array([np.interp(u, nodes, row) for row in np.eye(9)[1:]]).T
         linear = [one.response(t, t, (h - h[0])[:, None])[:, 0, 0] + h[0] for h in hats.T]
     slopes = np.column_stack([*linear, gain * moved[:, 1:], np.ones(len(t))])[keep]
     sizes = np.linalg.norm(slopes, axis=0)

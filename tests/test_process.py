@@ -430,3 +430,32 @@ def test_kinks_between_samples_and_changes():
     assert errors.kinks(0, 12.0) == (11.0, 12.0)
     assert ProcessStructure().names == ("tau", "dead_time")
     assert ProcessDynamics(ProcessStructure(), np.array([3.0, 1.0])).in_unit(0.5).p.tolist() == [6.0, 2.0]
+
+
+# -- where else they are used --------------------------------------------------------------------------------------
+
+
+def test_a_search_finds_the_process_behind_a_step_test():
+    found = optid.identify(record(), workers=1)
+    assert found.fit.formulation == "process.exact" and found.model.orders == {"process": "P1D"}
+    for name, value in {"K": 2, "tau": 30, "dead_time": 12.4}.items():
+        assert abs(found.fit.params[name].estimate - value) < 4 * found.fit.params[name].error
+
+
+def test_other_fits_of_a_step_test_point_to_processes():
+    sampled = optid.fit(record(), "oe.exact", na=1, nb=1, nk=13)
+    assert any("--formulation process.exact --process P1D" in one.step for one in sampled.advice)
+    assert not any("process.exact" in one.step for one in fit(record()).advice)
+
+
+def test_criteria_count_the_dead_time():
+    found = fit(record())
+    errors = found.residuals[:, 0]
+    likelihood = 200 * (np.log(np.mean(errors**2)) + 1 + np.log(2 * np.pi))
+    assert found.bic == pytest.approx(likelihood + 4 * np.log(200))
+
+
+def test_the_summary_says_seconds():
+    text = fit(record(dt=2.0)).summary()
+    assert "proved" in text and "profile likelihood" in text
+    assert re.search(r"dead time +24\.\d+ .* s\n", text) and re.search(r"time constant +5\d\.\d+ .* s\n", text)

@@ -92,7 +92,8 @@ def step_length(model: Model) -> int:
     if not model.is_stable:
         return 50
     decay = 0 if model.radius == 0 else int(np.ceil(np.log(SETTLED) / np.log(model.radius)))
-    return int(np.clip(1.5 * decay, 20, LONGEST_STEP))
+    late = int(np.max(getattr(model, "dead_times", 0.0)) / model.dt)  # of a process in continuous time
+    return int(np.clip(1.5 * decay + late, 20, LONGEST_STEP))
 
 
 def response_pairs(model: Model) -> list[tuple[str, str]]:
