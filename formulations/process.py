@@ -84,6 +84,8 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
     chosen = process or process_type(poles, zero, delay, integrator)
     errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial), times)
     errors, figures = choose_type(errors) if order else (errors, {})
+    if times is not None:
+        figures["instants"] = "as given; the verdict, and fits in %, count the samples as regular"
     pose = partial(_problem, errors)
     return (yield from fit_processes(errors, pose, tuple(constraints), certificate(errors), figures))
 

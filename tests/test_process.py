@@ -459,3 +459,15 @@ def test_the_summary_says_seconds():
     text = fit(record(dt=2.0)).summary()
     assert "proved" in text and "profile likelihood" in text
     assert re.search(r"dead time +24\.\d+ .* s\n", text) and re.search(r"time constant +5\d\.\d+ .* s\n", text)
+
+
+def test_parameters_at_their_bounds_are_named():
+    ramp = process_model("P0DI", K=0.05, dead_time=3.0, level=5.0)
+    found = fit(record(ramp, np.where(T >= 10, 1.0, 0.0), 0.01))
+    assert found.figures["bounds"] == ("tau at the largest value that is tried, 1990 s: the process may integrate (I in "
+                                       "its type)")
+    assert "fewer poles may do" in fit(record(), "P2D", constraints=["K:1.99"]).figures.get("bounds", "fewer poles may do")
+
+
+def test_given_instants_are_said():
+    assert fit(record(), times=T).figures["instants"].startswith("as given")

@@ -125,12 +125,12 @@ def search_cells(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) ->
     return best
 
 
-def sharpen(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> ProcessPoint:
-    """Return the optimum of the cells of a point to the last digits."""
+def sharpen(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> tuple[ProcessPoint, int]:
+    """Return the optimum of the cells of a point to the last digits, and the steps that it took."""
     for c, place in _delays(errors):
         box = box.within(place, *errors.cell(start.x, c))
-    end = descend(errors, start.x, box, steps=20, tolerance=SHARP)[0]
-    return min(start, end, key=lambda one: one.value)
+    end, _, steps = descend(errors, start.x, box, steps=20, tolerance=SHARP)
+    return min(start, end, key=lambda one: one.value), steps
 
 
 def _delays(errors: ProcessErrors) -> Iterator[tuple[int, int]]:

@@ -18,14 +18,19 @@ from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
 from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.profile import profile_intervals
-from optid.identify.process.proof import better_start
-from optid.identify.process.separation import refuse_inseparable, refuse_silence, warn_of_motion
+from optid.identify.process.proof import REASON, applies, better_start
+from optid.identify.process.separation import (
+    describe_bounds,
+    refuse_inseparable,
+    refuse_silence,
+    warn_of_motion,
+)
 from optid.identify.process.starts import best_descents, usual_box
-from optid.program.solution import Bound
+from optid.program.solution import Bound, Status
 from optid.solving.solve import Evidence, Procedure
 
 CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
-BOUNDS = "bounds"  # of the constraint that keeps numbers at their usual bounds
+BOUNDS = "usual bounds"  # of the constraint that keeps numbers at their usual bounds, and dead times from below zero
 PROFILED = 5_000  # outputs up to which profiles are worth their time; with more of them errors are all but quadratic
 ROUNDS = 3  # times that a better start is looked for over boxes
 
@@ -54,14 +59,16 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
     best = min((search_cells(errors, one, box) for one in several), key=lambda one: one.value)
     figures: dict[str, Any] = {**(known or {}), "starts": _agreement(points, best)}
     if complete:
-        best = sharpen(errors, _past_the_grid(errors, box, best), box)
+        best, steps = sharpen(errors, _past_the_grid(errors, box, best), box)
         refuse_silence(errors, best)
         refuse_inseparable(errors, box, best)
-        if motion := warn_of_motion(errors, best):
-            figures["start"] = motion
-        evidence = yield from _confirmed(errors, pose, constraints, best.x, figures)
+        figures |= {name: said for name, said in {"start": warn_of_motion(errors, best),
+                                                  "bounds": describe_bounds(errors, best)}.items() if said}
+        evidence = yield from _confirmed(errors, pose, constraints, best.x, figures, steps)
         if evidence is None:
             return None
+        if evidence.status is Status.LOCAL and not applies(errors):
+            evidence = replace(evidence, reason=REASON)
         evidence = replace(evidence, extend=partial(_with_profiles, errors, box, best.x, evidence))
         return evidence if certify is None else replace(evidence, bound=partial(certify, errors, box, best.value))
     ends = []
@@ -93,17 +100,17 @@ def _past_the_grid(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -
 
 
 def _confirmed(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], Problem], constraints: Sequence[Any],
-               x: Array, figures: Mapping[str, Any]) -> Procedure:
+               x: Array, figures: Mapping[str, Any], steps: int = 0) -> Procedure:
     """Let a back end confirm a point; numbers at their usual bounds stay within these."""
     problem, held = pose(x, constraints), _at_bounds(errors, x)
     if held:
-        problem = replace(problem.subject_to(partial(_bounds, held)), structural=problem.structural | {BOUNDS})
+        problem = problem.subject_to(partial(_bounds, held))
     fit = TangentFit(problem, errors, partial(CompressedErrors, errors))
-    return (yield from refine(fit, _descent(errors, x), figures, x))
+    return (yield from refine(fit, _descent(errors, x, steps), figures, x))
 
 
-def _descent(errors: ProcessErrors, x: Array) -> Descent:
-    return Descent(x, errors.linearise(x), 0, True)
+def _descent(errors: ProcessErrors, x: Array, steps: int = 0) -> Descent:
+    return Descent(x, errors.linearise(x), steps, True)
 
 
 def _middle(errors: ProcessErrors, box: ProcessBox) -> Array:

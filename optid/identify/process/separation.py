@@ -93,6 +93,22 @@ def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
     return found
 
 
+def describe_bounds(errors: ProcessErrors, best: ProcessPoint) -> str:
+    """Return which parameters lie at the smallest or largest value that is tried, and what that means; "" for none."""
+    box, found, j = usual_box(errors), [], 0
+    for c, one in enumerate(errors.processes(best.x)):
+        for name, value in zip(one.structure.names, one.in_unit(1 / errors.data.dt).p):
+            number = best.x[errors.unknowns.dynamic][j]
+            low, high = number <= box.low[j] + 1e-9, number >= box.high[j] - 1e-9
+            if name != "dead_time" and (low or high):
+                means = "fewer poles may do" if low else "the process may integrate (I in its type)"
+                size = f"{value:.4g} {errors.data.time_unit * (name != 'zeta')}".rstrip()
+                found.append(f"{errors.key(name, c)} at the {'smallest' if low else 'largest'} value that is tried, "
+                             f"{size}: {means if name not in ('zeta', 'tau_zero') else 'it is not determined'}")
+            j += 1
+    return "; ".join(found)
+
+
 def _refuse_instant(errors: ProcessErrors, box: ProcessBox, best: ProcessPoint) -> None:
     """Refuse a time constant below a sampling time that is not told from zero beside a dead time (`RankError`)."""
     from scipy.stats import f as fisher
