@@ -233,7 +233,7 @@ def test_words_hold_and_their_prices_are_those_of_refits(word, name, value):
     build = {"tau": lambda end: words.tau(high=end), "dead_time": lambda end: words.dead_time(end),
              "gain": lambda end: words.K(end), "K": lambda end: words.K(high=end)}[word.split(":")[0]]
     ends = [fit(data, constraints=[build(value + sign * step)]).solution.objective for sign in (1, -1)]
-    assert found.prices[0].multiplier == pytest.approx(abs(ends[0] - ends[1]) / (2 * step), rel=1e-3)
+    assert found.prices[0].multiplier == pytest.approx(abs(ends[0] - ends[1]) / (2 * step), rel=1e-5)
 
 
 def test_several_words_together():
@@ -471,3 +471,21 @@ def test_parameters_at_their_bounds_are_named():
 
 def test_given_instants_are_said():
     assert fit(record(), times=T).figures["instants"].startswith("as given")
+
+
+def test_the_command_prints_gain_time_constant_dead_time_and_proof(tmp_path):
+    from typer.testing import CliRunner
+
+    from optid.cli.app import app
+
+    data = record(dt=5.0, inputs="valve", outputs="temperature", input_units="%", output_units="K",
+                  start="2024-05-01T08:00")
+    data.to_csv(tmp_path / "step.csv")
+    done = CliRunner().invoke(app, ["fit", str(tmp_path / "step.csv"), "--inputs", "valve", "--outputs", "temperature",
+                                    "--formulation", "process.exact", "--process", "P1D", "--constraint", "tau:high=140",
+                                    "--report", str(tmp_path / "step.html"), "--model", str(tmp_path / "step.json")])
+    assert done.exit_code == 0, done.output
+    assert re.search(r"time constant +140\.0 .* s\n", done.output) and "optimality is proved" in done.output
+    assert re.search(r"static gain .* K/%\n", done.output) and re.search(r"tau +active \(1 of 1\)", done.output)
+    assert optid.load(tmp_path / "step.json").orders == {"process": "P1D"}
+    assert "dead time" in (tmp_path / "step.html").read_text(encoding="utf-8")
