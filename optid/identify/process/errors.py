@@ -142,9 +142,9 @@ class ProcessErrors(Criterion):
         if max(sizes) <= most and sizes == [len(t) for t in self.instants]:
             return self
         cut = [replace(e, u=e.u[:n], y=e.y[:n]) for e, n in zip(self.data.experiments, sizes)]
-        data = Data.of_experiments(cut, self.data.dt, self.data.inputs, self.data.outputs)
         if not all(np.isfinite(e.y).any() for e in cut):
             return self
+        data = Data.of_experiments(cut, self.data.dt, self.data.inputs, self.data.outputs)
         return replace(self, data=data, instants=tuple(t[:n] for t, n in zip(self.instants, sizes)),
                        every=self.every * max(1, max(sizes) // most))
 

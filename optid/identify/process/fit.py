@@ -14,7 +14,7 @@ from optid.identify.arguments import enough_rows
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import refine
-from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
+from optid.identify.prediction_error.tangent_fit import INSIDE, Places, TangentFit
 from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.profile import profile_intervals
@@ -157,23 +157,14 @@ def read_box(problem: Problem, errors: ProcessErrors, box: ProcessBox) -> tuple[
 
 def _cell(errors: ProcessErrors, view: Any) -> dict[str, Any]:
     """Keep every dead time in its cell about the point where the constraints are read, other numbers at usual sizes."""
-    names = [errors.key("dynamics", c) for c in range(errors.data.m)]
-    x = np.zeros(errors.unknowns.size)
-    for name in (*view.inner,):
-        if name in view.reference:
-            part = {**{errors.key("mu", c): f"mu{c}" for c in range(errors.data.m)},
-                    **{one: f"dynamics{c}" for c, one in enumerate(names)}, "offset": "offset", "drift": "drift"}
-            part = part.get(name)
-            if part is not None:
-                x[errors.unknowns.slices[part]] = view.reference[name]
-    if "x0" in view.reference:
-        x[errors.unknowns.shared :] = np.ravel(view.reference["x0"], order="F")
+    places = Places.of(errors)
+    x = places.pack({name: view.reference[name] for name in places.names})
     box = usual_box(errors)
     low, high = box.low.copy(), box.high.copy()
     for c, structure in enumerate(errors.unknowns.structures):
         if structure.delay:
             low[errors.place(c)], high[errors.place(c)] = errors.cell(x, c)
-    numbers = cp.hstack([view.inner[name] for name in names])
+    numbers = cp.hstack([view.inner[errors.key("dynamics", c)] for c in range(errors.data.m)])
     return {CELL: [numbers >= low, numbers <= high]}
 
 

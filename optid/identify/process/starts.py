@@ -83,7 +83,7 @@ def scan(errors: ProcessErrors, c: int, box: ProcessBox, others: Array) -> list[
     structure, first = errors.unknowns.structures[c], sum(len(s.names) for s in errors.unknowns.structures[:c])
     part = slice(first, first + len(structure.names))
     low, high = box.low[part], box.high[part]
-    thetas = np.linspace(low[-1], high[-1], DELAYS) if structure.delay else np.zeros(1)
+    thetas = np.unique(np.linspace(low[-1], high[-1], DELAYS)) if structure.delay else np.zeros(1)
     still, found = np.column_stack([others, errors.y]), []
     m = errors.unknowns.sizes[c]
     for numbers in grid(structure, low, high):
