@@ -466,8 +466,8 @@ def test_parameters_at_their_bounds_are_named():
     found = fit(record(ramp, np.where(T >= 10, 1.0, 0.0), 0.01))
     largest = "tau at the largest value that is tried, 1990 s: the process may integrate (I in its type)"
     assert found.figures["bounds"] == largest
-    several = [fit(record(seed=seed), "P2D").figures.get("bounds", "") for seed in range(6)]
-    assert "tau2 at the smallest value that is tried, 0.05 s: fewer poles may do" in several and "" in several
+    two, one = (fit(record(noise=0.1, seed=seed), "P2D").figures.get("bounds", "") for seed in (0, 1))
+    assert two == "" and one == "tau2 at the smallest value that is tried, 0.05 s: fewer poles may do"
 
 
 
@@ -491,3 +491,11 @@ def test_the_command_prints_gain_time_constant_dead_time_and_proof(tmp_path):
     assert re.search(r"static gain .* K/%\n", done.output) and re.search(r"tau +active \(1 of 1\)", done.output)
     assert optid.load(tmp_path / "step.json").orders == {"process": "P1D"}
     assert "dead time" in (tmp_path / "step.html").read_text(encoding="utf-8")
+
+
+def test_real_poles_of_an_oscillation_are_equal_and_said_to_be():
+    truth = process_model("P2DU", K=2.0, T=8.0, zeta=0.6, dead_time=5.2, level=5.0)
+    with pytest.warns(optid.errors.DataWarning, match="condition number"):
+        found = fit(record(truth), "P2D")
+    assert estimates(found)["tau1"] == pytest.approx(estimates(found)["tau2"]) and found.solution.status is Status.LOCAL
+    assert "complex pair" in found.figures["time constants"]

@@ -13,10 +13,12 @@ from optid.arrays import Array
 from optid.identify.process.errors import ProcessErrors
 
 STEPS, ARRIVED = 60, 1e-10  # steps of a descent; relative gain of a full step that is none
+GOOD, POOR = 0.75, 0.25  # shares of the expected gain above, and below, which damping falls, and rises
 SHARP = 1e-15  # the same of a point that is reported
 LARGEST = 2.0  # largest change of the logarithm of a time constant in a step
 SHORT, GRAM = 1000, 1e-6  # rows up to which columns are factorised; least eigenvalue of a scaled Gram matrix
 RANK = 1e-11  # singular value of the columns of the linear unknowns, relative to the largest, that counts as zero
+EQUAL, COSTS_NOTHING = 0.05, 1e-4  # difference of logarithms of time constants that may vanish; relative cost then
 NEAR = 8  # cells on either side that are searched
 LONG = 2000  # outputs beyond which a cell is looked at in its middle alone, and two cells are searched
 BETTER = 1e-9  # relative gain by which another cell is better
@@ -107,7 +109,10 @@ def descend(errors: ProcessErrors, x: Array, box: ProcessBox, *, steps: int = ST
         if not there.value < here.value:
             return here, True, count
         settled = here.value - there.value <= tolerance * here.value
-        here, damping = there, max(damping / 10, 1e-10)
+        moved = there.x[at] - q
+        ratio = (here.value - there.value) / max(2 * moved @ pull - moved @ gram @ moved, 1e-300)
+        damping = max(damping / 10, 1e-10) if ratio > GOOD else max(5 * damping, 1e-6) if ratio < POOR else damping
+        here = there
         if settled:
             return here, True, count
     return here, False, steps
@@ -129,8 +134,26 @@ def sharpen(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> tupl
     """Return the optimum of the cells of a point to the last digits, and the steps that it took."""
     for c, place in _delays(errors):
         box = box.within(place, *errors.cell(start.x, c))
-    end, _, steps = descend(errors, start.x, box, steps=20, tolerance=SHARP)
+    end, _, steps = descend(errors, start.x, box, tolerance=SHARP)
     return min(start, end, key=lambda one: one.value), steps
+
+
+def join_equal(errors: ProcessErrors, start: ProcessPoint) -> ProcessPoint:
+    """Return the point with time constants made equal that differ little, where that costs nothing.
+
+    The errors are symmetric in them: where a complex pair would fit better, the best real poles are equal.
+    """
+    x = start.x.copy()
+    for c, structure in enumerate(errors.unknowns.structures):
+        first = errors.unknowns.slices[f"dynamics{c}"].start
+        logs = x[first : first + structure.real]
+        for i in range(1, structure.real):
+            order = np.argsort(-logs)
+            one, other = order[i - 1], order[i]
+            if logs[one] - logs[other] < EQUAL:
+                logs[[one, other]] = (logs[one] + logs[other]) / 2
+    joined = ProcessPoint.of(errors, x)
+    return joined if joined.value <= start.value * (1 + COSTS_NOTHING) else start
 
 
 def _delays(errors: ProcessErrors) -> Iterator[tuple[int, int]]:

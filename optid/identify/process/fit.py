@@ -15,12 +15,13 @@ from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.descent import Descent
 from optid.identify.prediction_error.tangent_descent import refine
 from optid.identify.prediction_error.tangent_fit import INSIDE, Places, TangentFit
-from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, search_cells, sharpen
+from optid.identify.process.descent import LONG, ProcessBox, ProcessPoint, descend, join_equal, search_cells, sharpen
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.profile import profile_intervals
 from optid.identify.process.proof import REASON, applies, better_start
 from optid.identify.process.separation import (
     describe_bounds,
+    describe_equal_ones,
     refuse_inseparable,
     refuse_silence,
     warn_of_motion,
@@ -31,6 +32,7 @@ from optid.solving.solve import Evidence, Procedure
 
 CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
 BOUNDS = "usual bounds"  # of the constraint that keeps numbers at their usual bounds, and dead times from below zero
+NEAR = 0.02  # of a logarithm from its bound, within which the bound is stated to solvers
 PROFILED = 5_000  # outputs up to which profiles are worth their time; with more of them errors are all but quadratic
 ROUNDS = 3  # times that a better start is looked for over boxes
 
@@ -59,11 +61,13 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
     best = min((search_cells(errors, one, box) for one in several), key=lambda one: one.value)
     figures: dict[str, Any] = {**(known or {}), "starts": _agreement(points, best)}
     if complete:
-        best, steps = sharpen(errors, _past_the_grid(errors, box, best), box)
+        best, steps = sharpen(errors, join_equal(errors, _past_the_grid(errors, box, best)), box)
+        best = join_equal(errors, best)
         refuse_silence(errors, best)
         refuse_inseparable(errors, box, best)
         figures |= {name: said for name, said in {"start": warn_of_motion(errors, best),
-                                                  "bounds": describe_bounds(errors, best)}.items() if said}
+                                                  "bounds": describe_bounds(errors, best),
+                                                  "time constants": describe_equal_ones(errors, best)}.items() if said}
         evidence = yield from _confirmed(errors, pose, constraints, best.x, figures, steps)
         if evidence is None:
             return None
@@ -173,10 +177,10 @@ def _at_bounds(errors: ProcessErrors, x: Array) -> list[tuple[str, int, float, f
     box, found, j = usual_box(errors), [], 0
     for c, structure in enumerate(errors.unknowns.structures):
         for i, name in enumerate(structure.names):
-            value, near = x[errors.unknowns.slices[f"dynamics{c}"]][i], 3.0 if name == "dead_time" else 1e-9
+            value, near = x[errors.unknowns.slices[f"dynamics{c}"]][i], 3.0 if name == "dead_time" else NEAR
             if value <= box.low[j] + near:
                 found.append((errors.key("dynamics", c), i, 1.0, float(box.low[j])))
-            if value >= box.high[j] - 1e-9:
+            if value >= box.high[j] - (1e-9 if name == "dead_time" else NEAR):
                 found.append((errors.key("dynamics", c), i, -1.0, float(box.high[j])))
             j += 1
     return found

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from optid.arrays import Array
 from optid.errors import DataWarning, RankError
 from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
 from optid.identify.process.errors import ProcessErrors
@@ -12,6 +13,7 @@ from optid.identify.process.starts import usual_box
 
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
 MOVING, EXACT = 1e-4, 1e-12  # p value, and share of the energy of the output, below which a motion counts as none
+NEAR = 0.02  # of a logarithm from its bound that counts as none
 ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
 
@@ -41,13 +43,14 @@ def refuse_inseparable(errors: ProcessErrors, box: ProcessBox, best: ProcessPoin
     u, at = errors.unknowns, errors.unknowns.dynamic
     _refuse_instant(errors, box, best)
     basis = np.linalg.qr(best.columns)[0]
-    slopes = errors.slopes(best.x)
+    slopes = _with_equal_ones_together(errors, best)
     left = slopes - basis @ (basis.T @ slopes)
     names = [errors.key(name, c) for c, one in enumerate(u.structures) for name in one.names]
     sizes, box = np.linalg.norm(left, axis=0), usual_box(errors)
     inner = (best.x[at] > box.low + 1e-9) & (best.x[at] < box.high - 1e-9)
     whole = np.linalg.norm(slopes, axis=0)
-    silent = [name for name, size, much, free in zip(names, sizes, whole, inner) if free and size <= ALIKE * much]
+    silent = [name for name, size, much, free in zip(names, sizes, whole, inner)
+              if free and much > 0 and size <= ALIKE * much]
     if silent:
         raise RankError(f"{', '.join(silent)} {'have' if silent[1:] else 'has'} no effect on this record that the gain "
                         f"does not have as well. {_determined(errors, best)}")
@@ -99,13 +102,38 @@ def describe_bounds(errors: ProcessErrors, best: ProcessPoint) -> str:
     for c, one in enumerate(errors.processes(best.x)):
         for name, value in zip(one.structure.names, one.in_unit(1 / errors.data.dt).p):
             number = best.x[errors.unknowns.dynamic][j]
-            low, high = number <= box.low[j] + 1e-9, number >= box.high[j] - 1e-9
+            low, high = number <= box.low[j] + NEAR, number >= box.high[j] - NEAR
             if name != "dead_time" and (low or high):
                 means = "fewer poles may do" if low else "the process may integrate (I in its type)"
                 size = f"{value:.4g} {errors.data.time_unit * (name != 'zeta')}".rstrip()
                 found.append(f"{errors.key(name, c)} at the {'smallest' if low else 'largest'} value that is tried, "
                              f"{size}: {means if name not in ('zeta', 'tau_zero') else 'it is not determined'}")
             j += 1
+    return "; ".join(found)
+
+
+def _with_equal_ones_together(errors: ProcessErrors, best: ProcessPoint) -> Array:
+    """Return the derivatives by all numbers; of equal time constants the first has those of all, the others none."""
+    slopes, place = errors.slopes(best.x), 0
+    for c, one in enumerate(errors.unknowns.structures):
+        logs = best.x[errors.unknowns.slices[f"dynamics{c}"]][: one.real]
+        for i in range(1, one.real):
+            for j in range(i):
+                if logs[i] == logs[j] and slopes[:, place + i].any():
+                    slopes[:, place + j] += slopes[:, place + i]
+                    slopes[:, place + i] = 0.0
+        place += len(one.names)
+    return slopes
+
+
+def describe_equal_ones(errors: ProcessErrors, best: ProcessPoint) -> str:
+    """Return which time constants coincide, and what that means; "" for none."""
+    found = []
+    for c, one in enumerate(errors.unknowns.structures):
+        logs = best.x[errors.unknowns.slices[f"dynamics{c}"]][: one.real]
+        if len(set(logs.tolist())) < len(logs):
+            found.append(f"equal{'' if errors.data.m == 1 else f' ({errors.data.inputs[c]})'}: the record asks for a "
+                         "complex pair (U in the type), or for fewer poles")
     return "; ".join(found)
 
 
