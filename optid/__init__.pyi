@@ -579,6 +579,33 @@ def fit(
 @overload
 def fit(
     data: optid.data.record.Data | optid.data.streams.Stream,
+    formulation_name: Literal["process.exact"],
+    *,
+    process: str | collections.abc.Sequence[str] = ...,
+    poles: int = ...,
+    zero: bool = ...,
+    delay: bool = ...,
+    integrator: bool = ...,
+    order: str = ...,
+    basis: optid.bases.basis.Basis | str | collections.abc.Sequence[optid.bases.basis.Basis | str] = ...,
+    hold: str = ...,
+    offset: bool | str = ...,
+    drift: bool = ...,
+    initial: str = ...,
+    times: Any = ...,
+    constraints: collections.abc.Sequence[Any] = ...,
+    solver: Any = ...,
+    accuracy: float = ...,
+    time_limit: float | None = ...,
+    isolate: bool | None = ...,
+    prove: bool = ...,
+    solver_options: collections.abc.Mapping[str, Any] | None = ...,
+    raises: bool = ...,
+) -> Fit: ...
+
+@overload
+def fit(
+    data: optid.data.record.Data | optid.data.streams.Stream,
     formulation_name: Literal["ss.exact"],
     *,
     nx: int | str,

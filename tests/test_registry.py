@@ -8,7 +8,7 @@ import pytest
 from problems import BASIS, record
 
 import optid
-from formulations.constraints import poles, responses, shape
+from formulations.constraints import poles, process, responses, shape
 from optid.errors import LookupFailed, StructureError
 from optid.registry import (
     CONSTRAINTS,
@@ -33,7 +33,7 @@ def test_every_entry_point_loads_and_is_callable():
 
 def test_every_rule_of_the_catalogue_has_a_word():
     words = {point.value.split(":")[1] for point in registered(CONSTRAINTS).values()}
-    known = {*shape.__all__, *poles.__all__, *responses.__all__}
+    known = {*shape.__all__, *poles.__all__, *responses.__all__, *process.__all__}
     assert words == known - {"fixed"}  # a known parameter is an array, which no word can carry
 
 

@@ -29,6 +29,7 @@ DRIVEN = 0.5  # log ratio by which past outputs reduce the error of the input, f
 TOO_FEW = 10  # samples per parameter at least
 UNSTABLE = "the model has a pole outside the unit circle"
 SLOW = 0.9  # real poles from here on are compared with 1
+FEW = 8  # moves of the inputs below which a record determines a process, and little more
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
 NOISE_MODELS = ("arx", "hammerstein_arx", "armax", "hammerstein_armax", "bj", "hammerstein_bj")
 # formulations with a static function of the input, by those without
@@ -58,7 +59,7 @@ def advise(fit: Any) -> tuple[Advice, ...]:
     if not isinstance(fit.data, Data) or fit.model is None:
         return ()
     told = informativity(fit.data)
-    steps = [*_hopeless(told), *_in_a_loop(fit, told), *_on_record(fit)]
+    steps = [*_hopeless(told), *_in_a_loop(fit, told), *_on_record(fit), *_on_steps(fit, told)]
     # in a loop a free run says nothing about the plant, by which neighbours are compared
     tried = list(_tried(fit)) if fit.data.n_samples <= LONG and told.loop.word == "open" else []
     while tried:  # of steps with nearly the same gain, the simplest, which was tried first
@@ -103,6 +104,19 @@ def _on_record(fit: Any) -> Iterator[Advice]:
     if outliers:
         yield Advice(outliers[0].partition(":")[0], "--loss huber, or mark them as missing")
     yield from _halves(fit)
+
+
+def _on_steps(fit: Any, told: Informativity) -> Iterator[Advice]:
+    """Point to a process model where few moves show a dead time, of which a transfer function has whole samples."""
+    processes = told.processes
+    if told.loop.word != "open" or told.reason or not processes or fit.model.structure == "process" or fit.data.l > 1:
+        return
+    late = [r.nk - 1 for r in processes[0].responses]
+    if told.moves < FEW and max(late) > 0:
+        poles = max(min(max((r.poles != 1).sum() for r in processes[0].responses), 3), 1)
+        yield Advice(f"the inputs move {told.moves} times and the output answers {max(late)} samples late: gain, time "
+                     "constants and dead time in seconds, no matter how it is sampled, are those of a process model",
+                     f"--formulation process.exact --process P{poles}D")
 
 
 def _swapped(data: Data) -> Iterator[Advice]:

@@ -143,7 +143,8 @@ class _Reading:
     notes: list[str] = field(default_factory=list)
 
     def table(self, level: float, reason: str) -> Parameters:
-        rows = [*self.modes(), *self.dead_times(), *self.gains()]
+        of_process = self.model.structure == "process"
+        rows = self.of_process() if of_process else [*self.modes(), *self.dead_times(), *self.gains()]
         return Parameters(tuple(rows), level, reason, "Dynamics", tuple(dict.fromkeys(self.notes)))
 
     @property
@@ -164,6 +165,32 @@ class _Reading:
             self.notes.append(f"No standard error of the {what}: {str(error).rstrip('.')}.")
             return rows
         return np.column_stack([np.ravel(part) for part in (found.value, found.error, found.lower, found.upper)])
+
+    # -- processes -------------------------------------------------------------------------------------------------
+
+    def of_process(self) -> list[Parameter]:
+        """Return time constants, damping, dead time and gain of a process model: its parameters."""
+        units, found = self.model.coefficient_units(), []
+        times = {"tau": "time constant", **{f"tau{i}": f"time constant {i}" for i in (1, 2, 3)},
+                 "tau_zero": "time constant of the zero", "zeta": "damping", "dead_time": "dead time"}
+        for place, (name, _) in enumerate(self.model.coefficients()):
+            word, bracket, channel = name.partition("[")
+            rows = self.limits(name, lambda model, place=place: model.coefficients()[place][1])
+            if word in times:
+                found.append(_parameter(times[word] + bracket + channel, rows[0], units[name]))
+            elif word == "T":
+                rows = self.limits(name, lambda model, place=place: 1 / model.coefficients()[place][1])
+                found.append(_parameter(f"natural frequency{bracket}{channel}", rows[0], f"rad/{units[name] or 1}"))
+        model = self.model
+        for c, (one, f, channel) in enumerate(zip(model.processes, model.nonlinearities, model.inputs)):
+            name, (low, high) = "slope" if one.structure.integrator else "static gain", middle(*self.levels[c])
+            ends = np.array([low, high])
+            if not f.is_linear:
+                self.notes.append(f"{name.capitalize()} between {channel} = {low:g} and {high:g}.")
+            rows = self.limits(name, lambda model, c=c, ends=ends: (
+                np.diff(model.nonlinearities[c](ends)) / np.diff(ends)))
+            found.append(_parameter(name + self._of(channel), rows[0], units["K" + self._of(channel)]))
+        return found
 
     # -- poles -----------------------------------------------------------------------------------------------------
 

@@ -84,7 +84,11 @@ class Fit(Rendered):
         """Status, proof, residuals and times."""
         solution, evidence = self.outcome.solution, self.outcome.evidence
         if evidence and callable(evidence.bound):
-            solution = replace(solution, bound=evidence.bound())
+            asked = self.settings.get("prove", True)
+            bound = evidence.bound() if asked else Bound.none("no proof was asked for")
+            closed = bound.proved and solution.status is Status.LOCAL
+            solution = replace(solution, bound=bound, **(
+                {"status": Status.OPTIMAL, "reason": bound.reason} if closed else {}))
         reason, unbounded = _stand_in(self.arguments), solution.bound is not None and solution.bound.value == -np.inf
         if not reason or unbounded or solution.status not in (Status.OPTIMAL, Status.LOCAL):
             return solution

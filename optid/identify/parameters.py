@@ -15,7 +15,7 @@ from optid.registry import Rendered
 class Parameter(NamedTuple):
     """An estimate; an unknown error or interval is NaN, an unknown unit "".
 
-    Coefficients, whose units follow from those of the channels, are listed without.
+    Coefficients whose units follow from those of the channels are listed without.
     """
 
     name: str
@@ -86,6 +86,9 @@ def parameters(fit: Any, level: float = 0.95) -> Parameters:
     known = None if known is None else known.at_level(level)
     rows = [Parameter(name, value) for name, value in fit.model.coefficients()] if known is None else [
         Parameter(*row) for row in known.table()]
+    if hasattr(fit.model, "coefficient_units"):
+        units = fit.model.coefficient_units()
+        rows = [row._replace(unit=units.get(row.name, "")) for row in rows]
     for function in static_functions(fit.model):
         if not function.is_linear:
             rows += function_parameters(function, known)

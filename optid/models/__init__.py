@@ -17,4 +17,10 @@ def _physical(content: dict[str, Any], functions: Any) -> Any:
     return import_module("optid.models.physical").PhysicalModel.from_dict(content, functions)
 
 
+def _process(content: dict[str, Any], functions: Any) -> Any:
+    """Build a process model; its kernels are imported when there is one."""
+    return import_module("optid.models.process").ProcessModel.from_dict(content, functions)
+
+
 files.KINDS["PhysicalModel"] = _physical
+files.KINDS["ProcessModel"] = _process

@@ -92,7 +92,8 @@ def step_length(model: Model) -> int:
     if not model.is_stable:
         return 50
     decay = 0 if model.radius == 0 else int(np.ceil(np.log(SETTLED) / np.log(model.radius)))
-    return int(np.clip(1.5 * decay, 20, LONGEST_STEP))
+    late = int(np.max(getattr(model, "dead_times", 0.0)) / model.dt)  # of a process in continuous time
+    return int(np.clip(1.5 * decay + late, 20, LONGEST_STEP))
 
 
 def response_pairs(model: Model) -> list[tuple[str, str]]:
@@ -109,6 +110,10 @@ def free_parameters(model: Any) -> int:
     """Return the number of parameters of a model, less those that repeat others (gauge)."""
     if hasattr(model, "parameters"):  # state equations of the user
         return len(model.parameters)
+    if model.structure == "process":
+        dynamics = sum(one.p.size for one in model.processes)
+        levels = 1 if model.levels is None else model.levels.size
+        return int(dynamics + sum(f.mu.size for f in model.nonlinearities) + levels + (model.drift != 0))
     shapes = sum(f.basis.size - 1 for f in model.nonlinearities)
     constants = model.l if model.levels is None else model.levels.size
     if model.structure != "ss":

@@ -194,7 +194,9 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     best = yield from _constrained(here, figures)
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
-    slow = None if about_poles(here.fit.constraints) else slowed(here.fit.criterion, here.x)
+    criterion = here.fit.criterion
+    known = about_poles(here.fit.constraints) or criterion.dynamics not in criterion.unknowns.slices
+    slow = None if known else slowed(criterion, here.x)
     slow_ones = [] if slow is None else [slow, *here.fit.mirrored(slow, [(-1, -1)])]
     for start in (*here.fit.mirrored(here.x), *slow_ones):
         end = yield from _constrained(_Iterate.of(here.fit, start), figures, MIRRORED)

@@ -22,7 +22,7 @@ WARM = 0.25  # cost of a fit that goes on from another instead of searching for 
 LEAST = 0.01  # units of the shortest fit
 SAMPLES, EXPERIMENTS = 3000, 8  # of a record that costs twice as much as a short one
 RATES = {"arx": (7e-5, 1.5), "armax": (1.3e-3, 1.5), "bj": (4e-3, 1.5), "oe": (6e-3, 1.5), "sid": (1.7e-3, 1.0),
-         "ss": (5.3e-3, 1.2), "wiener": (4.7e-3, 1.2), "latent": (1.9e-2, 1.5)}
+         "ss": (5.3e-3, 1.2), "process": (6e-3, 1.5), "wiener": (4.7e-3, 1.2), "latent": (1.9e-2, 1.5)}
 """Units of a fit with one parameter to a short record, and the power of their number by which it becomes dearer."""
 
 
@@ -52,6 +52,8 @@ def units(candidate: Candidate, data: Data, fits: int = 1, searches: int = 1) ->
 def parameters(arguments: Mapping[str, Any], m: int, l: int) -> int:  # noqa: E741 - the field's letter for outputs
     """Return about how many parameters a structure with m inputs and l outputs has."""
     inner = _coefficients(arguments.get("basis", "linear"), m)
+    if "process" in arguments:
+        return sum(int(word[1]) + len(word) for word in arguments["process"]) + inner + l
     if "nx" not in arguments:
         numerators = int(np.sum(np.broadcast_to(arguments.get("nb", 1), m)))
         return int(arguments.get("na", 0)) * l + numerators + inner + sum(
@@ -71,8 +73,8 @@ def _rate(formulation: str) -> str:
     name = formulation.partition(".")[0]
     if formulation.endswith(".sid"):
         return "sid"
-    if name == "lfr":
-        return "latent"
+    if name in ("lfr", "process"):
+        return {"lfr": "latent"}.get(name, name)
     if name.endswith("wiener_ss"):
         return "wiener"
     if name in ("arx", "hammerstein_arx"):

@@ -172,6 +172,10 @@ def linear_models(ladder: Ladder) -> Rung:
     """The low-order model found in the record, autoregressions, subspace and output-error models, and refinements."""
     model = partial(structure, LINEAR)
     if ladder.single and ladder.told.processes:
+        if ladder.few_moves and ladder.open:
+            found = yield list(process_models(ladder))
+            if any(trial.complete for trial in found):  # a finer dead time than a sample, in the terms of the plant
+                return
         yield list(low_order(ladder))
         if ladder.few_moves:
             return
@@ -195,6 +199,21 @@ def linear_models(ladder: Ladder) -> Rung:
     if a := ladder.arguments(LINEAR, "oe.exact"):
         yield [model("bj.exact", na=n, nb=a["nb"], nk=a["nk"], nc=1, nd=1)
                for n in dict.fromkeys([max(a["na"] - 1, 1), a["na"], a["na"] + 1])]
+
+
+def process_models(ladder: Ladder) -> Iterator[Candidate]:
+    """Yield processes in continuous time with as many poles as were found, and with one less or more."""
+    responses = ladder.told.processes[0].responses
+    if any(r.nodes is not None for r in responses):  # a bent f is a matter of richer classes
+        return
+    for more in (0, -1, 1):
+        words = []
+        for response in responses:
+            poles = response.poles[response.poles != 1]
+            count = min(max(poles.size + more, int(not response.integrates)), 3)
+            pair = count == 2 and bool(np.any(np.iscomplex(poles)))
+            words.append(f"P{count}D{'I' * response.integrates}{'U' * pair}")
+        yield structure(LINEAR, "process.exact", process=words, initial="free")
 
 
 def low_order(ladder: Ladder) -> Iterator[Candidate]:

@@ -1,0 +1,1 @@
+"""Processes with dead time in continuous time: errors, search, proof of global optimality, order and intervals."""

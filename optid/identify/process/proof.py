@@ -1,0 +1,322 @@
+"""A proof that no other time constant and dead time fit better: branch and bound for one pole with dead time.
+
+With a held input that moves by w_j at s_j the response of a pole with dead time is
+
+    x(t) = w_0 + sum_j w_j S((t - s_j - theta) / tau),    S(z) = 1 - exp(-z) for z > 0, else 0,
+
+and V(log tau, theta) = min over gain and levels of |y - K x|². A box of (log tau, theta) is discarded where a lower
+bound of V there lies above what was found. In a box across kinks x is known up to an interval, since S falls in both
+unknowns. In a cell, x = x0 + a x1 + b x2 + r with |a| <= h1, |b| <= h2 and r within an envelope of its second
+derivatives: least squares over K, K a and K b in their cone, less the largest K |r|, is a lower bound. Boxes are halved
+at kinks first. What is not discarded holds the optimum: its middle is a start that no grid can miss.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optid.arrays import Array
+from optid.identify.process.descent import ProcessBox
+from optid.identify.process.errors import ProcessErrors
+from optid.kernel_cache import cached_njit
+from optid.models.process_dynamics import ProcessStructure
+from optid.program.solution import Bound
+
+GAP = 1e-6  # relative gap at which a fit counts as proved
+COARSE = 1e-2  # gap of the pass that looks for better starts before a fit is confirmed
+PIECES = 8  # of the range of either unknown at the beginning
+SECONDS = 20.0  # after which a proof is given up
+WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may compute; boxes that it needs at least
+MOST = 5e6  # responses to single moves in one bound beyond which no proof is tried
+METHOD = "branch and bound over time constant and dead time"
+REASON = ("a lower bound is known for one pole with dead time, a held input, a straight static curve and a start at "
+          "rest alone; elsewhere several starts are compared")
+
+
+@cached_njit
+def box_bounds(boxes, smooth, record, moves, edges):
+    """Return (lower bound, V at the middle, effects of both halves) of boxes.
+
+    Args:
+        boxes: (B, 4) log tau from, to; theta from, to.
+        smooth: (B,) whether no kink lies inside.
+        record: of all experiments one after another: instants (N,), outputs (N,) and orthonormal columns (N, c), which
+            are projected out of the outputs already, response (N,) before the moves.
+        moves: times (J,) and sizes (J,) of the moves, by experiment.
+        edges: (E + 1, 2) first sample, and first move, of every experiment.
+    """
+    t, y, still, base = record
+    s, w = moves
+    count, n, columns = len(boxes), len(t), still.shape[1]
+    found = np.zeros((count, 4))
+    x, envelope = np.zeros((3, n)), np.zeros(n)
+    energy = 0.0
+    for k in range(n):
+        energy += y[k] * y[k]
+    for i in range(count):
+        l1, l2, a, b = boxes[i]
+        low_tau, high_tau, tau = np.exp(l1), np.exp(l2), np.exp((l1 + l2) / 2)
+        h1, h2, theta = (l2 - l1) / 2, (b - a) / 2, (a + b) / 2
+        for e in range(len(edges) - 1):
+            for k in range(edges[e, 0], edges[e + 1, 0]):
+                x0, x1, x2, rest = base[k], 0.0, 0.0, 0.0
+                for j in range(edges[e, 1], edges[e + 1, 1]):
+                    since = t[k] - s[j] - theta
+                    size = abs(w[j])
+                    if smooth[i]:
+                        if since <= 0.0:
+                            continue
+                        z = since / tau
+                        decay = np.exp(-z)
+                        x0 += w[j] * (1 - decay)
+                        x1 -= w[j] * z * decay
+                        x2 -= w[j] * decay / tau
+                        za, zb = max(since - h2, 0.0) / high_tau, (since + h2) / low_tau
+                        m = max(abs(1 - za), abs(1 - zb))
+                        rest += size * np.exp(-za) * (h1 * h1 / 2 * zb * m + h1 * h2 * m / low_tau
+                                                      + h2 * h2 / (2 * low_tau * low_tau))
+                    elif since + h2 > 0.0:
+                        middle = 1 - np.exp(-since / tau) if since > 0.0 else 0.0
+                        up = 1 - np.exp(-(since + h2) / low_tau)
+                        down = 1 - np.exp(-(since - h2) / high_tau) if since > h2 else 0.0
+                        x0 += w[j] * middle
+                        rest += size * max(up - middle, middle - down)
+                x[0, k], x[1, k], x[2, k], envelope[k] = x0, x1, x2, rest
+        rows = 3 if smooth[i] else 1
+        for c in range(columns):
+            for o in range(rows):
+                total = 0.0
+                for k in range(n):
+                    total += still[k, c] * x[o, k]
+                for k in range(n):
+                    x[o, k] -= total * still[k, c]
+        gram, side, rho = np.zeros((3, 3)), np.zeros(3), 0.0
+        for k in range(n):
+            rho += envelope[k] * envelope[k]
+            for o in range(rows):
+                side[o] += x[o, k] * y[k]
+                for p in range(o, rows):
+                    gram[o, p] += x[o, k] * x[p, k]
+        rho = np.sqrt(rho)
+        for o in range(3):
+            for p in range(o):
+                gram[o, p] = gram[p, o]
+        first, second = h1 * np.sqrt(gram[1, 1]), h2 * np.sqrt(gram[2, 2])
+        change, length = rho + first + second, np.sqrt(gram[0, 0])
+        at_middle = energy - side[0] * side[0] / gram[0, 0] if gram[0, 0] > 0.0 else energy
+        lower = 0.0
+        if change < length:
+            largest = np.sqrt(energy) / (length - change)  # of the gain anywhere in the box
+            least = energy - _explained(gram, side, h1, h2) if smooth[i] else at_middle
+            lower = max(np.sqrt(max(least, 0.0)) - largest * rho, 0.0) ** 2
+        found[i, 0], found[i, 1] = lower, at_middle
+        found[i, 2] = first if smooth[i] else h1 * length
+        found[i, 3] = second if smooth[i] else h2 / tau * length
+    return found
+
+
+@cached_njit
+def _explained(gram, side, h1, h2):
+    """Return the most that K x0 + K a x1 + K b x2 explains with |a| <= h1 and |b| <= h2: faces of a cone, one by one.
+
+    On a face some of a and b are at their ends; the optimum of a face counts where it obeys the other bounds.
+    """
+    best = 0.0
+    for one in range(-1, 2):
+        for two in range(-1, 2):
+            # columns: x0 with what is fixed, then what is free
+            q = np.zeros((3, 3))
+            size = 1
+            q[0, 0], q[1, 0], q[2, 0] = 1.0, one * h1, two * h2
+            if one == 0:
+                q[1, size], size = 1.0, size + 1
+            if two == 0:
+                q[2, size], size = 1.0, size + 1
+            inner, right = np.zeros((size, size)), np.zeros(size)
+            for i in range(size):
+                for k in range(3):
+                    right[i] += q[k, i] * side[k]
+                    for j in range(size):
+                        for m in range(3):
+                            inner[i, j] += q[k, i] * gram[k, m] * q[m, j]
+            scale = np.zeros(size)
+            for i in range(size):
+                scale[i] = np.sqrt(inner[i, i]) if inner[i, i] > 0.0 else 1.0
+            for i in range(size):
+                right[i] /= scale[i]
+                for j in range(size):
+                    inner[i, j] /= scale[i] * scale[j]
+                inner[i, i] += 1e-13
+            v = np.linalg.solve(inner, right)
+            gain = 0.0
+            for i in range(size):
+                gain += v[i] * right[i]
+                v[i] /= scale[i]
+            inside, at = True, 1
+            if one == 0:
+                inside, at = inside and abs(v[at]) <= h1 * abs(v[0]) * (1 + 1e-9), at + 1
+            if two == 0:
+                inside = inside and abs(v[at]) <= h2 * abs(v[0]) * (1 + 1e-9)
+            if inside:
+                best = max(best, gain)
+                if one == 0 and two == 0:
+                    return gain
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What a search over boxes ended with: the least bound of discarded boxes, the best middle, and what is left."""
+
+    bound: float
+    best: float
+    point: Array  # (2,) log tau and theta of the best middle
+    left: Array  # (B, 4) boxes that were not discarded
+    boxes: int
+
+
+@dataclass(frozen=True, eq=False)
+class BranchAndBound:
+    """Boxes of (log tau, theta) for one pole with dead time, in sampling times."""
+
+    errors: ProcessErrors
+    box: ProcessBox
+
+    @cached_property
+    def compiled(self) -> tuple[tuple[Array, ...], tuple[Array, ...], NDArray[np.intp], Array]:
+        """Moves, record and edges as `box_bounds` takes them, and the dead times at which a move meets a sample."""
+        s, w, edges, base = [], [], [(0, 0)], []
+        for t, drives in zip(self.errors.read_at, self.errors.drives):
+            drive = drives[0]
+            s.append(drive.changes[1:])
+            w.append(np.diff(drive.values[:, 0]))
+            base.append(np.full(len(t), drive.values[0, 0]))
+            edges.append((edges[-1][0] + len(t), edges[-1][1] + len(s[-1])))
+        kinks = np.unique(np.concatenate([np.subtract.outer(t, one).ravel()
+                                          for t, one in zip(self.errors.read_at, s)]))
+        inside = (kinks > self.box.low[1]) & (kinks < self.box.high[1])
+        kinks = kinks[inside]
+        kept = np.concatenate([[True], np.diff(kinks) > 1e-9]) if len(kinks) else np.zeros(0, dtype=bool)
+        still, y = self._projected()
+        record = np.concatenate(self.errors.read_at), y, still, np.concatenate(base)
+        return (np.concatenate(s), np.concatenate(w)), record, np.array(edges), kinks[kept]
+
+    def _projected(self) -> tuple[Array, Array]:
+        """Orthonormal columns that do not move, and the outputs without them."""
+        errors = self.errors
+        x = np.zeros(errors.unknowns.size)
+        x[errors.unknowns.dynamic] = (self.box.low + self.box.high) / 2
+        still = np.linalg.qr(errors.columns(x)[:, 1:])[0]
+        return np.ascontiguousarray(still), errors.y - still @ (still.T @ errors.y)
+
+    @property
+    def work(self) -> int:
+        """Responses to single moves in one bound."""
+        moves = sum(len(t) * (len(drives[0].changes) - 1) for t, drives in zip(self.errors.read_at, self.errors.drives))
+        return max(moves, 1)
+
+    def search(self, value: float, gap: float, seconds: float, most: float = np.inf) -> Search:
+        """Discard boxes whose bound lies above (1 - gap) times a value, or times a better one found on the way.
+
+        Args:
+            value: sum of squares that was found.
+            gap: relative.
+            seconds: after which it ends.
+            most: boxes after which it ends.
+        """
+        moves, record, edges, kinks = self.compiled
+        ends = [np.linspace(low, high, PIECES + 1) for low, high in zip(self.box.low, self.box.high)]
+        l1, a = (one.ravel() for one in np.meshgrid(ends[0][:-1], ends[1][:-1]))
+        l2, b = (one.ravel() for one in np.meshgrid(ends[0][1:], ends[1][1:]))
+        boxes, count, bound, begun = np.column_stack([l1, l2, a, b]), 0, np.inf, time.perf_counter()
+        best, point = np.inf, np.zeros(2)
+        while len(boxes):
+            if time.perf_counter() - begun > seconds or count > most:
+                break
+            part, boxes = boxes[-2000:], boxes[:-2000]
+            inside = np.searchsorted(kinks, part[:, 3] - 1e-10) - np.searchsorted(kinks, part[:, 2] + 1e-10)
+            found = box_bounds(part, inside == 0, record, moves, edges)
+            count += len(part)
+            k = int(np.argmin(found[:, 1]))
+            if found[k, 1] < best:
+                best, point = float(found[k, 1]), np.array([part[k, :2].mean(), part[k, 2:].mean()])
+            out = found[:, 0] >= min(value, best) * (1 - gap)
+            bound = min(bound, float(np.min(found[out, 0], initial=np.inf)))
+            boxes = np.vstack([boxes, _halves(part[~out], found[~out], inside[~out], kinks)])
+        return Search(min(bound, value), best, point, boxes, count)
+
+    def certify(self, value: float) -> Bound:
+        """Return the lower bound on V within the box for a point with this value."""
+        if self.work > MOST:
+            return Bound.none(f"{self.work:.1e} pairs of a sample and a move of the input: a proof would take too "
+                              "long; several starts are compared")
+        begun = time.perf_counter()
+        found = self.search(value, GAP, SECONDS)
+        words = f"{found.boxes} boxes in {time.perf_counter() - begun:.2g} s"
+        if len(found.left):
+            return Bound(0.0, False, METHOD, f"given up after {words}: {len(found.left)} boxes are left, down to a "
+                         f"dead time of {self._time(found.left[:, 2].min())}")
+        gap = max(0.0, 1 - found.bound / value) if value > 0 else 0.0
+        if found.best < value * (1 - GAP):
+            return Bound(found.bound, False, METHOD, f"a better point was found by the proof ({words}): time constant "
+                         f"{self._time(np.exp(found.point[0]))}, dead time {self._time(found.point[1])}; hold it by "
+                         "constraints, or fit again from there")
+        return Bound(found.bound, True, METHOD, "proved up to rounding for time constants from "
+                     f"{self._time(np.exp(self.box.low[0]))} to {self._time(np.exp(self.box.high[0]))} and dead times "
+                     f"from {self._time(self.box.low[1])} to {self._time(self.box.high[1])}: {words}, relative gap "
+                     f"{gap:.1e}")
+
+    def _time(self, samples: float) -> str:
+        return f"{samples * self.errors.data.dt:.4g} {self.errors.data.time_unit}".rstrip()
+
+
+def _halves(boxes: Array, found: Array, inside: NDArray[np.intp], kinks: Array) -> Array:
+    """Return both halves of boxes: of the unknown that changes more, a dead time at the kink next to the middle."""
+    if not len(boxes):
+        return boxes
+    l1, l2, a, b = boxes.T
+    wide = found[:, 2] >= found[:, 3]
+    middle = (a + b) / 2
+    if len(kinks):
+        at = np.searchsorted(kinks, middle)
+        before, after = kinks[np.maximum(at - 1, 0)], kinks[np.minimum(at, len(kinks) - 1)]
+        near = np.where(np.abs(before - middle) < np.abs(after - middle), before, after)
+        middle = np.where((inside > 0) & (near > a + 1e-10) & (near < b - 1e-10), near, middle)
+    log = (l1 + l2) / 2
+    first = np.column_stack([l1, np.where(wide, log, l2), a, np.where(wide, b, middle)])
+    second = np.column_stack([np.where(wide, log, l1), l2, np.where(wide, a, middle), b])
+    return np.vstack([first, second])
+
+
+def applies(errors: ProcessErrors) -> bool:
+    """Whether a lower bound is known: one pole with dead time, straight f, held input, start at rest."""
+    one = errors.unknowns.structures
+    return (one == (ProcessStructure(),) and errors.unknowns.sizes == (1,) and not errors.unknowns.free
+            and not errors.straight and type(errors.bases[0]).__name__ == "Linear")
+
+
+def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array | None:
+    """Return a point (log tau, theta) with a smaller sum of squares than a value, where a coarse search finds one."""
+    if not applies(errors):
+        return None
+    bound = BranchAndBound(errors, box)
+    if bound.work > WORK / LEAST:
+        return None
+    found = bound.search(value, COARSE, 0.5, WORK / bound.work)
+    return found.point if found.best < value * (1 - GAP) else None
+
+
+def certificate(errors: ProcessErrors) -> Callable[[ProcessErrors, ProcessBox, float], Bound]:
+    """Return what bounds the errors of a fit within a box from below."""
+    if not applies(errors):
+        return lambda *_: Bound.none(REASON)
+
+    def certify(errors: ProcessErrors, box: ProcessBox, value: float) -> Bound:
+        found = BranchAndBound(errors, box).certify(value)
+        return replace(found, value=errors.unit * found.value)
+
+    return certify

@@ -1,0 +1,501 @@
+"""Fits of processes in continuous time: found, constrained, priced, proved, saved; bad input is refused by name."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import optid
+from formulations.constraints import process as words
+from optid.errors import DataError, InfeasibleError, RankError, StructureError
+from optid.identify.process.errors import ProcessErrors
+from optid.identify.process.order import choose_type
+from optid.identify.process.proof import BranchAndBound, box_bounds
+from optid.identify.process.record import Terms, process_errors
+from optid.identify.process.starts import usual_box
+from optid.models.process import ProcessModel, process_model
+from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
+from optid.program.solution import Status
+
+T = np.arange(200.0)
+STEP = np.where(T >= 10, 1.0, 0.0)
+FIRST = process_model("P1D", K=2.0, tau=30.0, dead_time=12.4, level=5.0)
+
+
+def record(model: ProcessModel = FIRST, u: np.ndarray = STEP, noise: float = 0.04, seed: int = 0, **options
+           ) -> optid.Data:
+    u = np.reshape(u, (len(u), -1))
+    y = model.respond(u) + noise * np.random.default_rng(seed).normal(size=len(u))
+    return optid.Data(u, y, **{"dt": 1.0, **options})
+
+
+def fit(data: optid.Data, process: str = "P1D", **options) -> optid.Fit:
+    return optid.fit(data, "process.exact", process=process, **options)
+
+
+def estimates(found: optid.Fit) -> dict[str, float]:
+    return dict(found.model.coefficients())
+
+
+# -- what a fit returns --------------------------------------------------------------------------------------------
+
+
+def test_first_order_with_dead_time_against_a_dense_search():
+    """The optimum is that of a simplex over (tau, theta) from many starts, everything else by least squares."""
+    data = record()
+    y = data.y[:, 0]
+
+    def value(p):
+        x = np.column_stack([-np.expm1(-np.maximum(T - 10 - p[1], 0) / p[0]), np.ones(200)])
+        return float(np.sum((y - x @ np.linalg.lstsq(x, y)[0]) ** 2))
+
+    best = min((minimize(value, start, method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 1e-14, "maxiter": 2000})
+                for start in ([30, 12.2], [30, 12.7], [28, 11.5], [32, 13.5])), key=lambda one: one.fun)
+    found = fit(data)
+    assert found.solution.objective <= best.fun * (1 + 1e-9)
+    np.testing.assert_allclose([found.params["tau"].estimate, found.params["dead_time"].estimate], best.x, rtol=1e-5)
+    assert found.solution.status is Status.OPTIMAL and found.solution.proof and found.solution.gap < 2e-6
+
+
+def test_time_is_in_the_unit_of_the_record():
+    slow, fast = fit(record(dt=60.0)), fit(record())
+    for name, factor in {"K": 1, "tau": 60, "dead_time": 60, "level": 1}.items():
+        assert slow.params[name].estimate == pytest.approx(factor * fast.params[name].estimate, rel=1e-9)
+        assert slow.params[name].error == pytest.approx(factor * fast.params[name].error, rel=1e-6)
+    assert slow.params["tau"].unit == "s" and slow.dynamics["dead time"].unit == "s"
+
+
+def test_other_units_of_the_channels_change_nothing_else():
+    data = record()
+    other = optid.Data(40 + 1e-3 * data.u, 1e5 * data.y - 300, dt=1.0)
+    one, two = estimates(fit(data)), estimates(fit(other))
+    assert two["tau"] == pytest.approx(one["tau"], rel=1e-7)
+    assert two["dead_time"] == pytest.approx(one["dead_time"], rel=1e-7)
+    assert two["K"] == pytest.approx(1e8 * one["K"], rel=1e-7)
+
+
+@pytest.mark.parametrize(("process", "values"), [
+    ("P1", {"tau": 20.0}), ("P2D", {"tau1": 30.0, "tau2": 8.0, "dead_time": 12.4}),
+    ("P2DU", {"T": 8.0, "zeta": 0.3, "dead_time": 12.4}),
+    ("P2DZ", {"tau1": 30.0, "tau2": 12.0, "tau_zero": -10.0, "dead_time": 6.4}),
+    ("P3DU", {"tau": 25.0, "T": 5.0, "zeta": 0.2, "dead_time": 4.3})])
+def test_exact_records_give_the_parameters_back(process, values):
+    truth = process_model(process, K=2.0, level=5.0, **values)
+    found = estimates(fit(record(truth, noise=1e-7), process))
+    for name, value in {**values, "K": 2.0, "level": 5.0}.items():
+        assert found[name] == pytest.approx(value, rel=2e-4), name
+
+
+@pytest.mark.parametrize("process", ["P0DI", "P1DI"])
+def test_integrators(process):
+    values = {"dead_time": 12.4, **({"tau": 9.0} if process == "P1DI" else {})}
+    truth = process_model(process, K=0.05, level=5.0, **values)
+    found = fit(record(truth, ((T >= 10) & (T < 60)) * 1.0, 0.01), process)
+    for name, value in {**values, "K": 0.05}.items():
+        row = found.params[name]
+        assert abs(row.estimate - value) < 4 * row.error, name
+    assert found.dynamics["slope"].estimate == pytest.approx(found.params["K"].estimate)
+    with pytest.raises(StructureError, match="integrator"):
+        found.model.static_gain(0.5)
+
+
+def test_two_inputs_two_experiments_and_labels():
+    rng = np.random.default_rng(1)
+    valve = process_model("P1D", K=2.0, tau=20.0, dead_time=6.3)
+    heater = process_model("P2DU", K=-1.0, T=8.0, zeta=0.4, dead_time=2.7)
+    us = [np.column_stack([np.repeat(rng.normal(size=10), 20), np.repeat(rng.normal(size=20), 10)]) for _ in range(2)]
+    ys = [valve.respond(u[:, :1]) + heater.respond(u[:, 1:]) + 3 + 0.05 * rng.normal(size=200) for u in us]
+    data = optid.Data(us, ys, dt=1.0, inputs=["valve", "heater"])
+    found = fit(data, ["P1D", "P2DU"])
+    truth = {"K[valve]": 2, "tau[valve]": 20, "dead_time[valve]": 6.3, "K[heater]": -1, "T[heater]": 8,
+             "zeta[heater]": 0.4, "dead_time[heater]": 2.7, "level": 3}
+    for name, value in truth.items():
+        assert abs(found.params[name].estimate - value) < 4 * found.params[name].error, name
+    held = fit(data, ["P1D", "P2DU"], constraints=["tau:20,channel=valve"])
+    assert estimates(held)["tau[valve]"] == pytest.approx(20.0)
+
+
+def test_a_motion_before_the_record_has_a_state_of_its_own():
+    model = process_model("P1D", K=2.0, tau=30.0, dead_time=12.4, level=5.0)
+    moving = record(model).y[:, 0] + 1.5 * np.exp(-T / 30)
+    data = optid.Data(STEP, moving, dt=1.0)
+    free = fit(data, initial="free")
+    with pytest.warns(optid.errors.DataWarning, match="does not begin at rest"):
+        rest = fit(data)
+    assert rest.figures["start"].startswith("not at rest")
+    assert abs(free.params["tau"].estimate - 30) < 4 * free.params["tau"].error
+    assert free.solution.objective < 0.5 * rest.solution.objective
+
+
+def test_levels_of_experiments():
+    ys = [record(seed=i).y[:, 0] + 10 * i for i in range(2)]
+    data = optid.Data([STEP, STEP], ys, dt=1.0)
+    found = fit(data, offset="each")
+    assert abs(found.params["tau"].estimate - 30) < 4 * found.params["tau"].error
+    np.testing.assert_allclose(found.model.levels[:, 0], [5, 15], atol=0.1)
+    assert found.solution.proof
+
+
+def test_irregular_instants_and_gaps():
+    rng = np.random.default_rng(3)
+    t = T + np.concatenate([[0], rng.uniform(-0.2, 0.2, 199)])
+    u = np.where(t >= 9.7, 1.0, 0.0)
+    y = FIRST.respond(u[:, None], instants=t) + 0.04 * rng.normal(size=200)
+    y[40:55] = y[90:120] = np.nan
+    data = optid.Data(u, y, dt=1.0)
+    found, regular = fit(data, times=t), fit(data)
+    for name, value in {"K": 2, "tau": 30, "dead_time": 12.4}.items():
+        assert abs(found.params[name].estimate - value) < 4 * found.params[name].error, name
+    assert found.solution.proof and estimates(found) != estimates(regular)
+
+
+def test_straight_inputs_are_exact():
+    ramp = np.interp(T, [0, 10, 60, 200], [0, 0, 5, 1])
+    one = FIRST.processes[0]
+    y = 5 + 2 * one.response(T, T, ramp[:, None], straight=True)[:, 0, 0]
+    found = fit(optid.Data(ramp, y + 1e-7 * np.random.default_rng(0).normal(size=200), dt=1.0), hold="first")
+    assert estimates(found)["dead_time"] == pytest.approx(12.4, abs=1e-4)
+    assert found.model.hold == "first"
+    with pytest.raises(StructureError, match="straight static curves"):
+        fit(optid.Data(ramp, y, dt=1.0), hold="first", basis="triangular:4")
+
+
+def staircase(seed: int = 5, hold: int = 25) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).permutation(np.linspace(-1, 1, 16)), hold)
+
+
+def test_static_curve_with_words():
+    u = staircase()
+    f = 2 * np.clip(u, -0.5, 0.5)
+    y = process_model("P1D", K=1.0, tau=8.0, dead_time=3.3, level=5.0).respond(f[:, None])
+    data = optid.Data(u, y + 0.02 * np.random.default_rng(0).normal(size=len(u)), dt=1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optid.errors.DataWarning)
+        free = fit(data, basis="triangular:9")
+        flat = fit(data, basis="triangular:9", constraints=["monotone:increasing"])
+    assert abs(free.params["dead_time"].estimate - 3.3) < 4 * free.params["dead_time"].error
+    curve = flat.model.nonlinearities[0](np.linspace(-1, 1, 50))
+    assert np.all(np.diff(curve) >= -1e-9) and flat.solution.objective >= free.solution.objective
+    assert not free.solution.proof and "one pole" in free.solution.bound.reason
+
+
+def test_a_model_is_saved_loaded_and_simulated(tmp_path):
+    found = fit(record(), "P2D")
+    found.model.save(tmp_path / "model.json")
+    loaded = optid.load(tmp_path / "model.json")
+    assert loaded.coefficients() == found.model.coefficients()
+    np.testing.assert_array_equal(loaded.simulate(record()), found.model.simulate(record()))
+    assert "exp(-" in str(loaded) and loaded.orders == {"process": "P2D"}
+    np.testing.assert_allclose(loaded.simulate(record())[:, 0], loaded.respond(STEP[:, None]))
+
+
+def test_simulation_fits_its_initial_state():
+    moving = FIRST.respond(STEP[:, None]) + 1.5 * np.exp(-T / 30)
+    data = optid.Data(STEP, moving, dt=1.0)
+    state = FIRST.initial_state(data)
+    np.testing.assert_allclose(FIRST.simulate(data, x0=state)[:, 0], moving, atol=1e-10)
+
+
+def test_responses_of_the_model():
+    model = process_model("P1D", K=2.0, tau=30.0, dead_time=12.0, level=5.0, dt=0.5)
+    step = model.step_response(400)[:, 0, 0]
+    t = 0.5 * np.arange(400)
+    np.testing.assert_allclose(step, -np.expm1(-np.maximum(t - 12, 0) / 30), atol=1e-12)
+    s = 0.2j
+    assert model.frequency_response(0.2)[0, 0, 0] == pytest.approx(np.exp(-12 * s) / (30 * s + 1))
+    assert model.static_gain(0.3) == 2.0 and model.is_stable and not model.integrates
+
+
+def test_time_constants_are_sorted():
+    model = process_model("P2", tau1=3.0, tau2=20.0)
+    assert model.processes[0].p.tolist() == [20.0, 3.0]
+
+
+def test_poles_and_zero_may_be_named_instead_of_a_type():
+    one = optid.fit(record(), "process.exact", poles=2, delay=True)
+    assert one.model.orders == {"process": "P2D"}
+    assert estimates(one) == pytest.approx(estimates(fit(record(), "P2D")))
+
+
+# -- constraints ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("word", "name", "value"), [
+    ("tau:high=25", "tau", 25.0), ("dead_time:15.4", "dead_time", 15.4), ("gain:2.2", "K", 2.2),
+    ("K:high=1.9", "K", 1.9)])
+def test_words_hold_and_their_prices_are_those_of_refits(word, name, value):
+    data = record()
+    found = fit(data, constraints=[word])
+    assert estimates(found)[name] == pytest.approx(value, rel=1e-7)
+    step = 1e-4 * value
+    build = {"tau": lambda end: words.tau(high=end), "dead_time": lambda end: words.dead_time(end),
+             "gain": lambda end: words.K(end), "K": lambda end: words.K(high=end)}[word.split(":")[0]]
+    ends = [fit(data, constraints=[build(value + sign * step)]).solution.objective for sign in (1, -1)]
+    assert found.prices[0].multiplier == pytest.approx(abs(ends[0] - ends[1]) / (2 * step), rel=1e-5)
+
+
+def test_several_words_together():
+    found = fit(record(), constraints=["tau:high=25", "gain:low=2.2"])
+    assert found.solution.status in (Status.LOCAL, Status.OPTIMAL)
+    assert estimates(found)["tau"] == pytest.approx(25) and estimates(found)["K"] == pytest.approx(2.2)
+
+
+def test_overdamped_on_an_oscillation():
+    truth = process_model("P2DU", K=2.0, T=8.0, zeta=0.6, dead_time=5.2, level=5.0)
+    found = fit(record(truth), "P2DU", constraints=["overdamped"])
+    assert estimates(found)["zeta"] == pytest.approx(1.0)
+    assert found.prices[0].active and found.prices[0].multiplier > 0
+
+
+def test_a_known_gain_sharpens_the_time_constant():
+    t = np.arange(95.0)
+    data = record(process_model("P1D", K=2.0, tau=80.0, dead_time=5.3, level=5.0), np.where(t >= 10, 1.0, 0.0))
+    assert fit(data, constraints=["gain:2"]).params["tau"].error < 0.3 * fit(data).params["tau"].error
+
+
+def test_bounds_are_part_of_the_proof():
+    found = fit(record(), constraints=["tau:high=25", "dead_time:low=14"])
+    assert found.solution.proof and found.solution.status is Status.OPTIMAL
+
+
+def test_contradictory_words_are_infeasible():
+    with pytest.raises(InfeasibleError, match="tau"):
+        fit(record(), constraints=[words.tau(high=10).named("below"), words.tau(low=20).named("tau above")])
+
+
+@pytest.mark.parametrize("word", ["tau:high=60", "dead_time:12", "overdamped", "zeta:0.5", "K:2"])
+def test_other_formulations_refuse_the_words_by_name(word):
+    with pytest.raises(StructureError, match=rf"'{word.split(':')[0]}'.*process.exact"):
+        optid.fit(record(), "oe.exact", na=1, nb=1, nk=13, constraints=[word])
+
+
+@pytest.mark.parametrize(("process", "word", "message"), [
+    ("P1D", "overdamped", "no zeta"), ("P1", "dead_time:3", "no dead_time"), ("P1D", "tau_zero:3", "no tau_zero"),
+    ("P1D", "tau:high=-2", "positive"), ("P1D", "dead_time:-1", "not negative"), ("P1D", "tau", "needs low")])
+def test_words_that_do_not_apply_are_refused(process, word, message):
+    with pytest.raises(StructureError, match=message):
+        fit(record(), process, constraints=[word])
+
+
+# -- proof ---------------------------------------------------------------------------------------------------------
+
+
+def errors_of(data: optid.Data, process: str = "P1D", **options) -> ProcessErrors:
+    return process_errors(data, process, "linear", Terms(**options))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_bounds_of_boxes_lie_below_every_point(seed):
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.normal(size=8), 10)
+    errors = errors_of(record(process_model("P1D", K=2.0, tau=12.0, dead_time=4.4), u, 0.3, seed), offset=seed % 2 == 0)
+    search = BranchAndBound(errors, usual_box(errors))
+    moves, values, edges, kinks = search.compiled
+    low = np.column_stack([rng.uniform(0, 4, 200), rng.uniform(0, 20, 200)])
+    size = 10 ** rng.uniform(-3, 0.3, (200, 2))
+    boxes = np.column_stack([low[:, 0], low[:, 0] + size[:, 0], low[:, 1], low[:, 1] + size[:, 1]])
+    inside = np.searchsorted(kinks, boxes[:, 3] - 1e-10) - np.searchsorted(kinks, boxes[:, 2] + 1e-10)
+    found = box_bounds(boxes, inside == 0, values, moves, edges)
+    assert np.sum(found[:, 0] > 0.3 * found[:, 1]) > 30  # they say something
+    for (l1, l2, a, b), bound in zip(boxes, found[:, 0]):
+        for share in rng.uniform(0, 1, (6, 2)):
+            x = np.zeros(errors.unknowns.size)
+            x[:2] = l1 + share[0] * (l2 - l1), a + share[1] * (b - a)
+            columns = errors.columns(x)
+            rest = errors.y - columns @ np.linalg.lstsq(columns, errors.y)[0]
+            assert bound <= rest @ rest * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_step_tests_are_proved(seed):
+    rng = np.random.default_rng([seed, 3])
+    count = int(rng.integers(60, 300))
+    t, on = np.arange(float(count)), int(rng.integers(3, count // 4))
+    truth = process_model("P1D", K=2.0, tau=np.exp(rng.uniform(np.log(2), np.log(count / 2))), level=5.0,
+                          dead_time=rng.uniform(0, count / 4))
+    found = fit(record(truth, np.where(t >= on, 1.0, 0.0), 2 * np.exp(rng.uniform(np.log(0.01), np.log(0.2))), seed))
+    assert found.solution.proof and found.solution.gap < 2e-6
+
+
+def test_a_point_that_is_not_best_is_not_proved():
+    errors = errors_of(record())
+    search = BranchAndBound(errors, usual_box(errors))
+    best = search.search(np.inf, 1e-6, 10).best
+    bound = search.certify(1.01 * best)
+    assert not bound.proved and "better point" in bound.reason
+
+
+def test_without_a_bound_the_reason_is_said():
+    found = fit(record(), "P2D")
+    assert not found.solution.proof and "one pole" in found.solution.bound.reason
+    assert fit(record(), prove=False).solution.bound.reason == "no proof was asked for"
+
+
+# -- order ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("process", "values"), [
+    ("P1D", {"tau": 30.0, "dead_time": 12.4}), ("P2DU", {"T": 8.0, "zeta": 0.4, "dead_time": 12.4}),
+    ("P2D", {"tau1": 30.0, "tau2": 8.0, "dead_time": 12.4})])
+def test_order_by_the_information_criterion(process, values):
+    truth = process_model(process, K=2.0, level=5.0, **values)
+    found = optid.fit(record(truth), "process.exact", order="auto")
+    assert found.model.orders == {"process": process}
+    assert re.match(rf"{process} by BIC, (runner-up|not distinguishable from) P", found.figures["process type"])
+
+
+def test_types_that_the_record_does_not_tell_apart():
+    truth = process_model("P3D", K=2.0, level=5.0, tau1=12.0, tau2=9.0, tau3=7.0, dead_time=5.4)
+    words = [choose_type(errors_of(record(truth, seed=seed)))[1]["process type"] for seed in range(6)]
+    assert any("not distinguishable" in word for word in words)
+
+
+def test_a_type_and_its_choice_exclude_each_other():
+    with pytest.raises(StructureError, match="give one of both"):
+        fit(record(), order="auto")
+    with pytest.raises(StructureError, match="order='bic'"):
+        optid.fit(record(), "process.exact", order="bic")
+
+
+# -- bad input -----------------------------------------------------------------------------------------------------
+
+
+def test_an_input_that_never_moves_is_refused_with_what_is_determined():
+    late = FIRST.respond(STEP[:, None])[60:]  # the step lies before the record
+    data = optid.Data(np.ones(140), late, dt=1.0)
+    with pytest.raises(DataError, match="'u'"):
+        fit(data)
+    with pytest.raises(DataError, match=r"'u' never moves.*before the record.*Determined is the course of 'y' alone"):
+        errors_of(data)
+
+
+def test_a_dead_time_beyond_the_record_is_refused():
+    quiet = 5 + 0.04 * np.random.default_rng(0).normal(size=200)
+    with pytest.raises(RankError, match=r"no response to u.*dead time may be longer.*Determined is its level alone, 5"):
+        fit(optid.Data(STEP, quiet, dt=1.0))
+
+
+def test_stamps_that_run_backwards_are_refused_by_sample():
+    t = T.copy()
+    t[50] = t[48]
+    with pytest.raises(DataError, match="runs backwards at sample 50"):
+        fit(record(), times=t)
+    t[50] = t[49]
+    with pytest.raises(DataError, match="stands still at sample 50"):
+        fit(record(), times=t)
+    with pytest.raises(DataError, match="one for each sample"):
+        fit(record(), times=t[:-1])
+
+
+def test_time_constant_and_dead_time_that_cannot_be_separated():
+    """A response that is over between two samples shows one number of the two."""
+    u = np.where(T >= 10, 1.0, 0.0)
+    y = 5 + 2.0 * (T >= 13) - 0.6 * (T == 13)
+    with pytest.raises(RankError, match=r"tau lies below a sampling time.*dead_time. Determined is their sum"):
+        fit(optid.Data(u, y + 1e-3 * np.random.default_rng(0).normal(size=200), dt=1.0))
+
+
+def test_other_impossible_requests():
+    with pytest.raises(StructureError, match="one output"):
+        fit(optid.Data(STEP, np.column_stack([STEP, STEP]), dt=1.0))
+    with pytest.raises(StructureError, match="initial"):
+        fit(record(), initial="fit")
+    with pytest.raises(StructureError, match="2 entries for 1 inputs"):
+        fit(record(), ["P1D", "P1"])
+    with pytest.raises(RankError, match="output samples for"):
+        fit(optid.Data(STEP[8:12], T[8:12], dt=1.0))
+
+
+def test_missing_inputs_cut_the_record():
+    u = STEP.copy()
+    u[100:103] = np.nan
+    with pytest.warns(optid.errors.DataWarning, match="missing inputs"):
+        found = fit(optid.Data(u, record().y, dt=1.0))
+    assert abs(found.params["tau"].estimate - 30) < 5 * found.params["tau"].error
+
+
+def test_the_record_is_not_modified():
+    data = record()
+    u, y = data.u.copy(), data.y.copy()
+    fit(data, "P2DZ")
+    np.testing.assert_array_equal(data.u, u)
+    np.testing.assert_array_equal(data.y, y)
+
+
+def test_kinks_between_samples_and_changes():
+    errors = errors_of(record())
+    assert errors.kinks(0, 12.4) == (12.0, 13.0)
+    assert errors.kinks(0, 12.0) == (11.0, 12.0)
+    assert ProcessStructure().names == ("tau", "dead_time")
+    assert ProcessDynamics(ProcessStructure(), np.array([3.0, 1.0])).in_unit(0.5).p.tolist() == [6.0, 2.0]
+
+
+# -- where else they are used --------------------------------------------------------------------------------------
+
+
+def test_a_search_finds_the_process_behind_a_step_test():
+    found = optid.identify(record(), workers=1)
+    assert found.fit.formulation == "process.exact" and found.model.orders == {"process": "P1D"}
+    for name, value in {"K": 2, "tau": 30, "dead_time": 12.4}.items():
+        assert abs(found.fit.params[name].estimate - value) < 4 * found.fit.params[name].error
+
+
+def test_other_fits_of_a_step_test_point_to_processes():
+    sampled = optid.fit(record(), "oe.exact", na=1, nb=1, nk=13)
+    assert any("--formulation process.exact --process P1D" in one.step for one in sampled.advice)
+    assert not any("process.exact" in one.step for one in fit(record()).advice)
+
+
+def test_criteria_count_the_dead_time():
+    found = fit(record())
+    errors = found.residuals[:, 0]
+    likelihood = 200 * (np.log(np.mean(errors**2)) + 1 + np.log(2 * np.pi))
+    assert found.bic == pytest.approx(likelihood + 4 * np.log(200))
+
+
+def test_the_summary_says_seconds():
+    text = fit(record(dt=2.0)).summary()
+    assert "proved" in text and "profile likelihood" in text
+    assert re.search(r"dead time +24\.\d+ .* s\n", text) and re.search(r"time constant +5\d\.\d+ .* s\n", text)
+
+
+def test_parameters_at_their_bounds_are_named():
+    ramp = process_model("P0DI", K=0.05, dead_time=3.0, level=5.0)
+    found = fit(record(ramp, np.where(T >= 10, 1.0, 0.0), 0.01))
+    largest = "tau at the largest value that is tried, 1990 s: the process may integrate (I in its type)"
+    assert found.figures["bounds"] == largest
+    two, one = (fit(record(noise=0.1, seed=seed), "P2D").figures.get("bounds", "") for seed in (0, 1))
+    assert two == "" and one == "tau2 at the smallest value that is tried, 0.05 s: fewer poles may do"
+
+
+
+def test_given_instants_are_said():
+    assert fit(record(), times=T).figures["instants"].startswith("as given")
+
+
+def test_the_command_prints_gain_time_constant_dead_time_and_proof(tmp_path):
+    from typer.testing import CliRunner
+
+    from optid.cli.app import app
+
+    data = record(dt=5.0, inputs="valve", outputs="temperature", input_units="%", output_units="K",
+                  start="2024-05-01T08:00")
+    data.to_csv(tmp_path / "step.csv")
+    done = CliRunner().invoke(app, ["fit", str(tmp_path / "step.csv"), "--inputs", "valve", "--outputs", "temperature",
+                                    "-f", "process.exact", "--process", "P1D", "--constraint", "tau:high=140",
+                                    "--report", str(tmp_path / "step.html"), "--model", str(tmp_path / "step.json")])
+    assert done.exit_code == 0, done.output
+    assert re.search(r"time constant +140\.0 .* s\n", done.output) and "optimality is proved" in done.output
+    assert re.search(r"static gain .* K/%\n", done.output) and re.search(r"tau +active \(1 of 1\)", done.output)
+    assert optid.load(tmp_path / "step.json").orders == {"process": "P1D"}
+    assert "dead time" in (tmp_path / "step.html").read_text(encoding="utf-8")
+
+
+def test_real_poles_of_an_oscillation_are_equal_and_said_to_be():
+    truth = process_model("P2DU", K=2.0, T=8.0, zeta=0.6, dead_time=5.2, level=5.0)
+    with pytest.warns(optid.errors.DataWarning, match="condition number"):
+        found = fit(record(truth), "P2D")
+    assert estimates(found)["tau1"] == pytest.approx(estimates(found)["tau2"]) and found.solution.status is Status.LOCAL
+    assert "complex pair" in found.figures["time constants"]
