@@ -121,8 +121,8 @@ class ProcessModel(Model):
         for one, f, name in zip(self.processes, self.nonlinearities, self.inputs):
             gain = f"{f.mu[0]:.4g} {name}" if f.is_linear else f"f{'' if self.m == 1 else f'_{name}'}({name})"
             terms.append(f"{one.equation()} {gain}")
-        drift = f" + {self.drift:.4g} t" if self.drift else ""
-        return f"{self.outputs[0]} = {' + '.join(terms)} + {self.level[0]:.4g}{drift}"
+        drift = f" {self.drift:+.4g} t" if self.drift else ""
+        return f"{self.outputs[0]} = {' + '.join(terms)} {self.level[0]:+.4g}{drift}"
 
     # -- responses -----------------------------------------------------------------------------------------------------
 
