@@ -127,8 +127,6 @@ def uses(fit: Any, folder: Path, seed: int) -> dict[str, Any]:
         return ""  # of a model that predicts nothing `validate` says so
 
     def exported() -> None:
-        if fit.formulation == "process.exact":  # in continuous time, with a dead time that no sampled model has
-            return
         model.to_c(folder / "model.c"), model.to_st(folder / "model.st"), model.to_casadi()
         model.to_dlti(), model.to_control() if find_spec("control") else None
         str(model.pole_table), model.zeros

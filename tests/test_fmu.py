@@ -16,6 +16,7 @@ from test_physical import CUBIC, bent, quiet
 
 from optid.errors import OptidError, StructureError
 from optid.models import fmu
+from optid.models.process import process_model
 
 fmpy = pytest.importorskip("fmpy", reason="needs FMPy: pip install fmpy")
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on PATH")
@@ -23,7 +24,9 @@ needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc on PA
 MODELS = {"direct": lambda: siso(nk=0), "delayed": lambda: siso(nk=3), "spline": lambda: siso(BASES[3], nk=1),
           "extrapolated": lambda: siso(BASES[8], nk=1), "trigonometric": lambda: siso(BASES[1]), "mimo": mimo,
           "feedback": lambda: feedback_fit().model, "static": lambda: siso(a=[], b=([2.0],)),
-          "state space": lambda: mimo_states(), "process": lambda: process(delay=12.4, time_unit="s").to_discrete(1.0)}
+          "state space": lambda: mimo_states(), "process": lambda: process(delay=12.4, time_unit="s").to_discrete(1.0),
+          "P2DU": lambda: process_model("P2DU", K=2.5, level=1.5, dt=0.5, T=3.0, zeta=0.3, dead_time=1.7, time_unit="s",
+                                        ).to_continuous().to_discrete(0.5)}
 
 
 def mimo_states():

@@ -5,6 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
+from refusals import refuses
 from scipy.optimize import minimize
 
 import optid
@@ -499,3 +500,27 @@ def test_real_poles_of_an_oscillation_are_equal_and_said_to_be():
         found = fit(record(truth), "P2D")
     assert estimates(found)["tau1"] == pytest.approx(estimates(found)["tau2"]) and found.solution.status is Status.LOCAL
     assert "complex pair" in found.figures["time constants"]
+
+
+@pytest.mark.parametrize(("word", "values"), [
+    ("P1D", {"tau": 7.0, "dead_time": 3.3}), ("P2DU", {"T": 3.0, "zeta": 0.3, "dead_time": 0.4}),
+    ("P2DZ", {"tau1": 5.0, "tau2": 5.0, "tau_zero": -2.0, "dead_time": 2.0}), ("P1Z", {"tau": 4.0, "tau_zero": 2.0}),
+    ("P3D", {"tau1": 5.0, "tau2": 5.0, "tau3": 1.0, "dead_time": 0.0})])
+def test_state_equations_and_samples_are_those_of_the_process(word, values, tmp_path):
+    model = process_model(word, K=2.5, level=1.5, dt=0.5, time_unit="s", **values)
+    u = np.repeat(np.random.default_rng(0).normal(size=40), 5)
+    y, continuous = model.respond(u[:, None]), model.to_continuous()
+    assert np.allclose(continuous.simulate(u, dt=0.5, x0="rest"), y, atol=1e-12)
+    sampled = continuous.to_discrete(0.5)
+    rest = np.linalg.solve(np.eye(sampled.nx) - sampled.A, sampled.B @ [2.5 * u[0]] + sampled.offset_x)
+    assert np.allclose(np.ravel(sampled.simulate(u, x0=rest)), y, atol=1e-12)
+    assert np.allclose(continuous.frequency_response([0.1, 1.0]), model.frequency_response([0.1, 1.0]))
+    assert model.zeros.size and model.to_c(tmp_path / "plant.c").stat().st_size > 0
+
+
+@pytest.mark.parametrize(("word", "more", "message"), [
+    ("P1D", {"hold": "first"}, "straight between samples"), ("P1D", {"drift": 0.1}, "A drift"),
+    ("P1DI", {}, "An integrator that stands still")])
+def test_what_has_no_state_equations_is_refused_by_name(word, more, message, tmp_path):
+    model = process_model(word, tau=3.0, dead_time=1.0, **more)
+    refuses(StructureError, message, model.to_c, tmp_path / "plant.c")

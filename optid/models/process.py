@@ -7,16 +7,27 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
 
 from optid.arrays import Array, finite
 from optid.data.channels import Transform
 from optid.errors import DataError, StructureError
+from optid.models.continuous import ContinuousModel
 from optid.models.experiments import Record, check_inputs, scaled_least_squares
 from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
 
 HOLDS = ("zero", "first")
+
+
+def _of_samples(name: str) -> Any:
+    """Return a method that exports the model in state equations of the same samples."""
+    def export(self: "ProcessModel", *arguments: Any, **options: Any) -> Any:
+        return getattr(self.to_continuous().to_discrete(self.dt), name)(*arguments, **options)
+
+    export.__doc__ = f"Export as `Model.{name}` does the model with the same samples; errors as of `to_continuous`."
+    return export
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -207,13 +218,38 @@ class ProcessModel(Model):
 
     # -- other tools ---------------------------------------------------------------------------------------------------
 
-    def _export(self, *_: Any, **__: Any) -> Any:
-        """Refuse: a dead time is no finite state in continuous time (`StructureError`)."""
-        raise StructureError("a process model in continuous time is not exported as a sampled one: its dead time need "
-                             "not be a multiple of the sampling time. Use model.simulate, its parameters "
-                             "(model.coefficients()) and its transfer function (model.equation())")
+    def to_continuous(self) -> ContinuousModel:
+        """Return the same as state equations in continuous time with dead times; of several levels the mean.
 
-    to_dlti = to_control = to_casadi = to_c = _export  # pyright: ignore[reportAssignmentType]
+        Raises:
+            StructureError: inputs that go straight between samples, a drift, an integrator.
+        """
+        for there, what in (
+                (self.hold == "first", "Inputs that go straight between samples (hold='first')"),
+                (self.drift != 0, "A drift, which is no answer to the inputs,"),
+                (any(one.structure.integrator for one in self.processes),
+                 "An integrator that stands still under the first inputs of every run, whichever they are,")):
+            if there:
+                raise StructureError(f"{what} cannot be stated in equations of a state and held inputs. Use "
+                                     "model.simulate, or the parameters (model.coefficients())")
+        A, b, c, d = zip(*(one.equations for one in self.processes))
+        names = {name: getattr(self, name) for name in ("inputs", "outputs", "input_units", "output_units")}
+        inner: Any = block_diag(*A)
+        driven: Any = block_diag(*b)
+        return ContinuousModel(inner, driven.T, np.concatenate(c)[None], np.array([d]), self.nonlinearities,
+                               tuple(range(self.m)), self.dead_times, np.zeros(self.n_sections), self.level,
+                               self.time_unit, **names)
+
+    @property
+    def zeros(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Zeros of the model with the same samples, as of `Model.zeros`; errors as of `to_continuous`."""
+        return self.to_continuous().to_discrete(self.dt).zeros
+
+    to_dlti, to_casadi, to_c, to_st, to_fmu = map(_of_samples, ("to_dlti", "to_casadi", "to_c", "to_st", "to_fmu"))
+
+    def to_control(self, pade: int | None = None) -> Any:
+        """Return the continuous transfer as a python-control system; with a dead time `pade` is needed."""
+        return self.to_continuous().to_control(pade)
 
     # -- gauge, units, files -------------------------------------------------------------------------------------------
 

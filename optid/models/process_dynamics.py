@@ -169,6 +169,12 @@ class ProcessDynamics:
         return f, row + self.value("tau_zero") * row @ f if s.zero else row
 
     @property
+    def equations(self) -> tuple[Array, Array, Array, float]:
+        """A (n, n), b (n,), c (n,) and d of x' = A x + b w, y = c x + d w, without the dead time."""
+        f, row = self._chain
+        return f[2:, 2:], f[2:, 0], row[2:], float(row[0])
+
+    @property
     def plain(self) -> tuple[Array, Array]:
         """System (F, C) that reads the output alone; see `process_kernel.run`."""
         f, row = self._chain
