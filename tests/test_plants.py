@@ -181,6 +181,7 @@ def test_records_that_cannot_be_simulated(call, words):
 
 @pytest.mark.parametrize("call, words", [
     (lambda: plants.pendulum(np.zeros(3), dt=0), "dt = 0"),
+    (lambda: plants.pendulum(np.zeros(3), substeps=0.5), "substeps must be a positive integer; got 0.5"),
     (lambda: plants.pendulum(np.zeros(3), quantum=-1), "quantum = -1"),
     (lambda: plants.pendulum(np.zeros(3), measurement=-1), "measurement = -1"),
     (lambda: plants.ReactionWheelPendulum(threshold=0), "threshold = 0"),

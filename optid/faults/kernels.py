@@ -116,7 +116,8 @@ def predict(A, C, K, root, drive, y, start):
     """
     n, l = A.shape[0], C.shape[0]  # noqa: E741
     x, r, e = np.empty((y.shape[0] + 1, n)), np.empty(y.shape), np.empty(l)
-    x[0] = start
+    for i in range(n):
+        x[0, i] = start[i]
     for k in range(y.shape[0]):
         for o in range(l):
             e[o] = y[k, o]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid import signals
-from optid.arrays import Array, one_of
+from optid.arrays import Array, check_integer, one_of
 from optid.data.record import Data
 from optid.errors import StructureError, nearest
 from optid.models.equations import Equations
@@ -213,7 +213,7 @@ def _scheme(dt: float, substeps: int, method: str = "rk4") -> "IntegrationScheme
 
     check_parameters(dt=dt, substeps=substeps)
     one_of("method", method, tuple(STAGES))
-    count = int(substeps) if method == "rk4" else 1
+    count = check_integer(substeps, "substeps") if method == "rk4" else 1
     return IntegrationScheme(STAGES[method], count, float(dt) / count)
 
 

@@ -100,8 +100,11 @@ def search(tables, grams, tested, z, q, same, floor):
     x, later = np.zeros((n, columns)), np.zeros((n, columns))
     cross, cosines = np.zeros((columns, columns)), np.zeros((most, most))
     work = np.zeros((most, most + 1))
-    best, onsets = np.full((candidates, candidates), -np.inf), np.full((candidates, candidates, 2), -1)
-    alike, found = np.zeros((LISTED, 4), dtype=np.int64), 0
+    best, onsets = np.empty((candidates, candidates)), np.empty((candidates, candidates, 2), dtype=np.int64)
+    for c in range(candidates):
+        for other in range(candidates):
+            best[c, other], onsets[c, other, 0], onsets[c, other, 1] = -np.inf, -1, -1
+    alike, found = np.empty((LISTED, 4), dtype=np.int64), 0
     for theta in range(count):
         any_here = False
         for c in range(candidates):

@@ -76,7 +76,10 @@ def absorb(
     n, size = source.size + 1, len(root)
     l, reach = size - n, len(signals) - len(weights)  # noqa: E741 - the field's letter
     fade = np.sqrt(forgetting)
-    innovations, traced = np.full((weights.size, l), np.nan), np.empty((np.count_nonzero(marks), n, l))
+    recorded = 0
+    for t in range(marks.size):
+        recorded += marks[t]
+    innovations, traced = np.empty((weights.size, l)), np.empty((recorded, n, l))
     row, recorded = np.empty(size), 0
     for t in range(weights.size):
         if weights[t] > 0.0:
@@ -96,6 +99,9 @@ def absorb(
                     for j in range(i, size):
                         if abs(root[i, j]) < NOTHING:
                             root[i, j] = 0.0
+        else:
+            for o in range(l):
+                innovations[t, o] = np.nan
         if marks[t]:
             solve(root, n, traced[recorded])
             recorded += 1
