@@ -234,6 +234,27 @@ def test_reading_goes_on_where_it_stopped():
     assert found.error == "" and found.lines.tolist() == [4]
 
 
+@pytest.mark.parametrize("text", [
+    "t;u;y\ns;V;mV\n10,0;1;2\n10,5;1,5;2\n11,0;1;2,5\n\n12,0;1;2\n",
+    "date\tu\ty\n03.04.2024 12:00:00.0\t1\t2\n03.04.2024 12:00:00.5\t1\t2\n03.04.2024 12:00:01.0\t1\t2\n",
+    "time,u,y\n23:59:59.0,1,2\n23:59:59.5,1,2\n00:00:00.0,1,2\n00:00:00.5,3,4\n"])
+def test_reading_goes_on_in_the_format_that_was_found(text):
+    how = {"how": Format(decimal="," if ";" in text else ".", date_format="%d.%m.%Y %H:%M:%S.%f" if "date" in text
+                         else None)}
+    lines = text.splitlines()
+    whole = reader(**how).read(lines)
+    assert whole.error == "" and len(whole.y) >= 3 and not np.isnan(whole.y[:3]).any()
+    for cut in range(1, len(lines)):
+        first, again = reader(**how), reader(**how)
+        before = first.read(lines[:cut])
+        again.resume(json.loads(json.dumps(first.memory)))
+        after = again.read(lines[cut:])
+        for word in ("values", "lines"):
+            both = np.concatenate([getattr(before, word), getattr(after, word)])
+            assert np.array_equal(both, getattr(whole, word), equal_nan=True), (cut, word)
+        assert after.error == "" and before.bad + after.bad == whole.bad
+
+
 def test_a_decimal_mark_that_is_the_delimiter_needs_quotes():
     comma = reader(how=Format(delimiter=",", decimal=","))
     found = comma.read(["t,u,y", '0,"0,5",2', "1,0,5,2"])

@@ -1,0 +1,191 @@
+"""A monitor that is stopped at any moment goes on as if it had never been stopped."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from test_monitor import everything, plant, stream, watch
+
+from optid.cli import following, monitoring
+from optid.cli.state_file import StateFile
+from optid.data.reading.rows import RowReader
+from optid.errors import DataError
+from optid.faults import Monitor
+
+QUICK = ["--arl0", "300", "--window", "30", "--kinds", "bias", "loss", "--thresholds", "thresholds.json", "--json"]
+
+
+def write_stream(folder, repeats):
+    """Write a model and its thresholds; return header and rows of a stream with faults, bad cells and blank lines."""
+    plant().save(folder / "model.json")
+    rows = []
+    for k in range(repeats):
+        u, y = stream(plant(), 500, 1 + k % 7)
+        for row in np.hstack([u, y]):
+            rows.append(f"{len(rows)};" + ";".join("" if np.isnan(v) else repr(float(v)) for v in row) + "\n")
+    for at in range(60, len(rows), 977):
+        rows[at] = f"{at};0.5;0.5;oops;1.0\n"
+    for at in range(70, len(rows), 991):
+        rows[at] = "\n"
+    return "t;u1;u2;y1;y2\n", rows
+
+
+def start(folder, state, *words, out):
+    return subprocess.Popen(
+        [sys.executable, "-m", "optid", "monitor", "model.json", *QUICK, "--follow", "grown.csv", "--state", state,
+         *words], cwd=folder, stdout=out, stderr=subprocess.PIPE, text=True)
+
+
+def finish(folder, state):
+    """Read the stream to its end; return the counts that are kept and those that are reported."""
+    with (folder / f"{state}.jsonl").open("a") as out:
+        process = start(folder, state, "--until-end", out=out)
+        errors = process.communicate(timeout=600)[1]
+    assert process.returncode == 0, errors
+    with np.load(folder / state) as kept:
+        head = json.loads(str(kept["head"]))
+    counts = [line for line in " ".join(errors.split()).split("note: ") if "rows were unreadable" in line]
+    return head["samples"], head["source"]["line"], head["source"]["place"]["offset"], counts
+
+
+def stop_often(folder, stops, seed=0, repeats=40):
+    """Stop a monitor of a growing file at random moments; return results without and with stops, and the signals."""
+    rng = np.random.default_rng(seed)
+    head, rows = write_stream(folder, repeats)
+    grown = folder / "grown.csv"
+    grown.write_text(head + "".join(rows))
+    begun = time.monotonic()
+    whole = finish(folder, "whole.npz")
+    usual = time.monotonic() - begun
+    grown.write_text(head)
+    signals, written = [], 0
+    for number in range(stops):
+        upto = len(rows) * (number + 1) // stops  # a part of the stream is there already, the rest follows
+        early = written + int(rng.integers(upto - written + 1))
+        with grown.open("a") as file:
+            file.write("".join(rows[written:early]))
+        with (folder / "stopped.npz.jsonl").open("a") as out:
+            process = start(folder, "stopped.npz", out=out)
+            time.sleep(rng.uniform(0, usual))
+            with grown.open("a") as file:
+                text = "".join(rows[early:upto])
+                cut = int(rng.integers(len(text) + 1))  # not always at the end of a line
+                file.write(text[:cut])
+                file.flush()
+                time.sleep(rng.uniform(0, 0.3))
+                signals.append((signal.SIGTERM, signal.SIGINT, signal.SIGKILL)[int(rng.integers(3))])
+                process.send_signal(signals[-1])
+                file.write(text[cut:])
+            errors = process.communicate(timeout=600)[1]
+        assert process.returncode in (0, -signals[-1], 130), errors
+        written = upto
+    stopped = finish(folder, "stopped.npz")
+    return whole, stopped, signals
+
+
+def events(folder, state):
+    return (folder / f"{state}.jsonl").read_text().splitlines()
+
+
+def follow(folder, name, capsys):
+    """Follow the stream from the state of this name; return the printed lines and the monitor."""
+    with StateFile(folder / name) as kept:
+        if kept.is_empty:
+            found = everything(plant())
+            monitor = watch(found.model, found, 40, 35.0)
+        else:
+            monitor = Monitor.load(kept.path)
+        reader = RowReader(["u1", "u2"], ["y1", "y2"], dt=1.0)
+        monitoring._Watch(monitor, reader, folder / "grown.csv", kept, strict=False, as_json=True).run(True)
+    return capsys.readouterr().out.splitlines(), monitor
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("owner, name", [
+    (RowReader, "read"), (Monitor, "run"), (Monitor, "save"), (following.Followed, "advance"),
+    (monitoring._Watch, "_tell"), (os, "replace")])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_at_any_step_waits_until_the_block_is_processed(tmp_path, monkeypatch, capsys, owner, name, number):
+    head, rows = write_stream(tmp_path, 2)
+    (tmp_path / "grown.csv").write_text(head + "".join(rows))
+    monkeypatch.setattr(following, "BLOCK", 8000)  # about 100 rows
+    whole, undisturbed = follow(tmp_path, "whole.npz", capsys)
+    told, original, calls, former, runs = [], getattr(owner, name), [], signal.getsignal(number), 0
+
+    def stopped(*arguments):
+        if signal.getsignal(number) is former:  # before the stream is read
+            return original(*arguments)
+        calls.append(runs)
+        first = calls.count(runs) == 1
+        if first and runs % 2:
+            signal.raise_signal(number)
+        result = original(*arguments)
+        if first and not runs % 2:
+            signal.raise_signal(number)
+        return result
+
+    monkeypatch.setattr(owner, name, stopped)
+    for runs in range(40):  # noqa: B007
+        lines, monitor = follow(tmp_path, "stopped.npz", capsys)
+        told += lines
+        if monitor.samples == undisturbed.samples:
+            break
+    assert len(calls) > 3 and told == whole and len(whole) > 6
+    assert monitor.samples == undisturbed.samples and monitor.source["bad"] == undisturbed.source["bad"] > 0
+    assert np.array_equal(monitor.state, undisturbed.state) and monitor.statistics == undisturbed.statistics
+
+
+def test_a_block_that_was_not_finished_is_processed_again(tmp_path, monkeypatch, capsys):
+    """As after a second signal, or an error in the middle of a block."""
+    head, rows = write_stream(tmp_path, 2)
+    (tmp_path / "grown.csv").write_text(head + "".join(rows))
+    monkeypatch.setattr(following, "BLOCK", 4000)
+    whole, _ = follow(tmp_path, "whole.npz", capsys)
+    original, told, calls = Monitor.run, [], []
+
+    def broken(self, u, y):
+        calls.append(len(u))
+        events = original(self, u, y)
+        if len(calls) % 9 == 0:
+            raise KeyboardInterrupt
+        return events
+
+    monkeypatch.setattr(Monitor, "run", broken)
+    for _ in range(30):
+        told += follow(tmp_path, "stopped.npz", capsys)[0]
+    assert told == whole and sum(calls) > 1000
+
+
+def test_a_state_is_held_by_one_monitor(tmp_path):
+    path = tmp_path / "state.npz"
+    with StateFile(path) as first:
+        for _ in range(2):
+            with pytest.raises(DataError, match=r"state.npz is the state of another monitor, which is running"):
+                StateFile(path)
+            first.replace(lambda part: part.write_text("state"), lambda: None)
+    assert path.read_text() == "state"
+    with StateFile(tmp_path / "new.npz"):
+        pass
+    with StateFile(path) as again:
+        with pytest.raises(OSError, match="full"):
+            again.replace(lambda part: part.write_text("half"), _full)
+        assert path.read_text() == "state"
+    assert [one.name for one in tmp_path.iterdir()] == ["state.npz"]
+
+
+def _full():
+    raise OSError("the disk is full")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_stops_at_random_moments_change_neither_events_nor_counts(tmp_path):
+    whole, stopped, _ = stop_often(tmp_path, 15)
+    assert stopped == whole
+    assert events(tmp_path, "stopped.npz") == events(tmp_path, "whole.npz")
+    assert not list(tmp_path.glob("*.part"))
