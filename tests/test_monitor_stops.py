@@ -1,11 +1,13 @@
 """A monitor that is stopped at any moment goes on as if it had never been stopped."""
 
+import errno
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,8 +94,8 @@ def events(folder, state):
     return (folder / f"{state}.jsonl").read_text().splitlines()
 
 
-def follow(folder, name, capsys):
-    """Follow the stream from the state of this name; return the printed lines and the monitor."""
+def follow(folder, name, capsys, errors=False):
+    """Follow the stream from the state of this name; return the printed lines, or the warnings, and the monitor."""
     with StateFile(folder / name) as kept:
         if kept.is_empty:
             found = everything(plant())
@@ -102,7 +104,8 @@ def follow(folder, name, capsys):
             monitor = Monitor.load(kept.path)
         reader = RowReader(["u1", "u2"], ["y1", "y2"], dt=1.0)
         monitoring._Watch(monitor, reader, folder / "grown.csv", kept, strict=False, as_json=True).run(True)
-    return capsys.readouterr().out.splitlines(), monitor
+    told = capsys.readouterr()
+    return " ".join(told.err.split()) if errors else told.out.splitlines(), monitor
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -121,11 +124,11 @@ def test_a_signal_at_any_step_waits_until_the_block_is_processed(tmp_path, monke
         if signal.getsignal(number) is former:  # before the stream is read
             return original(*arguments)
         calls.append(runs)
-        first = calls.count(runs) == 1
-        if first and runs % 2:
+        due = calls.count(runs) == 1 + runs % 4
+        if due and runs % 2:
             signal.raise_signal(number)
         result = original(*arguments)
-        if first and not runs % 2:
+        if due and not runs % 2:
             signal.raise_signal(number)
         return result
 
@@ -189,3 +192,59 @@ def test_stops_at_random_moments_change_neither_events_nor_counts(tmp_path):
     assert stopped == whole
     assert events(tmp_path, "stopped.npz") == events(tmp_path, "whole.npz")
     assert not list(tmp_path.glob("*.part"))
+
+
+class Disk:
+    """Fails while it is full."""
+
+    def __init__(self, original):
+        self.original, self.full = original, False
+
+    def __call__(self, *arguments):
+        if self.full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return self.original(*arguments)
+
+
+@pytest.mark.parametrize("what", ["state", "output", "both"])
+def test_a_full_disk_ends_no_monitor(tmp_path, monkeypatch, capsys, what):
+    head, rows = write_stream(tmp_path, 2)
+    (tmp_path / "grown.csv").write_text(head + "".join(rows))
+    monkeypatch.setattr(following, "BLOCK", 4000)
+    whole, undisturbed = follow(tmp_path, "whole.npz", capsys)
+    files, output, blocks = Disk(Path.write_bytes), Disk(sys.stdout.flush), []
+    monkeypatch.setattr(Path, "write_bytes", lambda *a: files(*a))
+    monkeypatch.setattr(sys.stdout, "flush", output)
+    monkeypatch.setattr(monitoring, "RETRY", 0.0)
+    original = Monitor.run
+
+    def run(*arguments):
+        blocks.append(0)
+        files.full = what != "output" and 2 <= len(blocks) <= 8
+        output.full = what != "state" and 2 <= len(blocks) <= 8
+        return original(*arguments)
+
+    monkeypatch.setattr(Monitor, "run", run)
+    with StateFile(tmp_path / "full.npz") as kept:
+        monitor = watch(undisturbed.dictionary.model, undisturbed.dictionary, 40, 35.0)
+        reader = RowReader(["u1", "u2"], ["y1", "y2"], dt=1.0)
+        monitoring._Watch(monitor, reader, tmp_path / "grown.csv", kept, strict=False, as_json=True).run(True)
+    told = capsys.readouterr()
+    assert told.out.splitlines() == whole and Monitor.load(kept.path).samples == undisturbed.samples
+    errors = " ".join(told.err.split())
+    assert errors.count("cannot be written (No space left on device): monitoring goes on") == 1
+    assert errors.count("writing works again") == 1
+    assert ("the events cannot" if what == "output" else "full.npz cannot") in errors
+    assert not list(tmp_path.glob("*.part*"))
+
+
+def test_a_state_that_is_never_written_is_reported_at_the_beginning_and_at_the_end(tmp_path, monkeypatch, capsys):
+    head, rows = write_stream(tmp_path, 1)
+    (tmp_path / "grown.csv").write_text(head + "".join(rows))
+    files = Disk(None)
+    files.full = True
+    monkeypatch.setattr(Path, "write_bytes", lambda *a: files(*a))
+    lines, monitor = follow(tmp_path, "never.npz", capsys, errors=True)
+    assert lines.index("No space left") < lines.index("is blank")
+    assert "the last state that could be saved is that of sample 0" in lines and monitor.samples == 500
+    assert not (tmp_path / "never.npz").exists() and not list(tmp_path.glob("*.part*"))

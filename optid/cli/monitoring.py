@@ -4,8 +4,9 @@ import json
 import os
 import signal
 import sys
+import time as clock
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -24,6 +25,8 @@ ARL0 = 10_000
 REMEMBERED = 1000  # samples whose time stamps are kept, for the time of an onset
 
 Part = tuple[list[bytes], str]  # lines, and a remark where another file begins
+
+RETRY = 10.0  # seconds until a failed write is tried again, events or not
 
 KEPT = 10_000  # samples after which the state is saved, events or not
 
@@ -65,7 +68,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     from optid.data.reading.rows import RowReader
     from optid.errors import DataError
 
-    check_folders(state, thresholds)
+    check_folders(thresholds)
+    check_folders(state, writable=False)
     with nullcontext() if state is None else StateFile(state) as kept:
         with hearing() as heard, Waiting() as waiting:
             waiting.step("reading")
@@ -222,7 +226,7 @@ class _Watch:
         self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
         self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
         self.lines: list[str] = []  # of events that are not printed yet
-        self._is_whole = True
+        self._is_whole, self._is_printing, self.failed = True, False, 0.0
         if self.place is not None and follow is not None:
             if self.place["path"] != str(follow.resolve()):
                 raise DataError(f"{state and state.path} is the state of {self.place['path']}, not of {follow}: name "
@@ -237,6 +241,8 @@ class _Watch:
         parts = standard_input() if self.file is None else self.file.lines(until_end, partial=self.state is None)
         with _Signals() as signals:
             try:
+                if self.state is not None:  # a state that cannot be written is noticed at once
+                    self._keep()
                 for raw, fresh in signals.until_stopped(parts):
                     self._take_in(raw, fresh)
             except KeyboardInterrupt:
@@ -248,24 +254,26 @@ class _Watch:
                 signals.ignore()
                 if self._is_whole:
                     self._keep()
+                if self.failed and self.state is not None:
+                    _note(f"the last state that could be saved is that of sample {self.saved}")
         if not self.watcher.samples:
-            note("no sample was read: no rows follow the header")
+            _note("no sample was read: no rows follow the header")
         if self.bad:
-            note(f"{self.bad} of {self.watcher.samples} rows were unreadable in part or in full")
+            _note(f"{self.bad} of {self.watcher.samples} rows were unreadable in part or in full")
 
     def _take_in(self, raw: list[bytes], fresh: str) -> None:
         from optid.errors import DataError
 
         self._is_whole = False
         if fresh:
-            note(fresh)
+            _note(fresh)
             self.reader.begin_file()
         first, line = self.watcher.samples, self.reader.line
         rows = self.reader.read([part.removesuffix(b"\r").decode("utf-8", "replace") for part in raw])
         if self.strict and rows.bad:
             raise DataError(rows.bad[0][1])
         for text in [text for _, text in rows.bad[:LOUD]] + list(rows.remarks[:LOUD]):
-            note(text)
+            _note(text)
         self.bad += len({number for number, _ in rows.bad})
         self._remember(first, rows.stamps)
         events = self.watcher.run(rows.u, rows.y)
@@ -276,7 +284,8 @@ class _Watch:
             self.file.advance(sum(map(len, done)) + len(done), done)
             self.place = dict(self.file.place)
         self._is_whole = True
-        if events or self.watcher.samples - self.saved >= KEPT:
+        due = bool(self.failed) or self.watcher.samples - self.saved >= KEPT
+        if events or (due and clock.monotonic() - self.failed >= RETRY):
             self._keep()
         if rows.error:
             raise DataError(rows.error)
@@ -288,19 +297,34 @@ class _Watch:
             self.stamps = dict([*self.stamps.items()][-REMEMBERED - len(stamps):])
 
     def _keep(self) -> None:
-        """Print the events of the last block and replace the saved state."""
-        if self.state is None:
-            self._print()
+        """Print the events of the last block and replace the saved state; where that fails, it is tried again later."""
+        try:
+            if self.state is None:
+                self._print()
+            else:
+                self.watcher.source = {"model": self.plant, "place": self.place, "bad": self.bad,
+                                       "stamps": [*self.stamps.items()][-REMEMBERED:], **self.reader.memory}
+                self.state.replace(self.watcher.save, self._print)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            if not self.failed:
+                what = "the events" if self.state is None or self._is_printing else f"the state {self.state.path}"
+                _note(f"{what} cannot be written ({error.strerror or error}): monitoring goes on, and writing is tried "
+                      "again")
+            self.failed = clock.monotonic()
+            with suppress(OSError):  # events need no state
+                self._print()
             return
-        self.watcher.source = {"model": self.plant, "place": self.place, "bad": self.bad,
-                               "stamps": [*self.stamps.items()][-REMEMBERED:], **self.reader.memory}
-        self.state.replace(self.watcher.save, self._print)
-        self.saved = self.watcher.samples
+        if self.failed:
+            _note(f"writing works again from sample {self.watcher.samples} on")
+        self.failed, self.saved = 0.0, self.watcher.samples
 
     def _print(self) -> None:
-        text, self.lines = "".join(self.lines), []
+        text, self.lines, self._is_printing = "".join(self.lines), [], True
         sys.stdout.write(text)
         sys.stdout.flush()
+        self._is_printing = False
 
     def _tell(self, event: Any, line: int) -> None:
         stamp, onset = self.stamps.get(event.sample), self.stamps.get(event.onset)
@@ -309,6 +333,12 @@ class _Watch:
         else:
             text = f"sample {event.in_words(_in_words(stamp), _in_words(onset))}"
         self.lines.append(text + "\n")
+
+
+def _note(text: str) -> None:
+    """Print a warning; an error stream that cannot be written ends no monitor."""
+    with suppress(OSError):
+        note(text)
 
 
 def _in_words(stamp: str | None) -> str:
