@@ -292,7 +292,7 @@ class Monitor:
         else:
             innovation, matrices = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
             _, statistic, weight = self.search.advance(moving, innovation[None], limit, matrices,
-                                                       int(np.count_nonzero(~np.isnan(y))))
+                                                       int(np.count_nonzero(matrices[3].any(axis=1))))
         self.samples += 1
         if unsure.any():
             decisions.begun = now + 1
