@@ -177,7 +177,8 @@ class _Signals:
         self._waiting = self._arrived = False
 
     def __enter__(self) -> Self:
-        self._former = {number: signal.signal(number, self._arrive) for number in (signal.SIGTERM, signal.SIGINT)}
+        wanted = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) != signal.SIG_IGN]
+        self._former = {number: signal.signal(number, self._arrive) for number in wanted}
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 WIDTH = 80
 
 WORDS = {
-    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading",
+    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading", "saturated": "reading",
     "schedule": "share of the change",
 }
 """Name of the magnitude of a kind."""
@@ -132,7 +132,7 @@ def certificate_words(found: "Diagnosis") -> str:
             words += f", twice the log of the odds against the next {proof.runner_up_margin:.1f}"
         return words
     if proof.kind == "flat line":
-        return f"proof: {proof.value:.0f} readings in a row are identical"
+        return f"proof: {proof.value:.0f} readings in a row are identical or missing"
     if proof.kind == "duality gap":
         return f"proof: duality gap {proof.value:.1e}"
     if proof.kind == "infeasible healthy":

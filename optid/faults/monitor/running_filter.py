@@ -258,15 +258,20 @@ class RunningFilter:
 def _response(steady: Predictor) -> Array:
     """Return R (n, n): the norm of R x is that of the whitened innovations that a state x adds, over a long horizon."""
     n = len(steady.A)
-    R, step = np.linalg.qr(np.vstack([steady.root @ steady.C, np.zeros((n, n))]), mode="r"), steady.F
+    R, step = _triangular(np.vstack([steady.root @ steady.C, np.zeros((n, n))])), steady.F
     for _ in range(DOUBLINGS):
-        R, step = np.linalg.qr(np.vstack([R, R @ step]), mode="r"), step @ step
+        R, step = _triangular(np.vstack([R, R @ step])), step @ step
     return R
+
+
+def _triangular(M: Array) -> Array:
+    """Return R, upper triangular, with R'R = M'M."""
+    return np.asarray(np.linalg.qr(M, mode="r"))
 
 
 def _lower_triangular(E: Array) -> Array:
     """Return a square R, lower triangular, with R'R = E'E; its first rows are zero where E has fewer rows."""
     R = np.zeros((E.shape[1], E.shape[1]))
-    T = np.linalg.qr(E[:, ::-1], mode="r")
+    T = _triangular(E[:, ::-1])
     R[len(R) - len(T) :] = T[::-1, ::-1]
     return R
