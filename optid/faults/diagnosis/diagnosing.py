@@ -24,7 +24,7 @@ from optid.faults.diagnosis.records import (
     without_lost_readings,
 )
 from optid.faults.nuisance import uncertain_start
-from optid.faults.ranges import outside
+from optid.faults.ranges import extrapolated, outside, usable_samples
 from optid.faults.screening import check_channels
 from optid.faults.search.calibration import Thresholds
 from optid.faults.signatures import Dictionary, dictionary
@@ -116,10 +116,12 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
     """Return the diagnosis of an experiment; `noise` are arguments of `whiten`, and the remark is reported."""
     model = found.model
     part, lines = without_lost_readings(record, number)
+    count, cut = usable_samples(model, part.u)
+    part = replace(part, u=part.u[:count], y=part.y[:count])
     stuck = lost_sensors(lines, found, 2 * model.nx)
     first = search_record(record, part, found, asked, noise)
-    notes = [remark, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
-             *first.extrapolated]
+    notes = [remark, cut, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
+             *extrapolated(model, part.u), *first.extrapolated]
     seen, ranking, alarm = find(first)
     notes.append(ranking.note)
     fits = ranking.fits if not found.unknown or ranking.explains else ()

@@ -6,7 +6,7 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.monitor.events import Event
-from optid.faults.ranges import known_range
+from optid.faults.ranges import known_range, usable_range
 from optid.faults.readings import SensorChecks
 from optid.models import HammersteinSS
 
@@ -15,8 +15,8 @@ class Screened(NamedTuple):
     """A block of samples after the checks."""
 
     y: Array  # (T, l) readings; those of frozen sensors are missing
-    unsure: np.ndarray  # (T, m) inputs that are missing or outside their range
-    distance: Array  # (T,) largest distance of such an input from the middle of its range, in half ranges; at least one
+    unsure: np.ndarray  # (T, m) inputs that are missing or so far outside their range that their effect is unknown
+    distance: Array  # (T,) largest distance of an input from the middle of its range, in half ranges; at least one
     repeating: np.ndarray  # (T,) whether a sensor repeats the reading of the sample before
     events: list[Event]  # in the order of their samples
     frozen: dict[int, int]  # {sample of the block: onset in samples of the stream} of the sensors found frozen
@@ -35,8 +35,10 @@ class ReadingChecks:
         """Begin a stream."""
         m, l = model.m, model.l  # noqa: E741
         self.model, self.low, self.high = model, np.full(m, -np.inf), np.full(m, np.inf)
-        for c, low, high in zip(model.input_of, *known_range(model)):
+        self._lowest, self._highest = self.low.copy(), self.high.copy()
+        for c, low, high, lowest, highest in zip(model.input_of, *known_range(model), *usable_range(model)):
             self.low[c], self.high[c] = max(self.low[c], low), min(self.high[c], high)
+            self._lowest[c], self._highest[c] = max(self._lowest[c], lowest), min(self._highest[c], highest)
         self.sensors, self._outside = SensorChecks(l), [-1] * m
 
     @property
@@ -54,7 +56,8 @@ class ReadingChecks:
         distance, (at, c) = np.ones(len(u)), np.nonzero(outside)
         np.maximum.at(distance, at, np.abs(2 * u[at, c] - self.low[c] - self.high[c]) / (self.high[c] - self.low[c]))
         clean, repeating, findings = self.sensors.screen(y, blind, start)
-        found = Screened(clean, outside | np.isnan(u), distance, repeating, [], {})
+        unsure = np.asarray((u < self._lowest) | (u > self._highest) | np.isnan(u))
+        found = Screened(clean, unsure, distance, repeating, [], {})
         for c in range(u.shape[1]):
             self._range(c, u[:, c], outside[:, c], start, found.events)
         for one in findings:
