@@ -109,11 +109,11 @@ def follow(folder, name, capsys, errors=False):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
-@pytest.mark.parametrize("owner, name", [
-    (RowReader, "read"), (Monitor, "run"), (Monitor, "save"), (following.Followed, "advance"),
-    (monitoring._Watch, "_tell"), (os, "replace")])
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_at_any_step_waits_until_the_block_is_processed(tmp_path, monkeypatch, capsys, owner, name, number):
+@pytest.mark.parametrize("number, owner, name", [
+    (signal.SIGTERM, RowReader, "read"), (signal.SIGTERM, Monitor, "run"), (signal.SIGINT, Monitor, "run"),
+    (signal.SIGINT, Monitor, "save"), (signal.SIGTERM, following.Followed, "advance"),
+    (signal.SIGTERM, monitoring._Watch, "_tell"), (signal.SIGTERM, os, "replace")])
+def test_a_signal_at_any_step_waits_until_the_block_is_processed(tmp_path, monkeypatch, capsys, number, owner, name):
     head, rows = write_stream(tmp_path, 2)
     (tmp_path / "grown.csv").write_text(head + "".join(rows))
     monkeypatch.setattr(following, "BLOCK", 8000)  # about 100 rows
