@@ -37,14 +37,14 @@ def test_a_saturated_sensor_returns_to_its_limit(record, unit):
         limit = np.quantile(sign * y[:, 1], 0.8)
         clipped = np.column_stack([y[:, 0], sign * np.minimum(sign * y[:, 1], limit)])
         lines = lost_readings(clipped, ("y1", "y2"))
-        assert {(one.name, one.kind, one.value) for one in lines} == {("sensor:y2", "saturated", sign * limit)}
+        assert {(one.name, one.condition, one.value) for one in lines} == {("sensor:y2", "saturated", sign * limit)}
         assert all(one.count >= 5 and "again and again" in str(one) for one in lines) and len(lines) > 1
         assert all(np.all(clipped[one.first : one.first + one.count, 1] == sign * limit) for one in lines)
         streamed, (checks, parts) = [], (SensorChecks(2), np.array_split(clipped, 17))
         for first, part in zip(np.cumsum([0, *map(len, parts)]), parts):
             streamed += checks.screen(part, np.zeros(len(part), dtype=bool), int(first))[2]
         assert [one.onset for one in streamed if not one.ended] == [one.first for one in lines]
-        assert [one.kind for one in streamed if not one.ended][1:] == ["saturated"] * (len(lines) - 1)
+        assert [one.condition for one in streamed if not one.ended][1:] == ["saturated"] * (len(lines) - 1)
 
 
 @pytest.mark.parametrize("gap", [0, 3, 12, 59])
@@ -55,7 +55,7 @@ def test_a_sensor_that_is_read_now_and_then_is_not_dead(record, gap):
     assert lost_readings(y, ("y1", "y2")) == ()
     y[500:, 0] = np.nan
     (line,) = lost_readings(y, ("y1", "y2"), 2)
-    assert (line.name, line.kind, line.experiment) == ("sensor:y1", "dead", 2)
+    assert (line.name, line.condition, line.experiment) == ("sensor:y1", "dead", 2)
     assert line.first == 500 - (500 - 1) % (gap + 1) and line.count == 800 - line.first
     y[700:, 0] = 1.0 + np.arange(100)
     assert len(lost_readings(y, ("y1", "y2"))) == 1  # also when it comes back

@@ -224,6 +224,19 @@ def test_a_missing_input_makes_the_state_unknown():
     assert watch(model, everything(model), 40, 40.0).run(gap, inject(model, u, seed=10)) == []
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fault_of_an_actuator_whose_input_is_unknown_is_carried_with_a_finite_size(seed):
+    model, u = plant(), levels(500, seed)
+    found = everything(model)
+    faults = [Fault.step("process:load", 90, 3.0, direction=[0.3, -0.2, 0.5]), Fault.step("sensor:y1", 300, 2.0)]
+    y = inject(model, u, faults, seed=seed)
+    u[100:250, seed % 2] = u[280:420, 1 - seed % 2] = np.nan
+    monitor = watch(model, found, 40, 30.0)
+    events = monitor.run(u, y)
+    assert "alarm" in {e.kind for e in events} and np.isfinite(monitor.plant.P).all()
+    assert np.linalg.eigvalsh(monitor.plant.P)[0] > -1e-6 and np.abs(monitor.plant.P).max() < 1e12
+
+
 def test_a_carried_fault_counts_for_nothing_and_its_size_is_that_of_least_squares():
     model, count = plant(), 140
     found, u = everything(model), levels(count, 11)

@@ -21,10 +21,10 @@ USUAL = 2
 """A gap of a record is dead if it is more than so many times as long as any other one of the sensor."""
 
 
-class Finding(NamedTuple):
+class SensorFinding(NamedTuple):
     """A sensor whose readings say nothing, or say something again."""
 
-    kind: str  # "frozen", "saturated" or "dead"
+    condition: str  # "frozen", "saturated" or "dead"
     output: int
     sample: int  # at which it is noticed
     onset: int  # first sample of the identical readings or of the missing ones
@@ -38,7 +38,7 @@ class LostReadings:
 
     Attributes:
         name: "sensor:y1".
-        kind: "frozen", "saturated" or "dead".
+        condition: "frozen", "saturated" or "dead".
         experiment: index of the experiment.
         first: first sample of the equal readings or of the missing ones.
         count: number of these readings.
@@ -46,7 +46,7 @@ class LostReadings:
     """
 
     name: str
-    kind: str
+    condition: str
     experiment: int
     first: int
     count: int
@@ -54,9 +54,9 @@ class LostReadings:
 
     def __str__(self) -> str:
         """State sensor, reading and samples."""
-        if self.kind == "dead":
+        if self.condition == "dead":
             return f"{self.name}: no reading in {self.count} samples from sample {self.first} on"
-        limit = ", which it reaches again and again" if self.kind == "saturated" else ""
+        limit = ", which it reaches again and again" if self.condition == "saturated" else ""
         return f"{self.name}: {self.count} readings of exactly {self.value:.6g}{limit} from sample {self.first} on"
 
 
@@ -73,12 +73,12 @@ class SensorChecks:
 
     def __init__(self, count: int) -> None:
         """Begin a stream of so many sensors."""
-        self.memory: dict[str, Any] = {"last": [None] * count, "frozen": [""] * count}
+        self.memory: dict[str, Any] = {"last": [None] * count, "condition": [""] * count}
         self.memory |= {word: [0] * count for word in ("run", "repeats", "seen", "missing", "since")}
         self.memory |= {"ends": [[None, None] for _ in range(count)]}
         self.memory |= {word: [[0, 0] for _ in range(count)] for word in ("visits", "held")}
 
-    def screen(self, y: Array, blind: np.ndarray, start: int) -> tuple[Array, np.ndarray, list[Finding]]:
+    def screen(self, y: Array, blind: np.ndarray, start: int) -> tuple[Array, np.ndarray, list[SensorFinding]]:
         """Check a block of readings (T, l) that begins at the sample `start`; `blind` (T,) are samples without inputs.
 
         Returns:
@@ -90,11 +90,11 @@ class SensorChecks:
             self._sensor(o, clean[:, o], repeating, blind, start, found)
         return clean, repeating, sorted(found, key=lambda one: one.sample)
 
-    def _sensor(self, o: int, y: Array, repeating: np.ndarray, blind: np.ndarray, start: int, found: list[Finding]
+    def _sensor(self, o: int, y: Array, repeating: np.ndarray, blind: np.ndarray, start: int, found: list[SensorFinding]
                 ) -> None:
         own = {word: values[o] for word, values in self.memory.items()}
         before = np.concatenate([[np.nan if own["last"] is None else own["last"]], y[:-1]])
-        if not (own["run"] or own["missing"] or own["frozen"] or np.isnan(y).any() or np.any(y == before)):
+        if not (own["run"] or own["missing"] or own["condition"] or np.isnan(y).any() or np.any(y == before)):
             self.memory["seen"][o] += len(y)
             self.memory["last"][o] = float(y[-1]) if len(y) else own["last"]
             self._reach(own, y)
@@ -105,33 +105,33 @@ class SensorChecks:
             if np.isnan(value):
                 own["missing"] += int(not blind[k])
                 if own["missing"] == DEAD and not blind[k]:
-                    found.append(Finding("dead", o, now, now - DEAD + 1, False, f"no reading for {DEAD} samples"))
+                    found.append(SensorFinding("dead", o, now, now - DEAD + 1, False, f"no reading for {DEAD} samples"))
                 continue
             if own["missing"] >= DEAD:
-                found.append(Finding("dead", o, now, now, True))
+                found.append(SensorFinding("dead", o, now, now, True))
             own["missing"] = 0
             if value == own["last"]:
                 own["run"] += 1
                 repeating[k] = True
                 most = max(FROZEN - 1, np.log(CHANCE) / np.log((own["repeats"] + 1) / (own["seen"] + 2)))
-                if not own["frozen"] and own["run"] >= most:
+                if not own["condition"] and own["run"] >= most:
                     at_end = [visits for end, visits in zip(own["ends"], own["visits"]) if end == value]
-                    own["frozen"] = "saturated" if at_end and max(at_end) > 1 else "frozen"
+                    own["condition"] = "saturated" if at_end and max(at_end) > 1 else "frozen"
                     note = f"{own['run'] + 1} identical readings" + (
-                        f" of {value:.6g}, the limit of the sensor" if own["frozen"] == "saturated" else "")
-                    found.append(Finding(own["frozen"], o, now, own["since"], False, note))
-                if own["frozen"]:
+                        f" of {value:.6g}, the limit of the sensor" if own["condition"] == "saturated" else "")
+                    found.append(SensorFinding(own["condition"], o, now, own["since"], False, note))
+                if own["condition"]:
                     y[k] = np.nan
                 continue
-            if own["frozen"]:
-                found.append(Finding(own["frozen"], o, now, now, True))
+            if own["condition"]:
+                found.append(SensorFinding(own["condition"], o, now, now, True))
             else:
                 if own["last"] in own["ends"]:
                     own["held"][own["ends"].index(own["last"])] += own["run"]
                 else:
                     own["repeats"] += own["run"]
                 own["seen"] += own["run"] + 1
-            own["run"], own["frozen"], own["last"], own["since"] = 0, "", value, now
+            own["run"], own["condition"], own["last"], own["since"] = 0, "", value, now
             self._reach(own, np.array([value]))
         for word, value in own.items():
             self.memory[word][o] = value
@@ -160,14 +160,15 @@ def lost_readings(y: Array, outputs: Sequence[str], experiment: int = 0) -> tupl
     for one in (one for one in found if not one.ended):
         last = next((e.sample for e in found if e.ended and e.output == one.output and e.sample > one.sample), len(y))
         own = y[one.onset : last, one.output]
-        value = float("nan") if one.kind == "dead" else float(own[0])
-        count = int(np.sum(np.isnan(own) if one.kind == "dead" else own == value))
-        lines.append(LostReadings(f"sensor:{outputs[one.output]}", one.kind, experiment, one.onset, count, value))
-    limits = {(one.name, one.value) for one in lines if one.kind == "saturated"}
-    kinds = ["saturated" if (one.name, one.value) in limits else one.kind for one in lines]
-    lines = [LostReadings(one.name, kind, experiment, one.first, one.count, one.value)
-             for one, kind in zip(lines, kinds)]
-    return tuple(one for one in lines if one.kind != "dead" or one.count > USUAL * _longest_other_gap(y, outputs, one))
+        value = float("nan") if one.condition == "dead" else float(own[0])
+        count = int(np.sum(np.isnan(own) if one.condition == "dead" else own == value))
+        lines.append(LostReadings(f"sensor:{outputs[one.output]}", one.condition, experiment, one.onset, count, value))
+    limits = {(one.name, one.value) for one in lines if one.condition == "saturated"}
+    conditions = ["saturated" if (one.name, one.value) in limits else one.condition for one in lines]
+    lines = [LostReadings(one.name, condition, experiment, one.first, one.count, one.value)
+             for one, condition in zip(lines, conditions)]
+    return tuple(one for one in lines
+                 if one.condition != "dead" or one.count > USUAL * _longest_other_gap(y, outputs, one))
 
 
 def _longest_other_gap(y: Array, outputs: Sequence[str], one: LostReadings) -> int:

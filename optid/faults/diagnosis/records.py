@@ -130,7 +130,7 @@ def without_lost_readings(record: Data, number: int) -> tuple[Experiment, tuple[
     for line in lines:
         own = y[line.first + 1 :, record.outputs.index(line.name.partition(":")[2])]
         changes = np.flatnonzero(~np.isnan(own) & (own != line.value))
-        if line.kind != "dead":
+        if line.condition != "dead":
             own[: changes[0] if changes.size else None] = np.nan
     return replace(part, y=y) if lines else part, lines
 
@@ -144,12 +144,12 @@ def lost_sensors(lines: Sequence[LostReadings], found: Dictionary, edge: int) ->
     longest = {line.name: line for line in sorted(lines, key=lambda line: line.count)}
     faults = []
     for name, line in longest.items():
-        known = [c for c in found.candidates if c.kind == line.kind and name in c.places]
-        candidate = known[0] if known else candidate_of(found.model, name, line.kind)
-        onset, censored = line.first + (line.kind != "dead"), line.first < edge
-        value = np.array([] if line.kind == "dead" else [line.value])
+        known = [c for c in found.candidates if c.kind == line.condition and name in c.places]
+        candidate = known[0] if known else candidate_of(found.model, name, line.condition)
+        onset, censored = line.first + (line.condition != "dead"), line.first < edge
+        value = np.array([] if line.condition == "dead" else [line.value])
         faults.append(Estimate(
-            candidate.label, name, line.kind, candidate, onset, (0 if censored else onset, onset), censored, value,
+            candidate.label, name, line.condition, candidate, onset, (0 if censored else onset, onset), censored, value,
             np.stack([value, value], axis=1), np.zeros((value.size, value.size)), float("inf"),
         ))
     return tuple(sorted(faults, key=lambda fault: fault.onset))

@@ -61,12 +61,12 @@ class ReadingChecks:
         for c in range(u.shape[1]):
             self._range(c, u[:, c], outside[:, c], start, found.events)
         for one in findings:
-            label = ((f"sensor:{self.model.outputs[one.output]} {one.kind}", 1.0),)
+            label = ((f"sensor:{self.model.outputs[one.output]} {one.condition}", 1.0),)
             if one.ended:
                 found.events.append(Event("cleared", one.sample, label))
                 continue
             found.events.append(Event("isolated", one.sample, label, one.onset, note=one.note))
-            if one.kind != "dead":
+            if one.condition != "dead":
                 k = one.sample - start
                 found.frozen[k] = min(one.onset, found.frozen.get(k, one.onset))
         found.events.sort(key=lambda e: e.sample)

@@ -6,10 +6,10 @@ unknown initial state, missing readings, and unknown inputs. With e the innovati
 is x+ = A x + ... + K e, y = C x + ... + e: once its state is known it stays known, and the filter is the steady
 predictor.
 
-An unknown state or input has no prior: the covariance of the state is P + k N N', k without limit, and the readings
-determine the combinations N of states by least squares before anything is concluded from them (the exact initialisation
-of P. de Jong, Annals of Statistics 19, 1991). The result depends neither on the coordinates of the state nor on where
-the plant starts.
+An unknown state has no prior: its covariance is P + k N N', k without limit, and the readings determine the
+combinations N of states by least squares before anything is concluded from them (the exact initialisation of P. de
+Jong, Annals of Statistics 19, 1991). The result depends neither on the coordinates of the state nor on where the plant
+starts. The effect of an unknown input differs from that of the last known one, with a wide prior.
 """
 
 from dataclasses import dataclass
@@ -28,6 +28,9 @@ from optid.models import HammersteinSS
 SEEN = 1e-7
 """Share of the response to an unknown that determines it: a response of one standard deviation that is ignored has
 1e7 standard deviations behind it, and one that is used makes the covariance 1e14 at most."""
+
+WIDE = 1e10
+"""Prior energy of an unknown input in all innovations: with none, a fault of its actuator would have no size at all."""
 
 DOUBLINGS = 24
 """Doublings of the horizon over which the response to the state is taken."""
@@ -153,18 +156,18 @@ class RunningFilter:
         if model.E.size:
             x[:n] += model.E @ fed(used)
         wide = np.flatnonzero(unsure)
-        into, onto = model.B[:, wide], model.D[:, wide]
-        sizes = np.sqrt(np.sum((steady.root @ onto) ** 2, axis=0) + np.sum((self.response @ into) ** 2, axis=0))
-        into, onto = (part / np.maximum(sizes, 1e-300) for part in (into, onto))
-        free, direct = np.hstack([drift[:n, :n] @ self.N, into]), np.hstack([model.C @ self.N, onto])[there]
-        seen, covariance = C[there], steady.covariance[:, there]
+        into, onto = np.vstack([model.B[:, wide], np.zeros((q, len(wide)))]), model.D[:, wide]
+        sizes = np.sum((steady.root @ onto) ** 2, axis=0) + np.sum((self.response @ into[:n]) ** 2, axis=0)
+        spread = np.where(sizes > 0, WIDE / np.maximum(sizes, 1e-300), 0.0)
+        free, seen, covariance = drift[:n, :n] @ self.N, C[there], steady.covariance[:, there]
         if there.size:
-            S = seen @ self.P @ seen.T + covariance[there]
-            cross = drift @ self.P @ seen.T + noise @ covariance
+            direct = onto[there]
+            S = seen @ self.P @ seen.T + covariance[there] + (direct * spread) @ direct.T
+            cross = drift @ self.P @ seen.T + noise @ covariance + (into * spread) @ direct.T
             lower = np.linalg.cholesky((S + S.T) / 2)
             inverse = solve_triangular(lower, np.eye(there.size), lower=True)
-            if free.size:  # what determines unknowns is no innovation
-                left, size, right = np.linalg.svd(inverse @ direct)
+            if free.size:  # readings that determine unknowns are no innovations
+                left, size, right = np.linalg.svd(inverse @ model.C[there] @ self.N)
                 known = int(np.sum(size > SEEN))
                 unknowns = right[:known].T @ (left[:, :known].T @ inverse / size[:known, None])
                 gain[:n, there], free = free @ unknowns, free @ right[known:].T
@@ -177,8 +180,8 @@ class RunningFilter:
         if free.size:
             size, right = np.linalg.svd(self.response @ free)[1:]
             free = free @ right[: int(np.sum(size > SEEN))].T
-        forget, left = drift - gain @ C, noise - gain
-        self.P = forget @ self.P @ forget.T + left @ steady.covariance @ left.T
+        forget, left, blind = drift - gain @ C, noise - gain, into - gain @ onto
+        self.P = forget @ self.P @ forget.T + left @ steady.covariance @ left.T + (blind * spread) @ blind.T
         self.P, self.N = (self.P + self.P.T) / 2, free
         for p, one in enumerate(self.directions):
             raw = H[:, p] + (model.C @ one.deviation if one.age else 0.0)
