@@ -171,6 +171,35 @@ def test_a_sensor_that_repeats_its_reading_is_a_finding_and_the_rest_is_judged(f
     assert "at or before" in str(constant)
 
 
+def test_a_sensor_without_readings_is_dead(found, tmp_path):
+    u, y = record()
+    for other in (y, record(Fault.step("sensor:y2", 40, 0.8))[1]):
+        lost = other.copy()
+        lost[70:, 0] = np.nan
+        answer = diagnose(small(), (u, lost), found)
+        assert answer.verdict == "faulty" and answer.best.labels[-1] == "sensor:y1 dead"
+        assert answer.best.faults[-1].onset == 70 and answer.p_value == 0
+        assert f"no reading in {COUNT - 70} samples from sample 70 on" in answer.status
+        assert load_diagnosis(answer.save(tmp_path / "d.json")).to_dict() == answer.to_dict()
+    assert answer.best.labels == ("sensor:y2", "sensor:y1 dead")
+    several = diagnose(small(), Data([u, u], [y, lost], inputs=("u1", "u2"), outputs=("y1", "y2")), found)
+    assert [one.detected for one in several] == [False, True]
+    lost[1:, 0] = np.nan
+    whole = diagnose(small(), (u, lost), found)
+    assert whole.best.faults[0].onset_censored and "sensor:y1 dead" in str(whole)
+    gaps = y.copy()
+    gaps[50:59, 1] = gaps[80, 0] = np.nan
+    assert diagnose(small(), (u, gaps), found).verdict == "healthy"
+
+
+def test_a_sensor_at_its_limit_is_saturated(found):
+    u, y = record(u=inputs(400))
+    limit = np.quantile(y[:, 1], 0.7)
+    answer = diagnose(small(), (u, np.column_stack([y[:, 0], np.minimum(y[:, 1], limit)])), found)
+    assert answer.best.label == "sensor:y2 saturated" and answer.size[0] == limit
+    assert "reading" in str(answer) and answer.best.faults[0].onset_interval[1] == answer.onset
+
+
 @pytest.mark.slow
 def test_a_sensor_that_stands_still_in_its_noise_and_noise_that_grows_are_named():
     faults = dictionary(small(), kinds=["bias", "frozen", "noise"])

@@ -9,7 +9,7 @@ from test_fault_injection import small
 
 from optid import Data
 from optid.bases import Linear, Polynomial
-from optid.errors import LookupFailed, StructureError
+from optid.errors import DataError, LookupFailed, StructureError
 from optid.faults import (
     Fault,
     Monitor,
@@ -234,6 +234,72 @@ def test_an_input_outside_its_range_raises_no_fault_and_is_named():
     y[120:] += np.array([0.0, 2.0])
     faulty = diagnose(curved(beyond=False), (u, y), found)
     assert "sensor:y2" in [label for a in faulty.candidates for label in a.labels]
+
+
+def ranged(unit=1.0):
+    """A linear plant that was identified for inputs from -1.2 to 1.2, in units of the first input."""
+    lines = tuple(Nonlinearity(Linear((-1.2 * scale, 1.2 * scale)), np.ones(1)) for scale in (unit, 1.0))
+    return replace(small(), B=small().B / [unit, 1.0], D=small().D / [unit, 1.0], nonlinearities=lines)
+
+
+@pytest.mark.parametrize("unit", [0.01, 1.0, 1e4])
+def test_a_record_is_used_up_to_where_an_input_stays_far_outside_its_range(unit):
+    model, u = ranged(unit), levels(COUNT, 0) * [unit, 1.0]
+    u[90:95, 0], u[100:102, 0], u[130:, 0] = 1.7 * unit, 3.0 * unit, -2.5 * unit
+    found = dictionary(model)
+    for fault, label in (((), None), (Fault.step("sensor:y2", 60, 0.8), "sensor:y2")):
+        y = inject(model, u, fault, seed=4)
+        y[130:] += 20.0  # what nobody knows there
+        answer = diagnose(model, (u, y), found)
+        assert (answer.best and answer.best.label) == label and answer.window == 130
+        assert "The record is used up to sample 129: u1 then stays far outside" in answer.status
+        assert "first in sample 90: its linear function is extrapolated" in answer.status
+        assert "u1 is far outside the identified range" in answer.status and "2 samples, first in sample 100" in (
+            answer.status)
+    both = diagnose(model, Data([u, u[:80]], [y, y[:80]], inputs=model.inputs, outputs=model.outputs), found)
+    assert [one.window for one in both] == [130, 80] and all(one.detected for one in both)
+    u[3:, 0] = 2.5 * unit
+    with pytest.raises(DataError, match="It stays there from sample 3 on, and 3 samples before are too few"):
+        diagnose(model, (u, y), found)
+
+
+def test_a_nonlinear_input_may_leave_its_range_until_too_little_is_known():
+    f = tuple(Nonlinearity(Polynomial(3, interval=(-1.2, 1.2)), np.array([1.0, 0.0, 0.3])) for _ in range(2))
+    model, u = replace(small(), nonlinearities=f), levels(COUNT, 0)
+    found, y = dictionary(model), inject(model, np.clip(u, -1.2, 1.2), Fault.step("sensor:y1", 40, 0.8), seed=4)
+    u[50:54, 0], u[70:, 0] = 1.5, 1.5
+    answer = diagnose(model, (u, y), found)
+    assert answer.best.label == "sensor:y1" and "used up to sample 49" in answer.status
+    u[54 + COUNT // 2 - 10 :, 0] = 0.0
+    y = inject(model, np.clip(u, -1.2, 1.2), Fault.step("sensor:y1", 40, 0.8), seed=4)
+    assert diagnose(model, (u, y), found).window == COUNT
+
+
+def test_the_monitor_extrapolates_linear_functions_as_far_as_a_diagnosis():
+    model, u = ranged(), levels(300, 2)
+    u[100:200, 0], u[250:, 0] = 1.7, 2.5
+    y = inject(model, u, Fault.step("sensor:y2", 150, 1.0), seed=4)
+    y[250:] += 3.0  # the effect of the input is unknown there, not that of the outputs
+    found = dictionary(model, kinds=["bias"], state_jump=False)
+    monitor = Monitor(model, found, window=40, thresholds=np.full(len(found.labels), 25.0))
+    events = monitor.run(u[:250], y[:250])
+    assert [e.sample for e in events if e.kind in ("outside", "inside")] == [100, 200]
+    assert 150 <= next(e.sample for e in events if e.kind == "alarm") < 160
+    assert monitor.plant.certain or monitor.carried
+    steps = Monitor(model, found, window=40, thresholds=np.full(len(found.labels), 25.0))
+    assert [e for a, b in zip(u[:250], y[:250]) for e in steps.step(a, b)] == events
+
+
+@pytest.mark.parametrize("share", [0.02, 0.98])
+def test_a_share_lost_lies_between_zero_and_one(share):
+    found = dictionary(small(), kinds=["loss", "stuck"], sensors=[], state_jump=False)
+    for seed in range(8):
+        u = 0.3 * levels(COUNT, seed)
+        answer = diagnose(small(), (u, inject(small(), u, Fault.loss("actuator:u1", 60, share), seed=seed)), found,
+                          false_alarm=0.2)
+        for one in answer.candidates:
+            for fault in one.faults:
+                assert np.all((fault.size_interval[0] >= 0) & (fault.size_interval[0] <= 1)) and 0 <= fault.size[0] <= 1
 
 
 def test_without_an_actuator_that_moves_it_is_said_what_is_out_of_reach():

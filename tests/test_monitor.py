@@ -1,5 +1,6 @@
 """The monitor against dense least squares, and its decisions on records with known faults."""
 
+import re
 import warnings
 from dataclasses import replace
 
@@ -125,11 +126,94 @@ def test_an_unknown_state_counts_for_nothing():
     y = inject(model, u, seed=8, x0=np.array([40.0, -30.0, 20.0]))
     monitor = watch(model, found)
     monitor.run(u, y)
-    agrees(monitor, dense(found, 40, u, y, ("state", 0)), 1e-5)  # the prior of the state is wide, not without end
+    agrees(monitor, dense(found, 40, u, y, ("state", 0)), 1e-8)
     zero, unknown = watch(model, found, x0="zero"), watch(model, found)
     zero.run(u[:6], y[:6])
     unknown.run(u[:6], y[:6])
     assert max(zero.statistics.values()) > 100 > max(unknown.statistics.values())
+
+
+def near_integrating(T):
+    """A slow plant of poles .99999, .9999 and .8 in coordinates T x."""
+    back = np.linalg.inv(T)
+    C = np.array([[1.0, 0.5, 1.0], [0.0, 1.0, -0.5]])
+    return noisy(T @ np.diag([0.99999, 0.9999, 0.8]) @ back, T @ np.ones((3, 1)), C @ back, 1e-4 * T @ T.T,
+                 np.diag([0.03, 0.05]))
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_the_start_depends_neither_on_coordinates_nor_on_offsets(lost):
+    rng = np.random.default_rng(2)
+    u, known = rng.standard_normal((300, 1)), near_integrating(np.eye(3))
+    ways, results = (np.eye(3), rng.standard_normal((3, 3)), np.diag([1e-6, 1.0, 1e5])), []
+    for T in ways:
+        model = near_integrating(T)
+        found = dictionary(model, kinds=["bias"], actuators=[], state_jump=False)
+        for size in (0.0, 1e3, 1e7):
+            y = inject(known, u, seed=3, x0=size * np.array([1.0, -0.7, 0.4]))
+            if lost:
+                y[:4, 0] = y[2:9, 1] = y[200:210] = np.nan
+                u[100:103] = np.nan  # the input is unknown to the monitor
+            results.append(watch(model, found).watched(u, y))
+            u = np.nan_to_num(u, nan=0.3)
+    for one in results[1:]:
+        assert np.allclose(one, results[0], rtol=2e-5, atol=2e-5)
+    assert results[0].max() < 25 and results[0][20:].max() > 5
+
+
+@pytest.mark.parametrize("size", [1.0, 1e4, 1e8])
+def test_no_alarm_at_a_start_that_is_far_from_zero(size):
+    model, u = plant(), levels(300, 3)
+    found = everything(model)
+    for seed in range(5):
+        monitor = watch(model, found, 40, 35.0)
+        x0 = size * np.random.default_rng(seed).standard_normal(3)
+        events = monitor.run(u, inject(model, u, Fault.step("sensor:y1", 200, 2.0), seed=seed, x0=x0))
+        assert [e.sample // 10 for e in events if e.kind == "alarm"] == [20]
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+@pytest.mark.parametrize("where", [0, 3000])
+def test_a_transient_in_the_healthy_record_is_no_noise(where, unit):
+    """A start-up that the model does not describe hides faults: it is named, or refused."""
+    base, u, parts = plant(), levels(5000, 1), [slice(0, 2000), slice(2000, 5000)]
+    scale = np.array([unit, 1.0])
+    noise = replace(base.noise, R=base.noise.R * np.outer(scale, scale), S=base.noise.S * scale,
+                    innovation=base.noise.innovation * np.outer(scale, scale))
+    model = replace(base, C=scale[:, None] * base.C, D=scale[:, None] * base.D, offset_y=scale * base.offset_y,
+                    K=None if base.K is None else base.K / scale, noise=noise)
+    clean = inject(base, u, seed=3) * scale
+
+    def calibrated(size):
+        y = clean.copy()
+        y[where:, 0] += size * unit * np.exp(-np.arange(5000 - where) / 150)
+        return Monitor(model, arl0=1000, window=40, healthy=Data([u[p] for p in parts], [y[p] for p in parts]))
+
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        calibrated(9.0)
+    assert any("raises the energy of the innovations of y1" in str(one.message) for one in heard)
+    experiment, first = (1, 0) if where == 0 else (2, 1000)
+    refused((DataError, rf"in samples {first} to \d+ of experiment {experiment}: smaller", lambda: calibrated(40.0)))
+
+
+def test_thresholds_that_a_stretch_raises_are_reported():
+    """A few windows reach far more than the others."""
+    model, u = plant(), levels(4000, 1)
+    clean = inject(model, u, seed=3)
+
+    def calibrated(size):
+        y = clean.copy()
+        for k in (1000, 1250, 1500, 1750):
+            y[k : k + 12, 0] += size
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            Monitor(model, arl0=1000, window=40, healthy=Data(u, y))
+        return " ".join(str(one.message) for one in heard)
+
+    assert "raises the thresholds" not in calibrated(1.0)
+    assert re.search(r"raises the thresholds [3-9]\.\d-fold, most in samples 1\d\d0 to 1\d\d9: ", calibrated(4.5))
+    refused((DataError, "raises the thresholds", lambda: calibrated(10.0)))
 
 
 def test_a_missing_input_makes_the_state_unknown():
@@ -138,6 +222,19 @@ def test_a_missing_input_makes_the_state_unknown():
     u[60:63] += 5.0  # what the plant gets while nobody sees it
     gap[60:63] = np.nan
     assert watch(model, everything(model), 40, 40.0).run(gap, inject(model, u, seed=10)) == []
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fault_of_an_actuator_whose_input_is_unknown_is_carried_with_a_finite_size(seed):
+    model, u = plant(), levels(500, seed)
+    found = everything(model)
+    faults = [Fault.step("process:load", 90, 3.0, direction=[0.3, -0.2, 0.5]), Fault.step("sensor:y1", 300, 2.0)]
+    y = inject(model, u, faults, seed=seed)
+    u[100:250, seed % 2] = u[280:420, 1 - seed % 2] = np.nan
+    monitor = watch(model, found, 40, 30.0)
+    events = monitor.run(u, y)
+    assert "alarm" in {e.kind for e in events} and np.isfinite(monitor.plant.P).all()
+    assert np.linalg.eigvalsh(monitor.plant.P)[0] > -1e-6 and np.abs(monitor.plant.P).max() < 1e12
 
 
 def test_a_carried_fault_counts_for_nothing_and_its_size_is_that_of_least_squares():

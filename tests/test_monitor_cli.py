@@ -225,6 +225,31 @@ def test_dates_quotes_and_gaps():
         assert [line for line, _ in found.bad] == [3] and "is not a time stamp like those before" in found.bad[0][1]
 
 
+@pytest.mark.parametrize("back", [1.5, 3600.0])
+def test_a_clock_that_is_set_back_is_reported_and_its_rows_count(back):
+    times = np.arange(0, 20, 0.5)
+    times[7:] -= back
+    times[23:] -= back
+    lines = ["t,u,y", *(f"{t},{k},2" for k, t in enumerate(times))]
+    found = reader().read(lines)
+    assert found.error == "" and found.u.ravel().tolist() == list(range(40)) and found.bad == []
+    assert len(found.remarks) == 2 and f"line 9: the time stamp {times[7]}" in found.remarks[0]
+    assert "was set back" in found.remarks[0] and found.lines.tolist() == list(range(2, 42))
+    times[30:] += 2.0  # a gap is none of this
+    lines = ["t,u,y", *(f"{t},{k},2" for k, t in enumerate(times))]
+    assert "--fill-gaps" in reader().read(lines).error and len(reader().read(lines).y) == 30
+    filled = reader(fill=4).read(lines)
+    assert len(filled.y) == 44 and np.isnan(filled.y[30:34]).all() and len(filled.remarks) == 2
+    assert "comes 0 after" in reader().read(["t,u,y", "0,1,2", "0,1,2"]).error
+
+
+def test_many_gaps_and_clocks_in_one_block_are_one_loop():
+    times = np.cumsum(np.where(np.arange(3000) % 2, 1.0, 0.5))
+    assert len(reader(fill=1).read(["t,u,y", *(f"{t},1,2" for t in times)]).y) == 4500
+    odd = [f"{t},1,2" for t in np.tile([1.0, 0.5], 1500)]
+    assert len(reader().read(["t,u,y", *odd[:2]]).remarks) == 1
+
+
 def test_reading_goes_on_where_it_stopped():
     first = reader()
     first.read(["t,u,y", "0,1,2", "bad"])
@@ -232,6 +257,27 @@ def test_reading_goes_on_where_it_stopped():
     again.resume(json.loads(json.dumps(first.memory)))
     found = again.read(["1.0,1,2"])  # one row, of which no stamp is known, lies between
     assert found.error == "" and found.lines.tolist() == [4]
+
+
+@pytest.mark.parametrize("text", [
+    "t;u;y\ns;V;mV\n10,0;1;2\n10,5;1,5;2\n11,0;1;2,5\n\n12,0;1;2\n",
+    "date\tu\ty\n03.04.2024 12:00:00.0\t1\t2\n03.04.2024 12:00:00.5\t1\t2\n03.04.2024 12:00:01.0\t1\t2\n",
+    "time,u,y\n23:59:59.0,1,2\n23:59:59.5,1,2\n00:00:00.0,1,2\n00:00:00.5,3,4\n"])
+def test_reading_goes_on_in_the_format_that_was_found(text):
+    how = {"how": Format(decimal="," if ";" in text else ".", date_format="%d.%m.%Y %H:%M:%S.%f" if "date" in text
+                         else None)}
+    lines = text.splitlines()
+    whole = reader(**how).read(lines)
+    assert whole.error == "" and len(whole.y) >= 3 and not np.isnan(whole.y[:3]).any()
+    for cut in range(1, len(lines)):
+        first, again = reader(**how), reader(**how)
+        before = first.read(lines[:cut])
+        again.resume(json.loads(json.dumps(first.memory)))
+        after = again.read(lines[cut:])
+        for word in ("values", "lines"):
+            both = np.concatenate([getattr(before, word), getattr(after, word)])
+            assert np.array_equal(both, getattr(whole, word), equal_nan=True), (cut, word)
+        assert after.error == "" and before.bad + after.bad == whole.bad
 
 
 def test_a_decimal_mark_that_is_the_delimiter_needs_quotes():

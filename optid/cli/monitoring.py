@@ -4,12 +4,18 @@ import json
 import os
 import signal
 import sys
+import time as clock
+from collections.abc import Iterator
+from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
+
+if TYPE_CHECKING:
+    from optid.cli.state_file import StateFile
 
 LOUD = 20  # unreadable rows reported individually per block read; the others are counted
 
@@ -17,6 +23,10 @@ ARL0 = 10_000
 """Default mean number of samples between false alarms."""
 
 REMEMBERED = 1000  # samples whose time stamps are kept, for the time of an onset
+
+Part = tuple[list[bytes], str]  # lines, and a remark where another file begins
+
+RETRY = 10.0  # seconds until a failed write is tried again, events or not
 
 KEPT = 10_000  # samples after which the state is saved, events or not
 
@@ -53,40 +63,43 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         lines (--json): Print one JSON object per line.
     """
     from optid.cli import arguments as words
+    from optid.cli.state_file import StateFile
     from optid.data.reading.format import Format
     from optid.data.reading.rows import RowReader
     from optid.errors import DataError
 
-    check_folders(state, thresholds)
-    with hearing() as heard, Waiting() as waiting:
-        waiting.step("reading")
-        plant = words.state_space_model(model)
-        how = words.as_modelled(how, plant)
-        reading = words.reading(how)
-        channels = {key: reading.pop(key) for key in ("inputs", "outputs", "dt", "time")}
-        if reading.pop("experiment") is not None:
-            raise DataError("a stream of rows is one experiment; leave --experiment out")
-        reader = RowReader(**channels, how=Format(**reading), fill=fill_gaps or 0,
-                           label="standard input" if follow is None else follow.name)
-        if state is not None and state.exists():
-            watcher = _resumed(state, plant, model)
-        else:
-            waiting.step("simulating healthy plants for the thresholds")
-            origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
-            if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
-                origin = sound = _identified_from(model)
-            watcher = _new(
-                plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
-                window=window, seed=seed, healthy=sound, uncertainty=origin, extrapolate=extrapolate,
-            )
-            if sound is None and origin is not None:
-                _doubt(plant, origin)
-            elif sound is None and thresholds is None:
-                note("the thresholds assume an exact model and white innovations: give the record from which it was "
-                     "identified (--identified FILE...) and a later healthy record (--healthy FILE...)")
-    for sentence in heard:
-        note(sentence)
-    _Watch(watcher, reader, follow, state, strict=strict, as_json=lines).run(until_end)
+    check_folders(thresholds)
+    check_folders(state, writable=False)
+    with nullcontext() if state is None else StateFile(state) as kept:
+        with hearing() as heard, Waiting() as waiting:
+            waiting.step("reading")
+            plant = words.state_space_model(model)
+            how = words.as_modelled(how, plant)
+            reading = words.reading(how)
+            channels = {key: reading.pop(key) for key in ("inputs", "outputs", "dt", "time")}
+            if reading.pop("experiment") is not None:
+                raise DataError("a stream of rows is one experiment; leave --experiment out")
+            reader = RowReader(**channels, how=Format(**reading), fill=fill_gaps or 0,
+                               label="standard input" if follow is None else follow.name)
+            if kept is not None and not kept.is_empty:
+                watcher = _resumed(kept.path, plant, model)
+            else:
+                waiting.step("simulating healthy plants for the thresholds")
+                origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
+                if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
+                    origin = sound = _identified_from(model)
+                watcher = _new(
+                    plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
+                    window=window, seed=seed, healthy=sound, uncertainty=origin, extrapolate=extrapolate,
+                )
+                if sound is None and origin is not None:
+                    _doubt(plant, origin)
+                elif sound is None and thresholds is None:
+                    note("the thresholds assume an exact model and white innovations: give the record from which it "
+                         "was identified (--identified FILE...) and a later healthy record (--healthy FILE...)")
+        for sentence in heard:
+            note(sentence)
+        _Watch(watcher, reader, follow, kept, strict=strict, as_json=lines).run(until_end)
 
 
 def _identified_from(path: Path) -> Any:
@@ -125,6 +138,7 @@ def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | No
     from optid.errors import ModelFileError, StructureError
     from optid.faults import Calibration, Monitor, dictionary
     from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
+    from optid.models.files import complete
 
     found = dictionary(plant, kinds=kinds or list(KINDS_BY_DEFAULT), process=process, state_jump=state_jump)
     if path is not None and path.exists():
@@ -138,7 +152,8 @@ def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | No
         return Monitor(plant, found, thresholds=known, **how)
     made = Monitor(plant, found, ARL0 if arl0 is None else arl0, **how)
     if path is not None:
-        path.write_text(json.dumps(made.calibration.to_dict(), indent=1), encoding="utf-8")
+        with complete(path) as part:
+            part.write_text(json.dumps(made.calibration.to_dict(), indent=1), encoding="utf-8")
     return made
 
 
@@ -152,56 +167,114 @@ def _resumed(state: Path, plant: Any, path: Path) -> Any:
     return found
 
 
-class _Watch:
-    """Reads the stream, runs the monitor and prints its events."""
+class _Signals:
+    """SIGTERM and SIGINT as a request to stop, which interrupts waiting, but no processing.
 
-    def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: Path | None, *, strict: bool,
+    A second signal interrupts anything: what was not saved then is processed again when the stream is resumed.
+    """
+
+    def __init__(self) -> None:
+        self._waiting = self._arrived = False
+
+    def __enter__(self) -> Self:
+        wanted = [number for number in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(number) != signal.SIG_IGN]
+        self._former = {number: signal.signal(number, self._arrive) for number in wanted}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+
+    def _arrive(self, *_: object) -> None:
+        if self._waiting or self._arrived:
+            raise KeyboardInterrupt
+        self._arrived = True
+
+    def ignore(self) -> None:
+        """Let the processing come to its end."""
+        for number in self._former:
+            signal.signal(number, signal.SIG_IGN)
+
+    def until_stopped(self, parts: Iterator[Part]) -> Iterator[Part]:
+        """Yield the parts until a signal arrives: `KeyboardInterrupt`."""
+        while True:
+            self._waiting = True
+            if self._arrived:
+                raise KeyboardInterrupt
+            part = next(parts, None)
+            self._waiting = False
+            if part is None:
+                return
+            yield part
+
+
+class _Watch:
+    """Reads the stream, runs the monitor and prints its events.
+
+    Position of the stream, state of the monitor and counts belong together: they change while a block is processed and
+    are saved between blocks only. The saved state is replaced right after its last events have been printed: a process
+    that is killed just between the two prints these once more.
+    """
+
+    def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: "StateFile | None", *, strict: bool,
                  as_json: bool) -> None:
         from optid.cli.following import Followed
         from optid.errors import DataError
 
         self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
-        self.plant = (watcher.source or {}).get("model") or watcher.dictionary.model.to_dict()
-        self.bad, self.saved, kept = 0, watcher.samples, (watcher.source or {}).get("place")
-        self.stamps = {int(sample): stamp for sample, stamp in (watcher.source or {}).get("stamps", [])}
-        if kept is not None and follow is not None:
-            if kept["path"] != str(follow.resolve()):
-                raise DataError(f"{state} is the state of {kept['path']}, not of {follow}: name another file")
-            reader.resume(watcher.source)
-        self.file = None if follow is None else Followed(follow, None if kept is None else kept)
+        source = watcher.source or {}
+        self.plant = source.get("model") or watcher.dictionary.model.to_dict()
+        self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
+        self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
+        self.lines: list[str] = []  # of events that are not printed yet
+        self._is_whole, self._is_printing, self.failed = True, False, 0.0
+        if self.place is not None and follow is not None:
+            if self.place["path"] != str(follow.resolve()):
+                raise DataError(f"{state and state.path} is the state of {self.place['path']}, not of {follow}: name "
+                                "another file")
+            reader.resume(source)
+        self.file = None if follow is None else Followed(follow, self.place)
 
     def run(self, until_end: bool) -> None:
         from optid.cli.following import standard_input
 
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
         # with a state the last line may still be completed, so that it is read by the next run
         parts = standard_input() if self.file is None else self.file.lines(until_end, partial=self.state is None)
-        try:
-            for raw, fresh in parts:
-                if fresh:
-                    note(fresh)
-                    self.reader.begin_file()
-                self._take_in(raw)
-        except KeyboardInterrupt:
-            pass
-        except BrokenPipeError:  # the reader of the events has ended
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        finally:
-            self._keep()
+        with _Signals() as signals:
+            try:
+                if self.state is not None:  # a state that cannot be written is noticed at once
+                    self._keep()
+                for raw, fresh in signals.until_stopped(parts):
+                    self._take_in(raw, fresh)
+            except KeyboardInterrupt:
+                pass
+            except BrokenPipeError:  # the reader of the events has ended
+                self._is_whole = False
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            finally:
+                signals.ignore()
+                if self._is_whole:
+                    self._keep()
+                if self.failed and self.state is not None:
+                    _note(f"the last state that could be saved is that of sample {self.saved}")
         if not self.watcher.samples:
-            note("no sample was read: no rows follow the header")
+            _note("no sample was read: no rows follow the header")
         if self.bad:
-            note(f"{self.bad} of {self.watcher.samples} rows were unreadable in part or in full")
+            _note(f"{self.bad} of {self.watcher.samples} rows were unreadable in part or in full")
 
-    def _take_in(self, raw: list[bytes]) -> None:
+    def _take_in(self, raw: list[bytes], fresh: str) -> None:
         from optid.errors import DataError
 
+        self._is_whole = False
+        if fresh:
+            _note(fresh)
+            self.reader.begin_file()
         first, line = self.watcher.samples, self.reader.line
         rows = self.reader.read([part.removesuffix(b"\r").decode("utf-8", "replace") for part in raw])
         if self.strict and rows.bad:
             raise DataError(rows.bad[0][1])
-        for _, text in rows.bad[:LOUD]:
-            note(text)
+        for text in [text for _, text in rows.bad[:LOUD]] + list(rows.remarks[:LOUD]):
+            _note(text)
         self.bad += len({number for number, _ in rows.bad})
         self._remember(first, rows.stamps)
         events = self.watcher.run(rows.u, rows.y)
@@ -210,10 +283,13 @@ class _Watch:
         if self.file is not None:  # a line that ends the stream is the first to be read when it is resumed
             done = raw[: rows.stop - line - 1] if rows.error else raw
             self.file.advance(sum(map(len, done)) + len(done), done)
+            self.place = dict(self.file.place)
+        self._is_whole = True
+        due = bool(self.failed) or self.watcher.samples - self.saved >= KEPT
+        if events or (due and clock.monotonic() - self.failed >= RETRY):
+            self._keep()
         if rows.error:
             raise DataError(rows.error)
-        if events or self.watcher.samples - self.saved >= KEPT:
-            self._keep()
 
     def _remember(self, first: int, stamps: list[str]) -> None:
         """Keep the time stamps of the last samples: an event names the onset, which lies before it."""
@@ -222,19 +298,48 @@ class _Watch:
             self.stamps = dict([*self.stamps.items()][-REMEMBERED - len(stamps):])
 
     def _keep(self) -> None:
-        if self.state is not None:
-            place = None if self.file is None else self.file.place
-            self.watcher.source = {"model": self.plant, "place": place, "stamps": [*self.stamps.items()][-REMEMBERED:],
-                                   **self.reader.memory}
-            self.watcher.save(self.state)
-            self.saved = self.watcher.samples
+        """Print the events of the last block and replace the saved state; where that fails, it is tried again later."""
+        try:
+            if self.state is None:
+                self._print()
+            else:
+                self.watcher.source = {"model": self.plant, "place": self.place, "bad": self.bad,
+                                       "stamps": [*self.stamps.items()][-REMEMBERED:], **self.reader.memory}
+                self.state.replace(self.watcher.save, self._print)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            if not self.failed:
+                what = "the events" if self.state is None or self._is_printing else f"the state {self.state.path}"
+                _note(f"{what} cannot be written ({error.strerror or error}): monitoring goes on, and writing is tried "
+                      "again")
+            self.failed = clock.monotonic()
+            with suppress(OSError):  # events need no state
+                self._print()
+            return
+        if self.failed:
+            _note(f"writing works again from sample {self.watcher.samples} on")
+        self.failed, self.saved = 0.0, self.watcher.samples
+
+    def _print(self) -> None:
+        text, self.lines, self._is_printing = "".join(self.lines), [], True
+        sys.stdout.write(text)
+        sys.stdout.flush()
+        self._is_printing = False
 
     def _tell(self, event: Any, line: int) -> None:
         stamp, onset = self.stamps.get(event.sample), self.stamps.get(event.onset)
         if self.as_json:
-            print(json.dumps({**event.to_dict(), "line": line, "time": stamp, "onset_time": onset}), flush=True)
+            text = json.dumps({**event.to_dict(), "line": line, "time": stamp, "onset_time": onset})
         else:
-            print(f"sample {event.in_words(_in_words(stamp), _in_words(onset))}", flush=True)
+            text = f"sample {event.in_words(_in_words(stamp), _in_words(onset))}"
+        self.lines.append(text + "\n")
+
+
+def _note(text: str) -> None:
+    """Print a warning; an error stream that cannot be written ends no monitor."""
+    with suppress(OSError):
+        note(text)
 
 
 def _in_words(stamp: str | None) -> str:

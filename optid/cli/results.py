@@ -51,15 +51,15 @@ def reading_for(model: Any, how: Mapping[str, Any]) -> dict[str, Any]:
     return as_modelled(how, model) | ({"dt": how["dt"]} if counts_samples else {})
 
 
-def check_folders(*paths: Path | None) -> None:
-    """Refuse files that cannot be written (`DataError`) before any work is done."""
+def check_folders(*paths: Path | None, writable: bool = True) -> None:
+    """Refuse files without a folder, and read-only ones if `writable` (`DataError`), before any work is done."""
     for path in (path for path in paths if path is not None):
         folder = path.absolute().parent
         if not folder.is_dir():
             raise DataError(f"{path} cannot be written: there is no folder {folder}")
         if path.is_dir():
             raise DataError(f"{path} cannot be written: it is a folder; name a file in it")
-        if not os.access(path if path.exists() else folder, os.W_OK):
+        if writable and not os.access(path if path.exists() else folder, os.W_OK):
             raise DataError(f"{path} cannot be written: {'it' if path.exists() else f'folder {folder}'} is "
                             "read-only; give a file in another folder")
 

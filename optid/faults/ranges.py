@@ -1,7 +1,9 @@
-"""Inputs outside the range over which a nonlinearity was identified, where the effect of the actuator is unknown.
+"""Inputs outside the range over which a function was identified, where the effect of the actuator is unknown.
 
-At such samples the effect f(u) is modelled as a disturbance of unlimited variance, which is removed from innovations
-and signatures like the unknown initial state.
+A linear function is extrapolated, for which the covariance of its parameters accounts, up to `FAR` half ranges from the
+middle of its range; a nonlinear one is known inside its range. Beyond, the effect f(u) is modelled as a disturbance of
+unlimited variance, which is removed from innovations and signatures like the unknown initial state. A record in which a
+linear input stays there, or which is outside too often, is used up to that sample.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from optid.arrays import Array
-from optid.bases import UserFunctions
+from optid.bases import Linear, UserFunctions
 from optid.errors import DataError
 from optid.models.model import impulse_response
 
@@ -28,6 +30,12 @@ REACH = 50
 MOST = 400
 """Largest number of samples outside."""
 
+FAR = 1.5
+"""Distance from the middle of the range, in half ranges, up to which a linear function is extrapolated."""
+
+STAY = 3
+"""Samples in a row outside, from which on a record is not used."""
+
 
 class Outside(NamedTuple):
     """An input that leaves its range.
@@ -36,20 +44,22 @@ class Outside(NamedTuple):
         name: of the input.
         column: function of the input.
         interval: its range.
-        samples: where it is outside.
+        samples: where it is outside; for a linear function, where it is too far outside.
+        is_linear: whether the function is linear.
     """
 
     name: str
     column: int
     interval: tuple[float, float]
     samples: np.ndarray
+    is_linear: bool
 
     def __str__(self) -> str:
         """State the input, the range and the samples."""
         low, high = self.interval
         return (
-            f"{self.name} is outside the identified range [{low:.4g}, {high:.4g}] in {self.samples.size} samples, "
-            f"first in sample {self.samples[0]}: its effect there is not judged."
+            f"{self.name} is {'far ' * self.is_linear}outside the identified range [{low:.4g}, {high:.4g}] in "
+            f"{self.samples.size} samples, first in sample {self.samples[0]}: its effect there is not judged."
         )
 
 
@@ -59,13 +69,58 @@ def outside(model: "HammersteinSS", u: Array) -> list[Outside]:
     A function without an interval, or one that the user gave, is known everywhere.
     """
     found = []
-    for column, (low, high) in enumerate(zip(*known_range(model))):
+    for column, (low, high) in enumerate(zip(*usable_range(model))):
         x = u[:, model.input_of[column]]
         samples = np.flatnonzero((x < low) | (x > high))
         if samples.size:
-            interval = model.nonlinearities[column].basis.interval or (low, high)
-            found.append(Outside(model.inputs[model.input_of[column]], column, interval, samples))
+            basis = model.nonlinearities[column].basis
+            found.append(Outside(model.inputs[model.input_of[column]], column, basis.interval or (low, high), samples,
+                                 isinstance(basis, Linear)))
     return found
+
+
+def usable_range(model: "HammersteinSS") -> tuple[Array, Array]:
+    """Return (low, high), both (K,): `known_range`, and for linear functions how far they are extrapolated."""
+    low, high = known_range(model)
+    for column, f in enumerate(model.nonlinearities):
+        if isinstance(f.basis, Linear) and f.basis.interval is not None:
+            middle, half = np.mean(f.basis.interval), (f.basis.interval[1] - f.basis.interval[0]) / 2
+            low[column], high[column] = middle - FAR * half, middle + FAR * half
+    return low, high
+
+
+def extrapolated(model: "HammersteinSS", u: Array) -> list[str]:
+    """State the inputs (N, m) whose linear functions are extrapolated, and since when."""
+    (low, high), notes = known_range(model), []
+    for column, f in enumerate(model.nonlinearities):
+        x = u[:, model.input_of[column]]
+        samples = np.flatnonzero((x < low[column]) | (x > high[column]))
+        if samples.size and isinstance(f.basis, Linear) and f.basis.interval is not None:
+            first, last = f.basis.interval
+            notes.append(f"{model.inputs[model.input_of[column]]} leaves the identified range [{first:.4g}, "
+                         f"{last:.4g}], first in sample {samples[0]}: its linear function is extrapolated.")
+    return notes
+
+
+def usable_samples(model: "HammersteinSS", u: Array) -> tuple[int, str]:
+    """Return how many samples of inputs (N, m) are used, and why not all of them; "" where all are.
+
+    Raises:
+        DataError: fewer samples than a diagnosis of the model needs.
+    """
+    there = outside(model, u)
+    too_many = sum(one.samples.size for one in there) > min(MOST, len(u) // 2)
+    stays = [(one.samples[k], one) for one in there if one.is_linear or too_many
+             for k in np.flatnonzero(one.samples[STAY - 1 :] - one.samples[: 1 - STAY] == STAY - 1)[:1]]
+    if not stays:
+        return len(u), ""
+    count, one = min(stays, key=lambda stay: stay[0])
+    if count < 2 * model.nx + 2:
+        raise DataError(f"{one} It stays there from sample {count} on, and {count} samples before are too few for "
+                        "a diagnosis: identify the model over the wider range.")
+    return int(count), (f"The record is used up to sample {count - 1}: {one.name} then stays "
+                        f"{'far ' * one.is_linear}outside its identified range [{one.interval[0]:.4g}, "
+                        f"{one.interval[1]:.4g}].")
 
 
 def known_range(model: "HammersteinSS") -> tuple[Array, Array]:

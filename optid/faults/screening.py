@@ -1,7 +1,6 @@
 """Checks of a record before any statistics: flat lines, swapped channels, changes of unit."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import permutations, product
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +9,12 @@ import numpy as np
 from optid.arrays import as_list
 from optid.data.record import Data
 from optid.errors import DataError
+from optid.faults.readings import LostReadings, lost_readings
 from optid.faults.whitening import predictor, whiten
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
-
-FLAT = 3
-"""Number of identical readings that is not a coincidence with continuous noise."""
 
 UNITS = (1000.0, 100.0, 60.0, 25.4, 10.0, 9.81, 9 / 5, np.pi / 180)
 FACTORS = (*UNITS, *(1 / unit for unit in UNITS))
@@ -27,55 +24,10 @@ BETTER = 0.1
 """Share of the energy of the innovations below which another order or unit of the channels is accepted."""
 
 
-@dataclass(frozen=True)
-class FlatLine:
-    """A sensor that repeats one reading exactly.
-
-    Attributes:
-        name: "sensor:y1".
-        experiment: index of the experiment.
-        first: first sample of the run of equal readings.
-        count: their number.
-        value: the reading.
-    """
-
-    name: str
-    experiment: int
-    first: int
-    count: int
-    value: float
-
-    def __str__(self) -> str:
-        """State sensor, reading and samples."""
-        return f"{self.name}: {self.count} readings of exactly {self.value:.6g} from sample {self.first} on"
-
-
-def flat_lines(data: Data, at_least: int = FLAT) -> tuple[FlatLine, ...]:
-    """Find runs of identical readings; a missing reading ends a run.
-
-    A sensor whose resolution is coarser than its noise repeats readings when healthy: an output with fewer than ten
-    different readings per hundred outside its longest run is left out.
-
-    Args:
-        data: the record.
-        at_least: length of the shortest run reported.
-    """
-    found = []
-    for number, part in enumerate(data.experiments):
-        for name, y in zip(data.outputs, part.y.T):
-            starts, counts = _runs(y)
-            if not counts.size:
-                continue
-            longest = int(counts.argmax())
-            rest = np.delete(y, slice(starts[longest], starts[longest] + counts[longest]))
-            rest = rest[~np.isnan(rest)]
-            if rest.size and np.unique(rest).size < 0.1 * rest.size:
-                continue
-            found += [
-                FlatLine(f"sensor:{name}", number, int(k), int(c), float(y[k]))
-                for k, c in zip(starts, counts) if c >= at_least
-            ]
-    return tuple(found)
+def flat_lines(data: Data) -> tuple[LostReadings, ...]:
+    """Find sensors that repeat one reading more often than their resolution explains: frozen or saturated ones."""
+    found = [lost_readings(part.y, data.outputs, number) for number, part in enumerate(data.experiments)]
+    return tuple(line for lines in found for line in lines if line.condition != "dead")
 
 
 def check_channels(model: "HammersteinSS", data: Data) -> None:
@@ -154,11 +106,3 @@ def _energy(model: "HammersteinSS", data: Data) -> float:
     except DataError:
         return float("inf")
     return float(sum(np.sum(part.r**2) for part in found))
-
-
-def _runs(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First samples and lengths of the runs of equal readings; missing ones are skipped."""
-    edges = np.flatnonzero(np.concatenate([[True], y[1:] != y[:-1]]))
-    counts = np.diff(np.append(edges, y.size))
-    there = ~np.isnan(y[edges])
-    return edges[there], counts[there]

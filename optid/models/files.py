@@ -1,10 +1,11 @@
 """Files without code: models as JSON with every digit, the states of what runs on as npz, restored bit for bit."""
 
+import io
 import json
 import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +62,15 @@ def write(content: dict[str, Any], path: str | Path, form: str, version: int) ->
 
 @contextmanager
 def complete(path: Path) -> Iterator[Path]:
-    """Give a path to write to, which becomes the file at the end: an interrupted write leaves no half of it."""
+    """Give a path to write to, which becomes the file at the end: a failed write leaves neither half of it."""
     part = path.with_name(path.name + ".part")
-    yield part
-    os.replace(part, path)
+    try:
+        yield part
+        os.replace(part, path)
+    except BaseException:
+        with suppress(OSError):
+            part.unlink()
+        raise
 
 
 def read(path: str | Path, form: str, version: int, build: Callable[[dict[str, Any]], Any]) -> Any:
@@ -123,8 +129,10 @@ def write_state(path: str | Path, kind: str, version: int, head: Mapping[str, An
     """Write the state of a `kind` of estimator: a head of JSON types, and arrays by name; it replaces an older file."""
     path = Path(path)
     content = json.dumps({"optid": kind, "version": version, **head})
-    with complete(path) as part, part.open("wb") as file:
-        np.savez(file, head=np.array(content), **arrays)
+    buffer = io.BytesIO()  # an archive on a full disk cannot be closed
+    np.savez(buffer, head=np.array(content), **arrays)
+    with complete(path) as part:
+        part.write_bytes(buffer.getvalue())
     return path
 
 

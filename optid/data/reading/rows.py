@@ -16,6 +16,8 @@ from optid.errors import DataError
 
 LARGEST = 1e100  # larger numbers are not samples: they would overflow in later computations
 
+DAY = 86400.0  # seconds
+
 
 class Rows(NamedTuple):
     """Rows of samples."""
@@ -27,6 +29,7 @@ class Rows(NamedTuple):
     bad: list[tuple[int, str]]  # (line, message) of rows that could not be read and count as missing samples
     error: str = ""  # why the stream ends after these rows; empty if it continues
     stop: int = 0  # the line of the error
+    remarks: tuple[str, ...] = ()  # on rows that count as they are
 
     @property
     def u(self) -> Array:
@@ -94,19 +97,25 @@ class RowReader:
     @property
     def memory(self) -> dict[str, Any]:
         """The state from which to resume, in JSON types."""
-        last = None if self._last is None else str(self._last[0])
+        last = None if self._last is None else [self._last.dtype.str, self._last.view(np.int64).tolist()]
+        clock = self._reads and [self._reads.kind, self._reads.scale, self._reads.origin, list(self._reads.forms)]
         return {
-            "line": self.line, "names": self._names, "last": last, "since": self._since, "blank": list(self._blank)
+            "line": self.line, "names": self._names, "last": last, "since": self._since, "blank": list(self._blank),
+            "delimiter": self._delimiter, "texts": self._texts, "clock": clock,
         }
 
     def resume(self, memory: Mapping[str, Any]) -> None:
         """Resume from the state `memory`."""
         self.line, self._since, self._blank = int(memory["line"]), int(memory["since"]), list(memory["blank"])
+        self._delimiter, self._texts = str(memory["delimiter"]), int(memory["texts"])
+        if memory["clock"] is not None:
+            kind, scale, origin, forms = memory["clock"]
+            self._reads = TimeColumn(("time",), kind, self._how, scale, origin, tuple(forms))
         if memory["names"] is not None:
             self._known(list(memory["names"]))
         if memory["last"] is not None:
-            text = str(memory["last"])
-            self._last = np.array([float(text)]) if is_number(text) else np.array([text], dtype="M8[ns]")
+            kind, bits = memory["last"]
+            self._last = np.array(bits, dtype=np.int64).view(kind)
 
     def begin_file(self) -> None:
         """Expect the header of another file; its time stamps may start again."""
@@ -237,41 +246,55 @@ class RowReader:
         return row, self._stamp(cells), wrong
 
     def _timed(self, rows: Rows) -> Rows:
-        """Check the time stamps; cut before the first bad one, or fill the gap there."""
-        marks = np.flatnonzero([bool(stamp) for stamp in rows.stamps])
-        if not marks.size:
-            self._since += len(rows.lines)
-            return rows
-        try:
-            read = self._stamps([rows.stamps[k] for k in marks])
-        except DataError:
-            read = np.full(1, np.nan)
-        if not np.isfinite(read).all() or (self._last is not None and read.dtype != self._last.dtype):
-            return self._timed(self._without_odd_stamps(rows))
-        steps = seconds(np.diff(np.concatenate([read[:1] if self._last is None else self._last, read])))
-        # samples since the stamp before; rows without a stamp count
-        since = np.diff(np.concatenate([[marks[0] if self._last is None else -1 - self._since], marks]))
-        wrong = np.abs(steps - since * self._dt) > self._how.time_tolerance * self._dt
-        if not wrong.any():
-            self._last, self._since = read[-1:], len(rows.lines) - 1 - int(marks[-1])
-            return rows
-        at = int(np.argmax(wrong))
-        row, extra = int(marks[at]), steps[at] / self._dt - since[at]
-        lost = int(round(extra)) if abs(extra - round(extra)) <= self._how.time_tolerance else 0
-        if self._fill and lost >= 1:
+        """Check the time stamps; fill gaps, report a clock that was set back, and cut before any other bad stamp."""
+        done: list[Rows] = []
+        while len(rows.lines):
+            marks = np.flatnonzero([bool(stamp) for stamp in rows.stamps])
+            if not marks.size:
+                self._since += len(rows.lines)
+                break
+            try:
+                read = self._stamps([rows.stamps[k] for k in marks])
+            except DataError:
+                read = np.full(1, np.nan)
+            if not np.isfinite(read).all() or (self._last is not None and read.dtype != self._last.dtype):
+                rows = self._without_odd_stamps(rows)
+                continue
+            steps = seconds(np.diff(np.concatenate([read[:1] if self._last is None else self._last, read])))
+            if read.dtype.kind == "m":  # times of day begin again at midnight
+                steps = (steps + DAY / 2) % DAY - DAY / 2
+            # samples since the stamp before; rows without a stamp count
+            since = np.diff(np.concatenate([[marks[0] if self._last is None else -1 - self._since], marks]))
+            wrong = np.abs(steps - since * self._dt) > self._how.time_tolerance * self._dt
+            if not wrong.any():
+                self._last, self._since = read[-1:], len(rows.lines) - 1 - int(marks[-1])
+                break
+            at = int(np.argmax(wrong))
+            row, extra = int(marks[at]), steps[at] / self._dt - since[at]
+            lost = int(round(extra)) if abs(extra - round(extra)) <= self._how.time_tolerance else 0
+            stop = int(rows.lines[row])
+            where = f"line {stop}: the time stamp {rows.stamps[row]} comes {steps[at]:.6g} after the one before"
+            if not (steps[at] < 0 or (self._fill and lost >= 1)):
+                advice = " Pass --fill-gaps to count lost samples as missing." if lost >= 1 else ""
+                rows = rows.cut(0, row)._replace(bad=[one for one in rows.bad if one[0] < stop], stop=stop, error=(
+                    f"{self._label}, {where}, the sampling time of the model is {self._dt:g}. Resample the stream, or "
+                    f"ignore the stamps with --time none.{advice}"))
+                break
             self._last, self._since = read[at : at + 1], 0
-            count, rest = min(lost, self._fill), self._timed(rows.cut(row + 1))
-            return rest._replace(
-                values=np.vstack([rows.values[:row], np.full((count, rows.values.shape[1]), np.nan),
-                                  rows.values[row : row + 1], rest.values]),
-                lines=np.concatenate([rows.lines[:row], np.zeros(count, int), rows.lines[row : row + 1], rest.lines]),
-                stamps=[*rows.stamps[:row], *[""] * count, rows.stamps[row], *rest.stamps])
-        advice = " Pass --fill-gaps to count lost samples as missing." if lost >= 1 else ""
-        stop = int(rows.lines[row])
-        return rows.cut(0, row)._replace(bad=[one for one in rows.bad if one[0] < stop], stop=stop, error=(
-            f"{self._label}, line {stop}: the time stamp {rows.stamps[row]} comes {steps[at]:.6g} after the one "
-            f"before, the sampling time of the model is {self._dt:g}. Resample the stream, or ignore the stamps with "
-            f"--time none.{advice}"))
+            done.append(rows.cut(0, row))
+            if steps[at] < 0:
+                rows = rows._replace(remarks=(*rows.remarks, f"{where}: the clock was set back. The rows count as "
+                                              "consecutive samples."))
+            else:
+                count = min(lost, self._fill)
+                done.append(Rows(np.full((count, rows.values.shape[1]), np.nan), rows.m, np.zeros(count, int),
+                                 [""] * count, []))
+            done.append(rows.cut(row, row + 1))
+            rows = rows.cut(row + 1)
+        done.append(rows)
+        return rows._replace(values=np.vstack([part.values for part in done]),
+                             lines=np.concatenate([part.lines for part in done]),
+                             stamps=[stamp for part in done for stamp in part.stamps])
 
     def _without_odd_stamps(self, rows: Rows) -> Rows:
         """Treat rows with unreadable time stamps as rows without one."""

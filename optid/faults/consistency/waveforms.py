@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array, check_probability
 from optid.data.record import Data
 from optid.errors import DataError, LookupFailed, StructureError, nearest
-from optid.faults.screening import FlatLine, flat_lines
+from optid.faults.readings import LostReadings
+from optid.faults.screening import flat_lines
 from optid.faults.signatures import Candidate, Dictionary
 from optid.faults.whitening import Whitened, check_window
 
@@ -61,7 +62,7 @@ class WaveformTest:
     healthy: Consistency
     onset: int
     untested: dict[str, str] = field(default_factory=dict)
-    flat: tuple[FlatLine, ...] = ()
+    flat: tuple[LostReadings, ...] = ()
 
     @property
     def consistent(self) -> tuple[str, ...]:

@@ -97,6 +97,8 @@ def _stuck(found: Explanation, first: int) -> Explanation:
     slope[:, first] = 1.0
     covariances = found.covariances - np.einsum(
         "ki,kj,k->kij", slope, slope, found.covariances[:, first, first])
+    each = np.arange(covariances.shape[1])  # a magnitude that the share determines has no variance, but for rounding
+    covariances[:, each, each] = np.maximum(covariances[:, each, each], EXACT * found.covariances[:, each, each])
     covariances[:, first, first] = EXACT
     return found._replace(
         logs=_all_lost(found, first), sizes=found.sizes + slope * (1 - share)[:, None], covariances=covariances,

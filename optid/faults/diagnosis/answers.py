@@ -37,7 +37,7 @@ class Estimate:
         label: its label; that of the whole group where its members are not isolable from each other.
         name: its place, as in `Fault`; of a group the first member.
         kind: a kind of the dictionary ("bias", "loss", "stuck", "jump", "drift", "frozen", "noise", "spike",
-            "schedule").
+            "schedule"), or "saturated" or "dead" of a sensor.
         candidate: the entry of the dictionary; read from a file, without the matrices of a scheduled change.
         onset: most probable first sample that it changes.
         onset_interval: first and last sample of its interval.
@@ -45,9 +45,10 @@ class Estimate:
             is known; it is then "at or before" the end of its interval (or "at or after" its start).
         size: (d,) estimates of the magnitudes: size of a bias, slope of a drift, jump of the state, share lost of a
             loss, share lost and constants added of a stuck actuator, standard deviation of an added noise, reading of a
-            frozen sensor, share of a scheduled change; NaN where only the interval is known.
-        size_interval: (d, 2) intervals that account for the search for the onset; not clipped: the interval of a share
-            lost may exceed one.
+            frozen or saturated sensor, share of a scheduled change; NaN where only the interval is known; none of a
+            dead sensor.
+        size_interval: (d, 2) intervals that account for the search for the onset; shares lost and their intervals lie
+            between 0 and 1.
         covariance: (d, d) of the size, with the spread over the onsets.
         deflection: norm of the whitened signature.
         effect: {output: steady-state change} of a lasting disturbance whose direction was estimated.

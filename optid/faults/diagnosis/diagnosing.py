@@ -16,15 +16,15 @@ from optid.faults.diagnosis.posterior import estimates
 from optid.faults.diagnosis.ranking import NOTHING, Fit, find
 from optid.faults.diagnosis.record_search import Question, RecordSearch, search_record
 from optid.faults.diagnosis.records import (
-    frozen,
+    lost_sensors,
     plant_of,
     record_of,
     steady_predictor,
     uncertainty_of,
-    without_flat_lines,
+    without_lost_readings,
 )
 from optid.faults.nuisance import uncertain_start
-from optid.faults.ranges import outside
+from optid.faults.ranges import extrapolated, outside, usable_samples
 from optid.faults.screening import check_channels
 from optid.faults.search.calibration import Thresholds
 from optid.faults.signatures import Dictionary, dictionary
@@ -115,11 +115,13 @@ def _judged(record: Data, number: int, found: Dictionary, asked: Question, noise
           ) -> Diagnosis:
     """Return the diagnosis of an experiment; `noise` are arguments of `whiten`, and the remark is reported."""
     model = found.model
-    part, lines = without_flat_lines(record, number)
-    stuck = frozen(lines, found, 2 * model.nx)
+    part, lines = without_lost_readings(record, number)
+    count, cut = usable_samples(model, part.u)
+    part = replace(part, u=part.u[:count], y=part.y[:count])
+    stuck = lost_sensors(lines, found, 2 * model.nx)
     first = search_record(record, part, found, asked, noise)
-    notes = [remark, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
-             *first.extrapolated]
+    notes = [remark, cut, *(f"{line}." for line in lines), _outliers(first), *map(str, outside(model, part.u)),
+             *extrapolated(model, part.u), *first.extrapolated]
     seen, ranking, alarm = find(first)
     notes.append(ranking.note)
     fits = ranking.fits if not found.unknown or ranking.explains else ()

@@ -240,6 +240,9 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
         low, high = onset_range(found.onsets[:, number], weights, coverage, onset)
         sizes, covariances = found.sizes[:, part], found.covariances[:, part, part]
         intervals = mixture_intervals(weights, sizes, np.sqrt(np.einsum("kii->ki", covariances)), coverage)
+        size = sizes[best].copy()
+        if candidate.kind in ("loss", "stuck"):  # a share lost lies between 0 and 1
+            size[0], intervals[0] = np.clip(size[0], 0.0, 1.0), np.clip(intervals[0], 0.0, 1.0)
         mean = weights @ sizes
         spread = np.einsum("k,ki,kj->ij", weights, sizes - mean, sizes - mean)
         nu, own = sizes[best], covariances[best]
@@ -247,7 +250,7 @@ def estimates(found: Explanation, coverage: float, window: int, edge: int) -> tu
         result.append(Estimate(
             label=candidate.label, name=candidate.name, kind=candidate.kind, candidate=candidate, onset=onset,
             onset_interval=(0 if censored else low, high), onset_censored=censored,
-            size=np.full(nu.shape, np.nan) if at_edge else nu, size_interval=intervals,
+            size=np.full(nu.shape, np.nan) if at_edge else size, size_interval=intervals,
             covariance=np.einsum("k,kij->ij", weights, covariances) + spread,
             deflection=float(np.sqrt(max(nu @ np.linalg.pinv(own, hermitian=True) @ nu, 0.0))),
         ))

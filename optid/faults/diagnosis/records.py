@@ -1,4 +1,4 @@
-"""Preparation of a diagnosis: the record, the scale of the noise, the uncertainty of the model, flat lines."""
+"""Preparation of a diagnosis: the record, the scale of the noise, the uncertainty of the model, lost readings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,7 +10,8 @@ from optid.data.record import Data, Experiment
 from optid.errors import DataError, StructureError
 from optid.faults.diagnosis.answers import Estimate
 from optid.faults.nuisance import ModelUncertainty, model_uncertainty
-from optid.faults.screening import FlatLine, check_channels, flat_lines
+from optid.faults.readings import LostReadings, lost_readings
+from optid.faults.screening import check_channels
 from optid.faults.signatures import Dictionary, candidate_of
 from optid.faults.whitening import Predictor, health, predictor, whiten
 from optid.models.experiments import in_units_of
@@ -122,29 +123,33 @@ def uncertainty_of(
     return found, f"The uncertainty of the identified model is treated as noise. {found.remark}".strip()
 
 
-def without_flat_lines(record: Data, number: int) -> tuple[Experiment, tuple[FlatLine, ...]]:
-    """Remove the repeated readings of flat lines of an experiment, but the first, which may be a true one."""
+def without_lost_readings(record: Data, number: int) -> tuple[Experiment, tuple[LostReadings, ...]]:
+    """Remove the readings of frozen and saturated sensors of an experiment, but the first, which may be a true one."""
     part = record.experiments[number]
-    lines, y = tuple(line for line in flat_lines(record) if line.experiment == number), np.array(part.y)
+    lines, y = lost_readings(part.y, record.outputs, number), np.array(part.y)
     for line in lines:
-        y[line.first + 1 : line.first + line.count, record.outputs.index(line.name.partition(":")[2])] = np.nan
+        own = y[line.first + 1 :, record.outputs.index(line.name.partition(":")[2])]
+        changes = np.flatnonzero(~np.isnan(own) & (own != line.value))
+        if line.condition != "dead":
+            own[: changes[0] if changes.size else None] = np.nan
     return replace(part, y=y) if lines else part, lines
 
 
-def frozen(lines: Sequence[FlatLine], found: Dictionary, edge: int) -> tuple[Estimate, ...]:
-    """Return the frozen sensors, each at its longest flat line, whether in the dictionary or not.
+def lost_sensors(lines: Sequence[LostReadings], found: Dictionary, edge: int) -> tuple[Estimate, ...]:
+    """Return the frozen, saturated and dead sensors, each at its longest stretch, whether in the dictionary or not.
 
-    The first of the equal readings may be a true one: the fault begins with the second. A flat line that begins within
+    The first of the equal readings may be a true one: the fault begins with the second. A stretch that begins within
     `edge` samples of the start of the record may have begun before it.
     """
     longest = {line.name: line for line in sorted(lines, key=lambda line: line.count)}
     faults = []
     for name, line in longest.items():
-        known = [c for c in found.candidates if c.kind == "frozen" and name in c.places]
-        candidate = known[0] if known else candidate_of(found.model, name, "frozen")
-        onset, censored, value = line.first + 1, line.first < edge, np.array([line.value])
+        known = [c for c in found.candidates if c.kind == line.condition and name in c.places]
+        candidate = known[0] if known else candidate_of(found.model, name, line.condition)
+        onset, censored = line.first + (line.condition != "dead"), line.first < edge
+        value = np.array([] if line.condition == "dead" else [line.value])
         faults.append(Estimate(
-            candidate.label, name, "frozen", candidate, onset, (0 if censored else onset, onset), censored, value,
-            np.stack([value, value], axis=1), np.zeros((1, 1)), float("inf"),
+            candidate.label, name, line.condition, candidate, onset, (0 if censored else onset, onset), censored, value,
+            np.stack([value, value], axis=1), np.zeros((value.size, value.size)), float("inf"),
         ))
     return tuple(sorted(faults, key=lambda fault: fault.onset))

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 WIDTH = 80
 
 WORDS = {
-    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading",
+    "drift": "slope", "jump": "jump", "noise": "standard deviation", "frozen": "reading", "saturated": "reading",
     "schedule": "share of the change",
 }
 """Name of the magnitude of a kind."""
@@ -51,8 +51,6 @@ def size_words(fault: "Estimate") -> list[str]:
     """State each magnitude with its interval."""
     lines = []
     for word, value, (low, high) in zip(magnitude_names(fault), fault.size, fault.size_interval):
-        if word == "share lost":
-            value, low, high = (float(np.clip(number, 0.0, 1.0)) for number in (value, low, high))
         if word == "reading":
             lines.append(f"{word} {value:.6g}")
             continue
@@ -132,7 +130,7 @@ def certificate_words(found: "Diagnosis") -> str:
             words += f", twice the log of the odds against the next {proof.runner_up_margin:.1f}"
         return words
     if proof.kind == "flat line":
-        return f"proof: {proof.value:.0f} readings in a row are identical"
+        return f"proof: {proof.value:.0f} readings in a row are identical or missing"
     if proof.kind == "duality gap":
         return f"proof: duality gap {proof.value:.1e}"
     if proof.kind == "infeasible healthy":

@@ -17,7 +17,7 @@ from optid.models.files import from_content, read_state, write_state
 if TYPE_CHECKING:
     from optid.faults.monitor.monitoring import Monitor
 
-VERSION = 3
+VERSION = 4
 """Version of the file."""
 
 WORDS = "name", "kind", "columns", "members", "places", "bounded_deflection"

@@ -1,5 +1,6 @@
 """The noise of healthy records: its colour, its size, and the thresholds that it requires."""
 
+import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data
-from optid.errors import DataError
+from optid.errors import DataError, DataWarning
 from optid.faults.monitor.arl import COMMON, Calibration
 from optid.faults.nuisance import CONFIDENCE, ModelUncertainty, sensitivities
 from optid.faults.ranges import outside, unsure_since
@@ -27,6 +28,13 @@ ORDERS = 1, 2, 3, 4, 6, 8
 
 LONGEST = 3000
 """Samples of the identification along which the effect of uncertain parameters is simulated."""
+
+
+RAISED, REFUSED = 3.0, 10.0
+"""Factors by which a healthy record may raise energies: above the first one with a warning, above the second not."""
+
+BLOCK = 100
+"""Samples of the stretches whose energies are compared."""
 
 
 def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> tuple[Array, Array]:
@@ -80,6 +88,11 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
         raise
     if judged.white and judged.ratio <= OTHER_SCALE and judged.ratio >= 1 / OTHER_SCALE:
         return found, ""
+    for o, name in enumerate(found.model.outputs):
+        energies = [_blocks(part.r[:, o] ** 2, BLOCK).mean(axis=1) for part in parts]
+        every = np.concatenate(energies)
+        if usual := float(np.median(every)) if every.size else 0.0:
+            _check_rise(float(every.mean()) / usual, f"the energy of the innovations of {name}", energies, usual, BLOCK)
     signals = [np.where(part.present, part.innovations, np.nan) for part in parts]
     taps, covariance = _autoregression(signals, (0,) if judged.white else ORDERS)
     said = (f"on the healthy record the innovations are not those of the model (whiteness p = {judged.p_value:.2g}, "
@@ -130,6 +143,45 @@ def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dict
     return replace(found, model=wider, predictor=predictor, candidates=candidates)
 
 
+def _blocks(values: Array, length: int) -> Array:
+    """Return values (N,) in blocks (N // length, length)."""
+    return values[: len(values) // length * length].reshape(-1, length)
+
+
+def _check_rise(factor: float, what: str, levels: list[Array], usual: float, length: int) -> None:
+    """Report a stretch of a healthy record that hides faults.
+
+    Args:
+        factor: by which the record raises `what`.
+        what: thresholds or energies.
+        levels: those of every block of `length` samples, for each experiment.
+        usual: level of a usual block.
+        length: samples of a block.
+
+    Raises:
+        DataError: a factor above `REFUSED`.
+
+    Warns:
+        DataWarning: a factor above `RAISED`.
+    """
+    if factor <= RAISED:
+        return
+    number = int(np.argmax([one.max(initial=-np.inf) for one in levels]))
+    high = levels[number] > RAISED * usual
+    first = last = int(np.argmax(levels[number]))
+    while first > 0 and high[first - 1]:
+        first -= 1
+    while last + 1 < len(high) and high[last + 1]:
+        last += 1
+    where = f"samples {first * length} to {(last + 1) * length - 1}" + (
+        f" of experiment {number + 1}" if len(levels) > 1 else "")
+    text = (f"The healthy record raises {what} {factor:.1f}-fold, most in {where}: smaller faults stay hidden. If the "
+            "plant was starting up there, moved outside the range of the model, or was faulty, leave these samples out")
+    if factor > REFUSED:
+        raise DataError(f"{text}; else identify a model that describes them.")
+    warnings.warn(text + ".", DataWarning, stacklevel=4)
+
+
 def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
     """Return thresholds with no more alarms on a healthy record than are due: those of `base` times a factor.
 
@@ -138,14 +190,16 @@ def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calib
     records of this length; then it is the ratio of these energies, or the one that leaves so many alarms.
 
     Raises:
-        DataError: a record of fewer than 20 windows.
+        DataError: a record of fewer than 20 windows; a factor above 10.
+
+    Warns:
+        DataWarning: a factor above 3.
     """
     from scipy.special import bdtrik, pdtrik
 
     window, records = monitor.window, in_units_of(monitor.dictionary.model, healthy).experiments
-    watched = [monitor.watched(part.u, part.y)[: len(part.y) // window * window] for part in records]
-    blocks = np.vstack([one.reshape(-1, window, len(base.q)).max(axis=1) for one in watched])
-    largest = np.max(blocks / base.q, axis=1)
+    levels = [_blocks(np.max(monitor.watched(part.u, part.y) / base.q, axis=1), window).max(axis=1) for part in records]
+    largest = np.concatenate(levels)
     if len(largest) < FEWEST:
         raise DataError(
             f"The healthy record has {len(largest)} stretches of {window} samples: {FEWEST} are needed for thresholds.")
@@ -154,4 +208,5 @@ def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calib
     factor = max(1.0, float(np.sort(largest)[-1 - allowed]))
     if np.sum(largest > base.common) > bdtrik(CONFIDENCE, len(largest), COMMON):
         factor = max(factor, float(np.quantile(largest, 1 - COMMON)) / base.common)
+    _check_rise(factor, "the thresholds", levels, 1.0, window)
     return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.y) for part in records))

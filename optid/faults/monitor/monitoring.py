@@ -249,6 +249,7 @@ class Monitor:
         y, fed, unsure = screened.y, self._fed(screened.y), screened.unsure[:, self._input_of]
         frozen = np.isin(np.arange(count), list(screened.frozen))
         alone = np.isnan(y).any(axis=1) | screened.unsure.any(axis=1) | screened.repeating | frozen
+        alone |= screened.distance > 1
         stops, events, k = np.append(np.flatnonzero(alone), count), list(screened.events), 0
         while k < count:
             self.decisions.forget_range(self.samples - self.window)
@@ -292,7 +293,7 @@ class Monitor:
         else:
             innovation, matrices = plant.step(used, lambda y: self._fed(y[None])[0], y, unsure)
             _, statistic, weight = self.search.advance(moving, innovation[None], limit, matrices,
-                                                       int(np.count_nonzero(~np.isnan(y))))
+                                                       int(np.count_nonzero(matrices[3].any(axis=1))))
         self.samples += 1
         if unsure.any():
             decisions.begun = now + 1

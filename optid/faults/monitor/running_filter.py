@@ -5,6 +5,11 @@ A. S. Willsky, H. L. Jones, IEEE Trans. Automatic Control 21, 1976). One filter 
 unknown initial state, missing readings, and unknown inputs. With e the innovations of the steady predictor, the plant
 is x+ = A x + ... + K e, y = C x + ... + e: once its state is known it stays known, and the filter is the steady
 predictor.
+
+An unknown state has no prior: its covariance is P + k N N', k without limit, and the readings determine the
+combinations N of states by least squares before anything is concluded from them (the exact initialisation of P. de
+Jong, Annals of Statistics 19, 1991). The result depends neither on the coordinates of the state nor on where the plant
+starts. The effect of an unknown input differs from that of the last known one, with a wide prior.
 """
 
 from dataclasses import dataclass
@@ -20,8 +25,15 @@ from optid.faults.monitor.search_kernel import DRIFT, JUMP
 from optid.faults.whitening import Predictor
 from optid.models import HammersteinSS
 
-WIDE = 1e8
-"""Prior energy of an unknown in one innovation."""
+SEEN = 1e-7
+"""Share of the response to an unknown that determines it: a response of one standard deviation that is ignored has
+1e7 standard deviations behind it, and one that is used makes the covariance 1e14 at most."""
+
+WIDE = 1e10
+"""Prior energy of an unknown input in all innovations: with none, a fault of its actuator would have no size at all."""
+
+DOUBLINGS = 24
+"""Doublings of the horizon over which the response to the state is taken."""
 
 CERTAIN = 1e-12
 """Energy in one innovation below which the state is known."""
@@ -47,14 +59,16 @@ class RunningFilter:
         model, steady, columns: the healthy plant, its predictor, and the columns of the candidates.
         x: (n + q,) expected state and constants; the additions of carried faults at the next sample are in it.
         P: (n + q, n + q) covariance.
+        N: (n, d) combinations of states that are unknown, beside P.
         directions: (q,) the constants.
         held: (D,) magnitudes that are no longer estimated.
         before: (r,) functions of the inputs of the sample before.
         certain: whether the steady predictor is exact.
         strength: largest energy of a state of unit size in one innovation.
+        response: (n, n) whose product with a state has the norm of its effect on all later innovations.
     """
 
-    KEPT = "x", "P", "held", "before"
+    KEPT = "x", "P", "N", "held", "before"
 
     def __init__(self, model: HammersteinSS, steady: Predictor, columns: Columns) -> None:
         """Start from a known state of zero."""
@@ -64,12 +78,16 @@ class RunningFilter:
         self.directions: list[Direction] = []
         self.certain = True
         self.strength = float(np.max(np.sum((steady.root @ steady.C) ** 2, axis=0), initial=1e-300))
+        self.response, self.N = _response(steady), np.zeros((model.nx, 0))
 
     def lose(self) -> None:
         """Make the state of the next sample unknown."""
         n = self.model.nx
         self.P[:n], self.P[:, :n] = 0.0, 0.0
-        self.P[:n, :n] = WIDE / self.strength * np.eye(n)
+        sizes = np.maximum(np.linalg.norm(self.response, axis=0), 1e-300)
+        _, seen, axes = np.linalg.svd(self.response / sizes)
+        there = seen > 1e-12 * max(float(seen.max(initial=0.0)), 1e-300)
+        self.N = (axes[there] / seen[there, None] / sizes).T  # of unit response each
         self.certain = False
 
     def additions(self, f: Array) -> tuple[Array, Array]:
@@ -136,24 +154,32 @@ class RunningFilter:
             x[:n] += model.E @ fed(used)
         wide = np.flatnonzero(unsure)
         into, onto = np.vstack([model.B[:, wide], np.zeros((q, len(wide)))]), model.D[:, wide]
-        sizes = np.sum((steady.root @ np.vstack([model.C @ model.B, model.D]).reshape(2, model.l, -1)[:, :, wide]) ** 2,
-                       axis=(0, 1))
-        spread = WIDE / np.maximum(sizes, 1e-300)
-        seen, direct, covariance = C[there], onto[there], steady.covariance[:, there]
+        sizes = np.sum((steady.root @ onto) ** 2, axis=0) + np.sum((self.response @ into[:n]) ** 2, axis=0)
+        spread = np.where(sizes > 0, WIDE / np.maximum(sizes, 1e-300), 0.0)
+        free, seen, covariance = drift[:n, :n] @ self.N, C[there], steady.covariance[:, there]
         if there.size:
+            direct = onto[there]
             S = seen @ self.P @ seen.T + covariance[there] + (direct * spread) @ direct.T
             cross = drift @ self.P @ seen.T + noise @ covariance + (into * spread) @ direct.T
             lower = np.linalg.cholesky((S + S.T) / 2)
             inverse = solve_triangular(lower, np.eye(there.size), lower=True)
-            gain[:, there] = cross @ inverse.T @ inverse
+            if free.size:  # readings that determine unknowns are no innovations
+                left, size, right = np.linalg.svd(inverse @ model.C[there] @ self.N)
+                known = int(np.sum(size > SEEN))
+                unknowns = right[:known].T @ (left[:, :known].T @ inverse / size[:known, None])
+                gain[:n, there], free = free @ unknowns, free @ right[known:].T
+                inverse = _lower_triangular(left[:, known:].T @ inverse)
+            gain[:, there] += cross @ inverse.T @ inverse
             root[np.ix_(there, there)] = inverse
             innovation = y[there] - predicted[there]
             r[there] = inverse @ innovation
             x += gain[:, there] @ innovation
-        forget, left = drift - gain @ C, noise - gain
-        blind = into - gain @ onto
+        if free.size:
+            size, right = np.linalg.svd(self.response @ free)[1:]
+            free = free @ right[: int(np.sum(size > SEEN))].T
+        forget, left, blind = drift - gain @ C, noise - gain, into - gain @ onto
         self.P = forget @ self.P @ forget.T + left @ steady.covariance @ left.T + (blind * spread) @ blind.T
-        self.P = (self.P + self.P.T) / 2
+        self.P, self.N = (self.P + self.P.T) / 2, free
         for p, one in enumerate(self.directions):
             raw = H[:, p] + (model.C @ one.deviation if one.age else 0.0)
             response = steady.root @ raw
@@ -161,7 +187,7 @@ class RunningFilter:
             one.age += 1
             one.power += (float(response @ response) - one.power) / min(one.age, 100)
         self.x, self.before = x, f
-        self.certain = not q and self.strength * float(np.trace(self.P)) < CERTAIN
+        self.certain = not q and not free.size and self.strength * float(np.trace(self.P)) < CERTAIN
         if self.certain:
             self.P = np.zeros((n, n))
         missing = gain.copy()
@@ -229,3 +255,25 @@ class RunningFilter:
         most = SPARE + 2 * int(self.columns.size.max()) - count
         while len(self.directions) > most:
             self.forget(0, None)
+
+
+def _response(steady: Predictor) -> Array:
+    """Return R (n, n): the norm of R x is that of the whitened innovations that a state x adds, over a long horizon."""
+    n = len(steady.A)
+    R, step = _triangular(np.vstack([steady.root @ steady.C, np.zeros((n, n))])), steady.F
+    for _ in range(DOUBLINGS):
+        R, step = _triangular(np.vstack([R, R @ step])), step @ step
+    return R
+
+
+def _triangular(M: Array) -> Array:
+    """Return R, upper triangular, with R'R = M'M."""
+    return np.asarray(np.linalg.qr(M, mode="r"))
+
+
+def _lower_triangular(E: Array) -> Array:
+    """Return a square R, lower triangular, with R'R = E'E; its first rows are zero where E has fewer rows."""
+    R = np.zeros((E.shape[1], E.shape[1]))
+    T = _triangular(E[:, ::-1])
+    R[len(R) - len(T) :] = T[::-1, ::-1]
+    return R
