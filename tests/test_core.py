@@ -1,5 +1,7 @@
 """The core: terms, leaves and constraints against finite differences, CVXPY, and their definitions."""
 
+import warnings
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -325,7 +327,10 @@ def test_an_unknown_that_is_to_be_symmetric_is_and_one_that_is_not_is_a_violatio
     p = found.values["P"]
     assert found.status is Status.OPTIMAL and np.allclose(p, p.T, atol=1e-9)
     x = cp.Variable((3, 3), symmetric=True)
-    value = cp.Problem(cp.Minimize(cp.sum_squares(root @ cp.vec(x, order="F") - target)), [x >> 0]).solve(solver="SCS")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # old versions of SCS speak of the form of a matrix
+        squares = cp.sum_squares(root @ cp.vec(x, order="F") - target)
+        value = cp.Problem(cp.Minimize(squares), [x >> 0]).solve(solver="SCS")
     assert found.objective == pytest.approx(value, rel=1e-3)
     skew = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     assert judge(problem, {"P": p + 0.1 * skew}, found.duals).residuals.violation > 0.01

@@ -224,7 +224,7 @@ def test_one_model_gives_one_file(tmp_path):
 
 def test_time_is_in_seconds(tmp_path):
     path = process(time_unit="min").to_discrete(0.5).to_fmu(tmp_path / "plant.fmu", binary=False)
-    assert fmpy.read_model_description(str(path)).defaultExperiment.stepSize == "30.0"
+    assert fmpy.read_model_description(str(path)).defaultExperiment.stepSize in (30.0, "30.0")  # by version
     refuses(StructureError, "counts in 'weeks'", siso(time_unit="weeks").to_fmu, tmp_path / "a.fmu")
 
 
