@@ -61,6 +61,16 @@ def test_a_sensor_that_is_read_now_and_then_is_not_dead(record, gap):
     assert len(lost_readings(y, ("y1", "y2"))) == 1  # also when it comes back
 
 
+def test_three_equal_readings_are_enough_where_no_other_is_repeated(record):
+    _, u, y = record
+    y = y.copy()
+    y[100:103, 1] = y[100, 1]
+    (line,) = flat_lines(Data(u, y))
+    assert (line.name, line.condition, line.first, line.count) == ("sensor:y2", "frozen", 100, 3)
+    y[40:42, 1] = y[40, 1]
+    assert flat_lines(Data(u, y)) == ()
+
+
 def test_a_constant_channel_is_a_finding_and_no_crash(record):
     _, u, y = record
     constant = np.column_stack([np.full(200, 1.5), y[:, 1]])

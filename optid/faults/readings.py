@@ -17,6 +17,13 @@ FROZEN = 5
 CHANCE = 1e-10
 """Largest probability of that many identical readings of a healthy sensor."""
 
+FLAT = 3
+"""Identical readings of a frozen sensor that repeats no other reading in a record.
+
+A sensor that repeats readings with the probability p shows this in N healthy ones with a probability of about
+N p^2 exp(-N p), at most .5 / N.
+"""
+
 USUAL = 2
 """A gap of a record is dead if it is more than so many times as long as any other one of the sensor."""
 
@@ -152,8 +159,8 @@ class SensorChecks:
 def lost_readings(y: Array, outputs: Sequence[str], experiment: int = 0) -> tuple[LostReadings, ...]:
     """Return the stretches of a record (N, l) in which a sensor is frozen, saturated or dead.
 
-    All runs at the limit of a sensor that is saturated once are saturated. Gaps as long as a sensor often has are no
-    fault.
+    All runs at the limit of a sensor that is saturated once are saturated. `FLAT` readings are enough where a sensor
+    repeats no other. Gaps as long as a sensor often has are no fault.
     """
     _, _, found = SensorChecks(y.shape[1]).screen(y, np.zeros(len(y), dtype=bool), 0)
     lines = []
@@ -163,6 +170,12 @@ def lost_readings(y: Array, outputs: Sequence[str], experiment: int = 0) -> tupl
         value = float("nan") if one.condition == "dead" else float(own[0])
         count = int(np.sum(np.isnan(own) if one.condition == "dead" else own == value))
         lines.append(LostReadings(f"sensor:{outputs[one.output]}", one.condition, experiment, one.onset, count, value))
+    for o in set(range(y.shape[1])) - {one.output for one in found if one.condition != "dead"}:
+        repeats = np.flatnonzero(y[1:, o] == y[:-1, o])
+        if repeats.size >= FLAT - 1 and np.ptp(repeats) == repeats.size - 1 < 0.1 * len(y):
+            first = int(repeats[0])
+            lines.append(LostReadings(f"sensor:{outputs[o]}", "frozen", experiment, first, repeats.size + 1,
+                                      float(y[first, o])))
     limits = {(one.name, one.value) for one in lines if one.condition == "saturated"}
     conditions = ["saturated" if (one.name, one.value) in limits else one.condition for one in lines]
     lines = [LostReadings(one.name, condition, experiment, one.first, one.count, one.value)

@@ -51,6 +51,8 @@ def size_words(fault: "Estimate") -> list[str]:
     """State each magnitude with its interval."""
     lines = []
     for word, value, (low, high) in zip(magnitude_names(fault), fault.size, fault.size_interval):
+        if word == "share lost":  # also of a diagnosis that was saved with wider intervals
+            value, low, high = (float(np.clip(number, 0.0, 1.0)) for number in (value, low, high))
         if word == "reading":
             lines.append(f"{word} {value:.6g}")
             continue
