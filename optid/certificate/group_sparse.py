@@ -21,7 +21,7 @@ PROVED = 1e-6
 def certify_groups(form: GroupSparseStructure, program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
     """Return the best bound from the residual at the point and from the multipliers that the solver gave."""
     numbers, a = form.problem, form.flat(values)
-    candidates = [numbers.target - numbers.design @ a]
+    candidates: list[Array] = [numbers.target - numbers.design @ a]
     if (given := form.dual_point(duals)) is not None:
         candidates.append(given)
     slope, constant = _lagrangian(program.core, form, duals)

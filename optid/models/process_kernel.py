@@ -16,8 +16,21 @@ TERMS = 24  # of a series, at most, for a norm of one
 
 
 @cached_njit
-def exponential(F, h):  # noqa: N803 - the field's letter
-    """Return exp(F h) by scaling, a Taylor series and squaring."""
+def _product(left, right, into):
+    """Multiply square matrices."""
+    n = len(left)
+    for i in range(n):
+        for j in range(n):
+            into[i, j] = 0.0
+        for k in range(n):
+            if left[i, k] != 0.0:
+                for j in range(n):
+                    into[i, j] += left[i, k] * right[k, j]
+
+
+@cached_njit
+def exponential(F, h, found):  # noqa: N803 - the field's letter
+    """Write exp(F h), found by scaling, a Taylor series and squaring."""
     n = len(F)
     size = 0.0
     for i in range(n):
@@ -29,20 +42,22 @@ def exponential(F, h):  # noqa: N803 - the field's letter
     while size > 0.5:
         size /= 2.0
         doublings += 1
-    G = F * (h / 2.0**doublings)
-    E, term = np.eye(n), np.eye(n)
+    part = h / 2.0**doublings
+    term, following = np.zeros((n, n)), np.zeros((n, n))
+    for i in range(n):
+        for j in range(n):
+            term[i, j] = found[i, j] = 1.0 if i == j else 0.0
     for order in range(1, 18):
-        following = np.zeros((n, n))
+        _product(F, term, following)
         for i in range(n):
-            for k in range(n):
-                if G[i, k] != 0.0:
-                    for j in range(n):
-                        following[i, j] += G[i, k] * term[k, j]
-        term = following / order
-        E += term
+            for j in range(n):
+                term[i, j] = following[i, j] * (part / order)
+                found[i, j] += term[i, j]
     for _ in range(doublings):
-        E = E @ E
-    return E
+        _product(found, found, following)
+        for i in range(n):
+            for j in range(n):
+                found[i, j] = following[i, j]
 
 
 @cached_njit
@@ -54,7 +69,9 @@ def _apply(E, z, into):  # noqa: N803
             for k in range(n):
                 total += E[i, k] * z[k, c]
             into[i, c] = total
-    z[:] = into
+    for i in range(n):
+        for c in range(m):
+            z[i, c] = into[i, c]
 
 
 @cached_njit
@@ -64,7 +81,9 @@ def _series(F, h, norm, z, term, into):  # noqa: N803
     steps = max(1, int(np.ceil(norm * h)))
     g = h / steps
     for _ in range(steps):
-        term[:] = z
+        for i in range(n):
+            for c in range(m):
+                term[i, c] = z[i, c]
         for order in range(1, TERMS):
             largest, reached = 0.0, 0.0
             for i in range(n):
@@ -145,7 +164,8 @@ def run(F, C, instants, changes, inputs, sides, start):  # noqa: N803
                         again = again or abs(recent[one] - h) <= close
                     if again:
                         slot, used = used, (used + 1) % SLOTS
-                        kept[slot], lengths[slot] = exponential(F, h), h
+                        exponential(F, h, kept[slot])
+                        lengths[slot] = h
                     else:
                         recent[noted], noted = h, (noted + 1) % SLOTS
                 if slot >= 0:

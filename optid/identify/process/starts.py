@@ -35,14 +35,19 @@ def gram_matrices(F, C, instants, course, thetas, still, settings):  # noqa: N80
     changes, inputs = course
     m, s = inputs.shape[1], still.shape[1]
     found = np.zeros((len(thetas), m + s, m + s))
-    block = np.zeros((len(instants), m + s))
-    block[:, m:] = still
-    start = np.zeros((len(F), m))
+    row, later, start = np.zeros(m + s), np.zeros(len(changes)), np.zeros((len(F), m))
     for i in range(len(thetas)):
-        response = run(F, C, instants, changes + thetas[i], inputs, (settings[m] > 0, True), start)
-        for c in range(m):
-            block[:, c] = response[:, 0, c] + settings[c]
-        found[i] = block.T @ block
+        for j in range(len(changes)):
+            later[j] = changes[j] + thetas[i]
+        response = run(F, C, instants, later, inputs, (settings[m] > 0, True), start)
+        for k in range(len(instants)):
+            for c in range(m):
+                row[c] = response[k, 0, c] + settings[c]
+            for c in range(s):
+                row[m + c] = still[k, c]
+            for a in range(m + s):
+                for b in range(m + s):
+                    found[i, a, b] += row[a] * row[b]
     return found
 
 
