@@ -79,6 +79,7 @@ CELLS = [
     Cell("oe.exact", "output", ORDERS),
     Cell("hammerstein_oe.exact", "output", {**ORDERS, **CUBIC}, curved=True),
     Cell("hammerstein_oe.shooting", "output", {**ORDERS, **CUBIC}, curved=True),
+    Cell("process.exact", "output", {"process": "P2ZU"}),
     Cell("armax.exact", "coloured", {**ORDERS, "nc": 1}),
     Cell("hammerstein_armax.exact", "coloured", {**ORDERS, "nc": 1, **CUBIC}, curved=True),
     Cell("bj.exact", "output", {**ORDERS, "nc": 1, "nd": 1}),

@@ -127,6 +127,11 @@ def uses(fit: Any, folder: Path, seed: int) -> dict[str, Any]:
         return ""  # of a model that predicts nothing `validate` says so
 
     def exported() -> None:
+        if fit.formulation == "process.exact":  # in continuous time, where a dead time needs an approximation
+            with suppress(StructureError):  # an integrator, a drift, inputs that go straight
+                model.to_continuous(), model.to_fmu(folder / "model.fmu", binary=False)
+                model.to_control(pade=2) if find_spec("control") else None
+            return
         model.to_c(folder / "model.c"), model.to_st(folder / "model.st"), model.to_casadi()
         model.to_dlti(), model.to_control() if find_spec("control") else None
         str(model.pole_table), model.zeros

@@ -108,7 +108,16 @@ def follow(folder, name, capsys, errors=False):
     return " ".join(told.err.split()) if errors else told.out.splitlines(), monitor
 
 
+@pytest.fixture
+def heeded():
+    """Interrupts have their usual handler: a process that a shell starts in the background ignores them."""
+    former = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, former)
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.usefixtures("heeded")
 @pytest.mark.parametrize("number, owner, name", [
     (signal.SIGTERM, RowReader, "read"), (signal.SIGTERM, Monitor, "run"), (signal.SIGINT, Monitor, "run"),
     (signal.SIGINT, Monitor, "save"), (signal.SIGTERM, following.Followed, "advance"),

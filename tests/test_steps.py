@@ -25,6 +25,7 @@ ARGUMENTS = {
     "hammerstein_armax": {"na": 1, "nb": 1, "nk": 1, "nc": 1, "basis": "polynomial:2"},
     "hammerstein_bj": {"na": 1, "nb": 1, "nk": 1, "nc": 0, "nd": 1, "basis": "polynomial:2"},
     "lfr": {"nx": 1, "tries": 1}, "wiener_ss": {"nx": 1}, "hammerstein_wiener_ss": {"nx": 1, "basis": "polynomial:2"},
+    "process": {"process": "P1D", "initial": "free"},
     "physical": {"equations": optid.Equations(lambda v: {"x": v["a"] * v["x"] + v["b"] * v["u"], "y": v["x"]},
                                               {"x": 0.1}, {"a": 0.5, "b": 1.0}, time="discrete")},
 }
