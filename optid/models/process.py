@@ -132,8 +132,9 @@ class ProcessModel(Model):
         for one, f, name in zip(self.processes, self.nonlinearities, self.inputs):
             gain = f"{f.mu[0]:.4g} {name}" if f.is_linear else f"f{'' if self.m == 1 else f'_{name}'}({name})"
             terms.append(f"{one.equation()} {gain}")
-        drift = f" {self.drift:+.4g} t" if self.drift else ""
-        return f"{self.outputs[0]} = {' + '.join(terms)} {self.level[0]:+.4g}{drift}"
+        rest = [(self.level[0], ""), *([(self.drift, " t")] if self.drift else [])]
+        beside = "".join(f" {'-' if size < 0 else '+'} {abs(size):.4g}{of}" for size, of in rest)
+        return f"{self.outputs[0]} = {' + '.join(terms)}{beside}"
 
     # -- responses -----------------------------------------------------------------------------------------------------
 

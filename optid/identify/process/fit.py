@@ -196,8 +196,6 @@ def _with_profiles(errors: ProcessErrors, box: ProcessBox, x: Array, evidence: E
     unit = errors.data.time_unit
     if len(errors.y) > PROFILED:
         return evidence.model, {}
+    found = {name.replace("_", " "): ends for name, ends in profile_intervals(errors, box, x).items()}
     return evidence.model, {f"{name}, 95 % by profile likelihood": f"{low:.4g} to {high:.4g} {unit}".rstrip()
-                            for name, (low, high) in profile_intervals(errors, box, x).items()}
-
-
-
+                            for name, (low, high) in found.items()}
