@@ -17,10 +17,12 @@ from optid.models.process import process_model
 
 truth = process_model("P1D", K=0.4, tau=150.0, dead_time=32.0, level=20.0, dt=5.0)
 valve = np.where(np.arange(240) < 12, 50.0, 60.0)
-temperature = truth.respond(valve[:, None]) + 0.05 * np.random.default_rng(1).normal(size=240)
+noise = 0.05 * np.random.default_rng(1).normal(size=240)
+temperature = truth.respond(valve[:, None]) + noise
 with TemporaryDirectory() as folder:
     table = Path(folder) / "step.csv"
-    optid.Data(valve, temperature, 5.0, "valve", "temperature", ["%"], ["K"], start="2024-05-01T08:00").to_csv(table)
+    optid.Data(valve, temperature, 5.0, "valve", "temperature",
+               ["%"], ["K"], start="2024-05-01T08:00").to_csv(table)
     data = optid.read(table, inputs="valve", outputs="temperature")
 data
 
@@ -47,12 +49,12 @@ def simc(model):
 
 
 settings = fit.uncertainty.of(simc)
-for name, value, low, high in zip(["gain, %/K", "integral time, s"], settings.value, settings.lower, settings.upper):
+rows = zip(["gain, %/K", "integral time, s"], settings.value, settings.lower, settings.upper)
+for name, value, low, high in rows:
     print(f"{name}: {value:.3g} (95 %: {low:.3g} to {high:.3g})")
 
 # %%
-# What is known is said in the terms of the plant: here the gain, from a balance. Everything else becomes sharper, and
-# the price tells what the statement costs.
+# What is known is said in the terms of the plant: here the gain, from a balance. The dead time becomes sharper.
 known = optid.fit(data, "process.exact", process="P1D", constraints=["K:0.4"])
 known.dynamics
 
