@@ -49,7 +49,7 @@ def nuclear(data: Data, *, nx: int | str = "auto", block_rows: int | None = None
             split: str = "exact", stability: str = "auto", constraints: Sequence[Any] = ()) -> Procedure:
     """Identify a state-space model from a low-rank Hankel matrix found by convex optimisation.
 
-    Named variables: ``output``, ``yhat``. Other arguments as in `formulations.hammerstein_ss.sid`.
+    Named variables: ``T``, ``output``, ``yhat``. Other arguments as in `formulations.hammerstein_ss.sid`.
 
     Args:
         data: the record; missing outputs are estimated, windows with missing inputs left out.

@@ -44,14 +44,14 @@ from optid.solving.steps import steps
 Array = np.ndarray
 
 
-@steps(lambda given: {"process.exact": "QP" if given["constraints"] else "QP linear"})
+@steps(lambda given: {"process.exact": "QP"})
 def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, zero: bool = False, delay: bool = True,
             integrator: bool = False, order: str = "", basis: Bases = "linear",
             hold: str = "zero", offset: bool | str = True, drift: bool = False, initial: str = "rest",
             times: Any = None, constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation errors of processes with dead time.
 
-    Named variables: ``dynamics``, ``mu``, ``offset``, ``drift``, ``x0``.
+    Named variables: ``K``, ``Theta``, ``dead_time``, ``dynamics``, ``log tau``, ``mu``, ``offset``.
 
     Args:
         data: the record; one output. Outputs may be missing; it is cut where inputs are.

@@ -280,9 +280,12 @@ def test_a_formulation_documents_the_variables_it_poses(name):
     rng = np.random.default_rng(0)
     u = rng.uniform(-1, 1, 60)
     data = optid.Data(u, np.convolve(u + u**2, [1.0, 0.5])[:60] + 0.1 * rng.standard_normal(60))
+    if name == "process.exact":  # which responds at a later time, at a constant rate
+        level = np.repeat(rng.uniform(-1, 1, 6), 10)
+        data = optid.Data(level, np.convolve(level, 0.3 * 0.7 ** np.arange(30))[:60] + 0.01 * rng.standard_normal(60))
     plant = optid.Equations(lambda v: {"x": v["a"] * v["x"] + v["b"] * v["u"], "y": v["x"]}, {"x": 0.1},
                             {"a": 0.5, "b": 1.0}, time="discrete")
-    offered = {"equations": plant, "na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": "polynomial:2"}
+    offered = {"equations": plant, "na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": "linear" if name == "process.exact" else "polynomial:2"}
     found = describe(registered(FORMULATIONS)[name])
     function = registered(FORMULATIONS)[name].load()
     parameters = inspect.signature(function).parameters

@@ -95,7 +95,8 @@ def test_kernels_stay_within_their_arrays(tmp_path):
     """Every kernel is called by one of these tests, with every index checked."""
     tests = Path(__file__).parent
     names = ["recursion", "recursions", "tracking", "latent_signals", "hammerstein_ss", "noise_sensitivities",
-             "group_sparse", "fault_pairs", "fault_injection", "monitor", "plants", "regressors"]
+             "group_sparse", "fault_pairs", "fault_injection", "monitor", "plants", "regressors", "process",
+             "process_responses", "continuous"]
     files = [tests / f"test_{name}.py" for name in names]
     done = subprocess.run([sys.executable, tests / "kernels_within_bounds.py", *files], cwd=tmp_path,
                           capture_output=True, text=True,

@@ -283,7 +283,7 @@ def test_columns_are_not_searched_one_by_one(tmp_path):
         return time.process_time() - started
 
     spent(100)  # what is imported
-    assert spent(30_000) < 16 * spent(3_000)
+    assert min(spent(30_000) for _ in range(2)) < 16 * min(spent(3_000) for _ in range(2))
 
 
 def test_bad_row_is_counted_across_blocks(tmp_path):

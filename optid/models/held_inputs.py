@@ -12,7 +12,7 @@ from scipy.linalg import expm, logm, matrix_balance
 
 from optid.arrays import Array
 from optid.errors import StructureError
-from optid.kernel_cache import cached_njit
+from optid.models.recursions import late_njit
 
 SAME = 1e-9  # share of the shortest sampling interval within which two instants are one
 ALIKE = 1e-12  # share of the longest interval within which two intervals are one
@@ -125,18 +125,17 @@ def run_course(A: Array, B: Array, x0: Array, course: Course, w: Array, before: 
     _, index, counts = np.unique(grid, return_inverse=True, return_counts=True)
     lengths = np.bincount(index, course.lengths) / counts
     states = np.empty((len(index), len(A)))
-    x = np.array(x0, dtype=float)
+    x, march = np.array(x0, dtype=float), late_njit(_march)
     if lengths.size <= CHUNK:
-        _march(*map(np.ascontiguousarray, held_step(A, B, lengths)), index, held, x, states)
+        march(*map(np.ascontiguousarray, held_step(A, B, lengths)), index, held, x, states)
         return states[course.reads], driven[course.reads]
     for first in range(0, len(index), CHUNK):
         part = slice(first, first + CHUNK)
         steps = map(np.ascontiguousarray, held_step(A, B, course.lengths[part]))
-        x = _march(*steps, np.arange(len(index[part])), held[part], x, states[part])
+        x = march(*steps, np.arange(len(index[part])), held[part], x, states[part])
     return states[course.reads], driven[course.reads]
 
 
-@cached_njit
 def _march(Phi, Gamma, index, held, x, states):
     """Write the state at the beginning of every interval, and return that at the end of the last one."""
     n, r = x.size, held.shape[1]
