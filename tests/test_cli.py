@@ -285,7 +285,8 @@ def test_a_formulation_documents_the_variables_it_poses(name):
         data = optid.Data(level, np.convolve(level, 0.3 * 0.7 ** np.arange(30))[:60] + 0.01 * rng.standard_normal(60))
     plant = optid.Equations(lambda v: {"x": v["a"] * v["x"] + v["b"] * v["u"], "y": v["x"]}, {"x": 0.1},
                             {"a": 0.5, "b": 1.0}, time="discrete")
-    offered = {"equations": plant, "na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": "linear" if name == "process.exact" else "polynomial:2"}
+    basis = "linear" if name == "process.exact" else "polynomial:2"
+    offered = {"equations": plant, "na": 1, "nb": 2, "nk": 0, "nc": 1, "nd": 1, "nx": 1, "basis": basis}
     found = describe(registered(FORMULATIONS)[name])
     function = registered(FORMULATIONS)[name].load()
     parameters = inspect.signature(function).parameters

@@ -51,9 +51,9 @@ EXPECTED: dict[str, dict[str, Range]] = {
     "predictive_control": {"thrust": about(0.8, 0.01), "difference": (0, 1e-9)},
     "two_tanks": {"pump": about(0.4, 0.004), "upper": about(0.3, 0.001), "lower": about(0.25, 0.002),
                   "gain": about(5.12, 0.05)},
-    "step_tests": {"K": about(0.4, 0.004), "tau": about(150, 6), "dead time": about(32, 3), "proved": (1, 1),
-                   "Kc": about(5.9, 0.7), "two time constants": (1, 1), "Ti": about(150, 12),
-                   "integrator Kc": about(3.33, 1.0), "integrator Ti": about(120, 30)},
+    "step_tests": {"heater K": about(0.4, 0.004), "heater tau": about(150, 6), "heater dead_time": about(32, 3),
+                   "heater proved": (1, 1), "heater Kc": about(5.9, 0.7), "tank tau": about(20, 6),
+                   "tank Kc": about(3.33, 1.0)},
     "solvers": {
         **{f"hammerstein_arx.exact {word}": about(8.5572737, 1e-6) for word in ("auto", "gauss_newton", "ipopt")},
         **{f"hammerstein_arx.overparametrised {word}": about(8.4605281, 1e-6) for word in ("auto", "clarabel")},

@@ -507,7 +507,7 @@ def test_a_horizon_compares_predictions(short):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:.*towards a pole, or a zero of C:optid.errors.DataWarning")  # of the noise model
+@pytest.mark.filterwarnings("ignore:.*stopped with status 'limit':optid.errors.DataWarning")  # of the noise model
 def test_two_outputs():
     one, two = plant(300, seed=4), plant(300, seed=4, cubic=0.2)
     found = identify(optid.Data(one.u, np.column_stack([one.y, two.y])), classes=[LINEAR], workers=1)
