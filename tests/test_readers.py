@@ -510,3 +510,11 @@ def test_fit_names_the_way_to_a_record():
     for source in (frame, pl.DataFrame(frame), {"u": U, "y": Y}, U):
         refuses(DataError, r"optid\.read\(df, ", optid.fit, source)
     refuses(DataError, r"fit\(optid.read\('r.csv', ", optid.fit, "r.csv")
+
+
+def test_numbers_with_decimal_commas_are_no_tags(tmp_path):
+    rows = "".join(f"{k};{(5, 4, 2.5, 1)[k // 5 % 4]:.6f};{k / 3:.6f}\n".replace(".", ",") for k in range(60))
+    path = tmp_path / "comma.csv"
+    path.write_text("Zeit;Ventil;Temperatur\n" + rows)
+    refuses(DataError, "no column 'u' or 'u1'", read, path)
+    assert read(path, inputs="Ventil", outputs="Temperatur", delimiter=";", decimal=",").n_samples == 60

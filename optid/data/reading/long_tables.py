@@ -32,7 +32,8 @@ def explained(error: DataError, table: Table, inputs: Any, outputs: Any) -> Data
         counts = [str(cell) for cell in cells[:10_000]]
         named = [one for one in asked if counts.count(str(one)) > 1]
         repeated = len(tags) <= MOST_TAGS and len(cells) >= 4 * len(tags) > 4 and not asked
-        if named or (repeated and not any(map(is_number, tags))):
+        numbers = any(is_number(tag.replace(",", ".")) for tag in tags)  # with decimal commas, too
+        if named or (repeated and not numbers):
             clock = next((one for one in table.names if one in table.dates or is_time_name(one)), "TIME")
             numeric = [one for one in table.names if one != name and one in loaded and _is_numeric(loaded[one])]
             value = next((one for one in numeric if "val" in one.lower()), numeric[0] if numeric else "VALUE")
