@@ -53,7 +53,7 @@ EXPECTED: dict[str, dict[str, Range]] = {
                   "gain": about(5.12, 0.05)},
     "step_tests": {"heater K": about(0.4, 0.004), "heater tau": about(150, 6), "heater dead_time": about(32, 3),
                    "heater proved": (1, 1), "heater Kc": about(5.9, 0.7), "tank tau": about(20, 6),
-                   "tank Kc": about(3.33, 1.0)},
+                   "tank Kc": about(3.33, 1.0)},  # half a 95 % interval
     "solvers": {
         **{f"hammerstein_arx.exact {word}": about(8.5572737, 1e-6) for word in ("auto", "gauss_newton", "ipopt")},
         **{f"hammerstein_arx.overparametrised {word}": about(8.4605281, 1e-6) for word in ("auto", "clarabel")},

@@ -70,14 +70,7 @@ def _coefficients(basis: Any, m: int) -> int:
 
 
 def _rate(formulation: str) -> str:
-    name = formulation.partition(".")[0]
+    name = formulation.partition(".")[0].removeprefix("hammerstein_")
     if formulation.endswith(".sid"):
         return "sid"
-    if name in ("lfr", "process"):
-        return {"lfr": "latent"}.get(name, name)
-    if name.endswith("wiener_ss"):
-        return "wiener"
-    if name in ("arx", "hammerstein_arx"):
-        return "arx"
-    return {"armax": "armax", "hammerstein_armax": "armax", "bj": "bj", "hammerstein_bj": "bj", "oe": "oe",
-            "hammerstein_oe": "oe"}.get(name, "ss")
+    return {"lfr": "latent", "wiener_ss": "wiener"}.get(name, name if name in RATES else "ss")
