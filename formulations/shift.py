@@ -23,7 +23,6 @@ from optid.identify.subspace.shift import Shifting, ShiftStep
 from optid.program.program import named
 
 DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
-NORMAL = frozenset({"positive", "trace"})  # constraints that fix the size of P
 
 
 def constrained_shift(up: np.ndarray, down: np.ndarray, rules: Sequence[Rule] = ()) -> Shifting:
@@ -46,7 +45,7 @@ def fit_of_shift(step: ShiftStep, rules: Sequence[Rule], given: tuple[np.ndarray
         return Problem(
             "shift", {"P": np.eye(n), "Q": contracted},
             (Length(root, np.zeros(len(root)), ("P", "Q")),),  # ‖(top Q - low P) change‖
-            builders=(_normalised, *rules), structural=NORMAL, symmetric=frozenset({"P"}), **common)
+            restrictions=(_normalised,), builders=tuple(rules), symmetric=frozenset({"P"}), **common)
     p = (given[0] + given[0].T) / 2
     target = np.ravel(step.low @ step.change, order="F")
     return Problem(
@@ -69,7 +68,7 @@ def centre_of_shift(step: ShiftStep, a: np.ndarray, rules: Sequence[Rule]) -> Pr
     return Problem(
         "centre", {"P": np.eye(len(a)), "margin": np.zeros(())}, (Inner({"margin": np.array(-1.0)}),),
         further=lambda variables, _: {"Q": inner @ variables["P"]}, facts={"reference": {"A": step.free}},
-        builders=(_normalised, ease), structural=NORMAL | {"margin"}, symmetric=frozenset({"P"}))
+        restrictions=(_normalised, ease), symmetric=frozenset({"P"}))
 
 
 def _normalised(view: Any) -> dict[str, list[Any]]:

@@ -19,28 +19,28 @@ difficult starts. IPOPT uses the sparsity, and takes records up to the limit in 
 without it here and are for some hundred samples. Longer records are refused; ``hammerstein_oe.exact`` takes them.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
+import scipy.sparse as sp
 
 from formulations.constraints.poles import asks_for_integrator
 from formulations.prediction_error import Orders, transfer_model
 from optid.arrays import one_of
 from optid.bases import Bases
 from optid.core.leaves import Product
-from optid.data.record import Data
+from optid.core.problem import Problem
+from optid.core.terms import Squares
+from optid.data.record import Data, Experiment
 from optid.errors import StructureError
 from optid.identify.arguments import check_offset
-from optid.identify.gauges import FIXED, signs_are_fixed
+from optid.identify.gauges import FIXED
 from optid.identify.prediction_error.search import arx_start, iterated
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.prediction_error.transfer_errors import TransferErrors, transfer_errors
-from optid.program.program import Program
-from optid.program.solution import Bound
 from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.steps import steps
@@ -54,7 +54,7 @@ NO_BOUND = "simulation errors are not convex in the poles: no lower bound is kno
 
 @steps(lambda given: {"hammerstein_oe.shooting": "NLP"})
 def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk: Orders = 0,
-          constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Program:
+          constraints: Sequence[Any] = (), gauge: str = "norm", offset: bool = True) -> Problem:
     """Minimise the simulation errors with the simulated outputs as variables.
 
     Named variables: ``Theta``, ``a``, ``b``, ``mu``, ``offset``, ``x``.
@@ -74,115 +74,89 @@ def exact(data: Data, *, na: int, nb: Orders, basis: Bases = "polynomial:3", nk:
         raise StructureError(
             f"{criterion.data.n_samples} samples: with the outputs of every sample as variables this formulation takes "
             f"up to {LIMIT}. Use 'hammerstein_oe.exact', which has the same optima, or fewer samples")
-    return _Shooting(criterion).program(constraints)
+    problem = _posed(criterion, _start(criterion)).subject_to(*constraints)
+    if gauge != "norm" or problem.fixes_signs:
+        return problem
+    return problem.beginning(problem.start, partial(transfer_model, criterion, signed=False))
 
 
-class _Shooting:
-    """Writes the programme of one record."""
-
-    def __init__(self, criterion: TransferErrors) -> None:
-        self.criterion, self.data, self.layout = criterion, criterion.data, criterion.unknowns.layout
-        self.labels = criterion.labels
-        self.key, self.places = criterion.key, Places.of(criterion)
-        self.variables = self.places.variables()
-        self.variables.pop("x0", None)  # the first outputs are the initial state
-        self.pairs = [(self.key("mu", c), self.key("b", c)) for c in range(self.layout.m)]
-
-    def program(self, constraints: Sequence[Any]) -> Program:
-        """Return the programme under the user's constraints."""
-        layout, gauge = self.layout, self.criterion.gauge
-        expressions: dict[str, Any] = dict(self.variables)
+def _posed(errors: TransferErrors, start: dict[str, Array]) -> Problem:
+    """State the problem of one record, without constraints of the user."""
+    layout, terms = errors.unknowns.layout, []
+    equations: dict[str, Callable[[View], Any]] = {}
+    products = [Product(errors.key("mu", c), errors.key("b", c), "") for c in range(layout.m)]
+    for e, label in zip(errors.data.experiments, errors.labels):
+        there = np.isfinite(e.y[:, 0])
+        terms.append(Squares(sp.eye_array(e.n_samples).tocsr()[there], e.y[there, 0], 0.0, (f"x{label}",)))
+        equations[f"dynamics{label}"] = partial(_dynamics, errors, e, label)
         for c in range(layout.m):
-            expressions[self.key("Theta", c)] = cp.outer(self.variables[self.key("mu", c)],
-                                                         self.variables[self.key("b", c)])
-        structural, derived, residuals = {}, {}, []
-        for i, label in enumerate(self.labels):
-            dynamics, own = self._experiment(i, label)
-            structural |= dynamics
-            derived |= own
-            expressions[f"x{label}"] = self.variables[f"x{label}"]
-            residuals.append(self.variables[f"residual{label}"])
-        if layout.na:
-            structural["stability"] = self._stable()
-        structural["gauge"] = tuple(Product(self.key("mu", c), self.key("b", c), gauge).condition(self.variables)
-                                    for c in range(layout.m))
-        start = self._start(derived)
-        reference = {name: start[name] for name in ("a", "offset") if name in start}
-        units = self.criterion.units
-        view = View(expressions, channels=layout.inputs,
-                    bases=dict(zip(layout.inputs, outer_bases(layout.bases, units))), gauge=gauge, reference=reference,
-                    units=units)
-        objective = cp.Minimize(sum(cp.sum_squares(r) for r in residuals))
-        bound = Bound.none(NO_BOUND)
-        program = Program("hammerstein_oe.shooting", objective, structural, self.variables, start,
-                          partial(transfer_model, self.criterion), view, frozenset(structural), derived=derived,
-                          scale=self.criterion.energy, certify=lambda program, values, duals: (bound, None),
-                          note=NO_BOUND, unit=self.criterion.unit).subject_to(*constraints)
-        if gauge != "norm" or signs_are_fixed(program, self.pairs):
-            return program
-        return replace(program, recover=partial(transfer_model, self.criterion, signed=False))
+            equations[f"nonlinearity of {errors.key('w', c)}{label}"] = partial(_nonlinearity, errors, e, label, c)
+    if layout.na:
+        equations["stability"] = _stability
+    equations["gauge"] = lambda v: [Product(one.mu, one.b, errors.gauge).condition(v.inner) for one in products]
+    return Problem(
+        "hammerstein_oe.shooting", start, tuple(terms), tuple(products), partial(transfer_model, errors),
+        {"channels": layout.inputs, "bases": dict(zip(layout.inputs, outer_bases(layout.bases, errors.units))),
+         "gauge": errors.gauge, "reference": {name: start[name] for name in ("a", "offset") if name in start},
+         "units": errors.units},
+        restrictions=(lambda v: {name: built(v) for name, built in equations.items()},), scale=errors.energy,
+        unit=errors.unit, energy=errors.unit * errors.energy, proof=NO_BOUND)
 
-    def _experiment(self, i: int, label: str) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the structural constraints and the derived variables of one experiment."""
-        e, layout, variables = self.data.experiments[i], self.layout, self.variables
-        n, count = layout.first_row, self.data.experiments[i].n_samples
-        x = variables[f"x{label}"] = cp.Variable(count, name=f"x{label}")
-        left = x[n:]
-        for lag in range(1, layout.na + 1):
-            left = left + variables["a"][lag - 1] * x[n - lag : count - lag]
-        right: Any = 0.0
-        constraints, derived = {}, {}
-        for c, lags in enumerate(layout.lags):
-            name = f"{self.key('w', c)}{label}"
-            w = variables[name] = cp.Variable(count, name=name)
-            derived[name] = layout.bases[c].values(e.u[:, c]) @ variables[self.key("mu", c)]
-            constraints[f"nonlinearity of {name}"] = (w == derived[name],)
-            for j, lag in enumerate(lags):
-                right = right + variables[self.key("b", c)][j] * w[n - lag : count - lag]
-        if "offset" in variables:
-            right = right + variables["offset"][0]
-        constraints[f"dynamics{label}"] = (left == right,)
-        there = np.flatnonzero(np.isfinite(e.y[:, 0]))
-        seen = x if there.size == count else x[there]
-        r = variables[f"residual{label}"] = cp.Variable(there.size, name=f"residual{label}")
-        derived[f"residual{label}"] = seen - e.y[there, 0]
-        constraints[f"residual{label}"] = (r == derived[f"residual{label}"],)
-        return constraints, derived
 
-    def _stable(self) -> tuple[Any, ...]:
-        """Return the constraints that build A up from reflection coefficients between -1 and 1."""
-        a, na = self.variables["a"], self.layout.na
-        kappa = self.variables["kappa"] = cp.Variable(na, name="kappa")
-        constraints: list[Any] = [kappa <= REFLECTION, kappa >= -REFLECTION]
-        below = None
-        for m in range(1, na + 1):
-            name = f"a of order {m}"
-            level = a if m == na else cp.Variable(m, name=name)
-            if m < na:
-                self.variables[name] = level
-            constraints.append(level[m - 1] == kappa[m - 1])
-            if below is not None:
-                constraints += [level[i] == below[i] + kappa[m - 1] * below[m - 2 - i] for i in range(m - 1)]
-            below = level
-        return tuple(constraints)
+def _dynamics(errors: TransferErrors, e: Experiment, label: str, v: View) -> Any:
+    """Return ``A(q) x = sum_c B_c(q) w_c + offset`` from the first sample on whose lags are all in the record."""
+    layout, inner, n, count = errors.unknowns.layout, v.inner, errors.unknowns.layout.first_row, e.n_samples
+    x, right = inner[f"x{label}"], inner["offset"][0] if "offset" in inner else 0.0
+    left = x[n:]
+    for lag in range(1, layout.na + 1):
+        left = left + inner["a"][lag - 1] * x[n - lag : count - lag]
+    for c, lags in enumerate(layout.lags):
+        w = inner[f"{errors.key('w', c)}{label}"]
+        for j, lag in enumerate(lags):
+            right = right + inner[errors.key("b", c)][j] * w[n - lag : count - lag]
+    return left == right
 
-    def _start(self, derived: Mapping[str, Any]) -> dict[str, Array]:
-        """The best of equation error, Steiglitz-McBride and instruments, with its simulation: every equation holds."""
-        criterion = self.criterion
-        found = arx_start(criterion)
-        others = [iterated(criterion, found.x, method) for method in ("Steiglitz-McBride", "instruments")]
-        best = min([found, *(one for one in others if one is not None)], key=lambda one: one.value)
-        x = criterion.normalised(best.x)
-        start = self.places.values(x)
-        for c, (mu, b) in enumerate(self.pairs):
-            sign = criterion.gain_sign(x, f"b{c}") if criterion.gauge == "norm" else 1.0
-            start |= {mu: sign * start[mu], b: sign * start[b]}
-        start |= zip([f"x{label}" for label in self.labels], criterion.simulate(criterion.unknowns.unpack(x)))
-        level, start["kappa"] = start.get("a", np.zeros(0)), np.zeros(self.layout.na)
-        for m in range(self.layout.na, 0, -1):  # the recursion backwards
-            start[f"a of order {m}"], start["kappa"][m - 1] = level, level[-1]
-            level = (level[:-1] - level[-1] * level[-2::-1]) / (1 - level[-1] ** 2)
-        start = {name: value for name, value in start.items() if name in self.variables}
-        for name, value in start.items():
-            self.variables[name].value = value
-        return {**start, **{name: np.asarray(expression.value) for name, expression in derived.items()}}
+
+def _nonlinearity(errors: TransferErrors, e: Experiment, label: str, c: int, v: View) -> Any:
+    """Return ``w = eta mu`` of one input."""
+    return v.inner[f"{errors.key('w', c)}{label}"] == (
+        errors.unknowns.layout.bases[c].values(e.u[:, c]) @ v.inner[errors.key("mu", c)])
+
+
+def _stability(v: View) -> list[Any]:
+    """Return the constraints that build A up from reflection coefficients between -1 and 1."""
+    kappa = v.inner["kappa"]
+    found: list[Any] = [kappa <= REFLECTION, kappa >= -REFLECTION]
+    below = None
+    for m in range(1, kappa.size + 1):
+        level = v.inner["a" if m == kappa.size else f"a of order {m}"]
+        found.append(level[m - 1] == kappa[m - 1])
+        if below is not None:
+            found += [level[i] == below[i] + kappa[m - 1] * below[m - 2 - i] for i in range(m - 1)]
+        below = level
+    return found
+
+
+def _start(errors: TransferErrors) -> dict[str, Array]:
+    """Return the best of equation error, Steiglitz-McBride and instruments, with its simulation: all equations hold."""
+    layout = errors.unknowns.layout
+    found = arx_start(errors)
+    others = [iterated(errors, found.x, method) for method in ("Steiglitz-McBride", "instruments")]
+    best = min([found, *(one for one in others if one is not None)], key=lambda one: one.value)
+    x = errors.normalised(best.x)
+    start = Places.of(errors).values(x)
+    start.pop("x0", None)  # the first outputs are the initial state
+    for c in range(layout.m):
+        mu, b = errors.key("mu", c), errors.key("b", c)
+        sign = errors.gain_sign(x, f"b{c}") if errors.gauge == "norm" else 1.0
+        start |= {mu: sign * start[mu], b: sign * start[b]}
+        start |= {f"{errors.key('w', c)}{label}": layout.bases[c].values(e.u[:, c]) @ start[mu]
+                  for e, label in zip(errors.data.experiments, errors.labels)}
+    start |= zip([f"x{label}" for label in errors.labels], errors.simulate(errors.unknowns.unpack(x)))
+    level, kappa = start.get("a", np.zeros(0)), np.zeros(layout.na)
+    for m in range(layout.na, 0, -1):  # the recursion backwards
+        if m < layout.na:
+            start[f"a of order {m}"] = level
+        kappa[m - 1] = level[-1]
+        level = (level[:-1] - level[-1] * level[-2::-1]) / (1 - level[-1] ** 2)
+    return {**start, "kappa": kappa} if layout.na else start

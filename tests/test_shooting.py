@@ -14,6 +14,7 @@ from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError, StructureError
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.solution import Status
+from optid.solving.express import as_program
 
 ORDERS = {"na": 2, "nb": 2, "nk": 1, "basis": BASIS}
 
@@ -95,7 +96,7 @@ def test_constraints_on_the_simulated_output_and_nonconvex_ones():
 
 
 def test_start_satisfies_the_programme_and_judging_is_ours():
-    program = shooting.exact(plain((150, 100), gaps=0.1), **ORDERS)
+    program = as_program(shooting.exact(plain((150, 100), gaps=0.1), **ORDERS))
     program.assign(program.start)
     for group in program.constraints.values():
         for member in group:

@@ -69,7 +69,7 @@ def _places(problem: CovarianceProblem) -> Problem:
         "fault.noise_covariance", {"scaled": np.maximum(units.T @ problem.target, 1.0)},
         (Squares.half(problem.target, {"scaled": units}),),
         further=lambda v, _: {"rho": cp.multiply(1 / sizes, v["scaled"])},
-        builders=(lambda view: {"variances": view["rho"] >= 0},), structural=frozenset({"variances"}),
+        restrictions=(lambda view: {"variances": view["rho"] >= 0},),
         scale=0.5 * float(problem.target @ problem.target))
 
 
@@ -81,8 +81,7 @@ def _full(problem: CovarianceProblem) -> Problem:
         "fault.noise_covariance full", {"Q": np.eye(problem.nx), "R": np.eye(problem.l)},
         (Squares.half(problem.target, parts),), symmetric=frozenset("QR"),
         further=lambda v, _: {"Q": cp.multiply(of_process, v["Q"]), "R": cp.multiply(of_sensor, v["R"])},
-        builders=(lambda view: {"process covariance": view["Q"] >> 0, "sensor covariance": view["R"] >> 0},),
-        structural=frozenset({"process covariance", "sensor covariance"}),
+        restrictions=(lambda view: {"process covariance": view["Q"] >> 0, "sensor covariance": view["R"] >> 0},),
         scale=0.5 * float(problem.target @ problem.target))
 
 

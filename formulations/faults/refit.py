@@ -128,8 +128,8 @@ def _step(name: str, problem: Refitting, theta: Array, r: Array, s: Array, const
         name, start, (misfit,), model=lambda values: Refitted(problem, _vector(problem, values)),
         facts={"channels": tuple(curve.name for curve in problem.curves), "gauge": "none",
                "bases": {curve.name: curve.basis for curve in problem.curves}, "outputs": problem.model.outputs},
-        further=lambda view, _: {short: view[long] for short, long in of_one.items()}, builders=(restrict, *rules),
-        structural=frozenset(restrict(start)), scale=misfit.value(start) or 1.0)
+        further=lambda view, _: {short: view[long] for short, long in of_one.items()}, restrictions=(restrict,),
+        builders=tuple(rules), scale=misfit.value(start) or 1.0)
 
 
 def _not_stronger(curve: Any) -> list[Any]:

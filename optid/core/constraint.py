@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 from cvxpy.constraints.constraint import Constraint as Member
 from cvxpy.constraints.psd import PSD
 
@@ -24,6 +25,7 @@ from optid.program.program import named
 from optid.program.view import View
 
 NEGLIGIBLE = 64 * float(np.finfo(float).eps)  # share of its constant beneath which a row has no size of its own
+DENSE = 1_000_000  # entries of the rows of a constraint up to which they are an array
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,8 @@ class Constraint:
         name: of the group.
         limit: the constraint as the user wrote it, its bound, and what its rows were divided by.
         cone: "zero", "below", "psd", or "other" where CVXPY alone measures it.
-        rows: (m, leaves), but for a matrix divided by their sizes; zeros where the cone is "other".
+        rows: (m, leaves), but for a matrix divided by their sizes; sparse where there are many, without entries where
+            the cone is "other".
         right: (m,).
         moving: whether its builder looked at values of an iterate.
         builder: position of its builder.
@@ -45,7 +48,7 @@ class Constraint:
     name: str
     limit: Limit
     cone: str
-    rows: Array
+    rows: Any
     right: Array
     moving: bool
     builder: int
@@ -75,7 +78,7 @@ class Constraint:
     def leaves(self, space: LeafSpace) -> frozenset[str]:
         """Return the names of the leaves that it speaks about."""
         if self.cone != "other":
-            return frozenset(name for name, place in space.places.items() if self.rows[:, place].any())
+            return frozenset(name for name, place in space.places.items() if abs(self.rows[:, place]).sum() > 0)
         names: dict[int, str] = {variable.id: name for name, variable in space.variables.items()}
         return frozenset(names.get(variable.id, "an auxiliary variable") for variable in self.limit.member.variables())
 
@@ -87,7 +90,7 @@ class Constraint:
         expression = rows_of(self.limit.member)
         return np.atleast_1d(self.limit.member.violation()).ravel() if expression is None else flat_value(expression)
 
-    def slope(self, space: LeafSpace, y: Values) -> Array:
+    def slope(self, space: LeafSpace, y: Values) -> Any:
         """Return the derivative (m, leaves) of g at values of the leaves; NaN where CVXPY knows none."""
         if self.cone != "other":
             return self.rows
@@ -157,7 +160,7 @@ class ConstraintReader:
         problem: its name, for messages.
         space: its leaves.
         facts: keyword arguments of the `View`.
-        convex: whether a constraint that is not convex is refused.
+        convex: whether a constraint of the user that is not convex is refused; not where one of the formulation is not.
         about: names of further expressions that depend on the point about which constraints are read.
     """
 
@@ -167,15 +170,16 @@ class ConstraintReader:
     convex: bool
     about: frozenset[str] = frozenset()
 
-    def read(self, builders: Sequence[Any], about: Values, further: Mapping[str, Any], only: set[int] | None = None
-             ) -> list[Constraint]:
+    def read(self, own: Sequence[Any], builders: Sequence[Any], about: Values, further: Mapping[str, Any],
+             only: set[int] | None = None) -> list[Constraint]:
         """Read builders about a point, all or some by their positions.
 
         Args:
-            builders: callables of the `View`, or what they would return.
+            own: those of the formulation.
+            builders: those of the user: callables of the `View`, or what they would return.
             about: the reference, where the facts have none.
             further: expressions besides the leaves.
-            only: positions.
+            only: positions, among both.
 
         Raises:
             StructureError: an unknown variable, a name used twice, a constraint that is not convex but has to be.
@@ -184,11 +188,12 @@ class ConstraintReader:
         shown = {name: one for name, one in {**self.space.variables, **further}.items() if one is not None}
         view = _NotingView(shown, **{**self.facts, "reference": reference})
         found: list[Constraint] = []
-        for number, builder in enumerate(builders):
+        convex = self.convex
+        for number, builder in enumerate((*own, *builders)):
             if only is not None and number not in only:
                 continue
             reference.asked, view.asked = False, set()
-            default = getattr(builder, "name", None) or f"constraint {number + 1}"
+            default = getattr(builder, "name", None) or f"constraint {number - len(own) + 1}"
             built = named(builder(view) if callable(builder) else builder, default)
             moving = reference.asked and "reference" not in self.facts or bool(view.asked & self.about)
             for name, limits in built.items():
@@ -198,7 +203,9 @@ class ConstraintReader:
                 # a straight line has no curvature
                 for position, limit in enumerate(limit for limit in limits if limit.member.size):
                     one = replace(self._rows(view, name, limit, moving, number), position=position, first=first)
-                    if self.convex:
+                    if number < len(own):
+                        convex = convex and (one.cone != "other" or limit.member.is_dcp())
+                    elif convex:
                         one.refuse_nonconvex(self.problem)
                     found.append(one)
                     first += len(one)
@@ -215,15 +222,26 @@ class ConstraintReader:
         parts = None if expression is None else affine_parts(expression)
         if parts is None or any(variable.id not in leaves for variable in parts[0]):
             count = sum(dual.size for dual in member.dual_variables)
-            return Constraint(name, limit, "other", np.zeros((count, self.space.size)), np.zeros(count), moving, number)
-        rows, right = np.zeros((parts[1].size, self.space.size)), -parts[1]
-        for variable, part in parts[0].items():
-            rows[:, self.space.places[leaves[variable.id]]] = part.toarray() if hasattr(part, "toarray") else part
+            return Constraint(name, limit, "other", sp.csr_array((count, self.space.size)), np.zeros(count), moving,
+                              number)
+        rows, right = self._in_leaves({leaves[variable.id]: part for variable, part in parts[0].items()},
+                                      parts[1].size), -parts[1]
         if cone == "psd":
             return Constraint(name, limit, cone, rows, right, moving, number)
-        sizes = np.abs(rows) @ self.space.entry_sizes  # no solver sees the units in which a row was written
+        sizes = abs(rows) @ self.space.entry_sizes  # no solver sees the units in which a row was written
         sizes = np.where(sizes > NEGLIGIBLE * np.abs(right), sizes, 1.0)
-        return Constraint(name, replace(limit, sizes=sizes), cone, rows / sizes[:, None], right / sizes, moving, number)
+        rows = rows / sizes[:, None] if isinstance(rows, np.ndarray) else sp.diags_array(1 / sizes) @ rows
+        return Constraint(name, replace(limit, sizes=sizes), cone, rows, right / sizes, moving, number)
+
+    def _in_leaves(self, parts: Mapping[str, Any], count: int) -> Any:
+        """Return slopes by some leaves as rows (count, leaves), sparse where there are many."""
+        if count * self.space.size > DENSE:
+            return sp.csr_array(sp.hstack([parts.get(name, sp.csr_array((count, place.stop - place.start)))
+                                           for name, place in self.space.places.items()]))
+        rows = np.zeros((count, self.space.size))
+        for name, part in parts.items():
+            rows[:, self.space.places[name]] = part.toarray() if sp.issparse(part) else part
+        return rows
 
 
 def _in_cone(member: Member) -> tuple[Any, str]:

@@ -87,10 +87,10 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     A point with numbers that are not finite is infinitely far from everything.
     """
     if not all(np.all(np.isfinite(x[name])) for name in problem.start):
-        return Judgement(np.nan, Residuals(np.inf, "", np.inf, np.inf), {}, False, np.zeros(len(problem.products)))
+        return Judgement(np.nan, Residuals(np.inf, "", np.inf, np.inf), {}, False, np.zeros(len(problem.gauged)))
     rows = rows_at(problem, x)
     violation, worst = 0.0, ""
-    for product in problem.products:
+    for product in problem.gauged:
         level, parts = product.level(x)
         amount = abs(level) / (1.0 + sum(float(np.sum(np.abs(flat(x[name])))) for name in parts))
         if not amount <= violation:  # also true for nan
@@ -263,7 +263,7 @@ class LagrangianAtPoint:
 def gauges(problem: Problem, x: Values) -> list[tuple[Array, Array]]:
     """Return the slope of every gauge by the unknowns, and the direction in which the scale of its product changes."""
     found = []
-    for product in problem.products:
+    for product in problem.gauged:
         slope, along = np.zeros(problem.size), np.zeros(problem.size)
         for name, part in product.level(x)[1].items():
             slope[problem.slices[name]] = part

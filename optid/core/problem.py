@@ -12,6 +12,7 @@ from optid.arrays import Array
 from optid.core.constraint import Constraint, ConstraintReader
 from optid.core.leaves import Affine, Leaf, LeafSpace, Product, slices_of
 from optid.core.terms import Errors, Squares, Term, Values, flat
+from optid.program.solution import Bound
 from optid.program.structure import GAUGE
 
 TRIALS = 5  # random points at which constraints are compared with those of the opposite signs
@@ -30,13 +31,18 @@ class Problem:
         facts: keyword arguments of the `View` that builders get: channels, bases, outputs, units, reference, ....
         further: (variables of the leaves, values of the unknowns) -> more expressions for it, such as Q = A P, or None
             for a leaf that it does not show.
-        builders: of the constraints.
+        restrictions: builders of constraints that belong to the formulation: they have no price, and need not be convex.
+        builders: of the user's constraints.
         scale: objective of the zero model, the yardstick of gaps.
         unit: what one unit of the objective is in units of the record.
         energy: of the outputs about their mean in units of the record, to which prices are relative.
         compressed: the compressed record, for intervals and figures.
-        structural: names of constraints that belong to the formulation, and have no price.
         symmetric: unknowns that are symmetric matrices.
+        bounds: of unknowns, each (least, largest) in the shape of the unknown.
+        courses: unknowns that the restrictions determine from the others, such as states at every sample.
+        settled: whether the start is close to an optimum, from which a solver should not wander.
+        proof: (problem, values, multipliers) -> bound on the objective, where no term implies one; or the reason why
+            there can be none.
         about: names of further expressions that depend on the values of the unknowns.
         weights: of penalties, which `under_weights` changes.
         posed: states the problem with given weights, as keywords.
@@ -49,13 +55,17 @@ class Problem:
     model: Callable[[Values], Any] = dict
     facts: Mapping[str, Any] = field(default_factory=dict)
     further: Callable[[Mapping[str, Any], Values], Mapping[str, Any]] | None = None
+    restrictions: tuple[Any, ...] = ()
     builders: tuple[Any, ...] = ()
     scale: float = 1.0
     unit: float = 1.0
     energy: float = float("nan")
     compressed: Any = field(default=None, repr=False)
-    structural: frozenset[str] = frozenset()
     symmetric: frozenset[str] = frozenset()
+    bounds: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
+    courses: frozenset[str] = frozenset()
+    settled: bool = False
+    proof: Callable[["Problem", Values, Values], Bound] | str = ""
     about: frozenset[str] = frozenset()
     weights: Mapping[str, float] = field(default_factory=dict)
     posed: Callable[..., "Problem"] | None = field(default=None, repr=False)
@@ -77,8 +87,8 @@ class Problem:
 
     def without(self, *names: str) -> "Problem":
         """Return the problem without the builders of named constraints."""
-        dropped = {one.builder for one in self.constraints() if one.name in names}
-        return replace(self, builders=tuple(b for k, b in enumerate(self.builders) if k not in dropped))
+        dropped, own = {one.builder for one in self.constraints() if one.name in names}, len(self.restrictions)
+        return replace(self, builders=tuple(b for k, b in enumerate(self.builders, own) if k not in dropped))
 
     def tangent(self, x: Values, squares: Squares, compressed: Any) -> "Problem":
         """Return the convex problem of a step from a point: squares in the unknowns, leaves and gauges to first order.
@@ -86,7 +96,7 @@ class Problem:
         Its constraints are those of this problem, read about the point where they move; one that is not convex in the
         leaves is a `StructureError`.
         """
-        gauges = tuple(product.level(x) for product in self.products if product.gauge)
+        gauges = tuple(product.level(x) for product in self.gauged)
 
         def gauge(view: Any) -> dict[str, Any]:
             return {GAUGE: [level + sum(part @ (cp.vec(view.inner[name], order="F") - flat(x[name]))
@@ -94,13 +104,12 @@ class Problem:
 
         step = replace(
             self, start=x, terms=(squares,), leaves=tuple(Affine.of(leaf, x) for leaf in self.leaves),
-            builders=(*self.builders, gauge) if gauges else self.builders, compressed=compressed,
-            structural=self.structural | {GAUGE} if gauges else self.structural)
+            restrictions=((gauge,) if gauges else ()) + self.restrictions, compressed=compressed)
         vars(step)["space"] = self.space  # the same leaves of the same usual sizes, in which constraints are read
-        held = [replace(one, moving=False) for one in self.constraints(x)]
+        held = [replace(one, moving=False, builder=one.builder + bool(gauges)) for one in self.constraints(x)]
         for one in held:
             one.refuse_nonconvex(self.name)
-        vars(step)["_at_start"] = (*held, *(step._read(x, {len(self.builders)}) if gauges else ()))
+        vars(step)["_at_start"] = (*(step._read(x, {0}) if gauges else ()), *held)
         return step
 
     # -- what it is made of
@@ -116,10 +125,21 @@ class Problem:
         names = {product.name for product in self.products}
         return tuple(term for term in self.terms if isinstance(term, Squares) and names & set(term.z))
 
+    @cached_property
+    def gauged(self) -> tuple[Product, ...]:
+        """The products between whose factors a gauge fixes the scale."""
+        return tuple(product for product in self.products if product.gauge)
+
     @property
-    def is_convex(self) -> bool:
+    def has_convex_terms(self) -> bool:
         """Whether all terms are convex in the unknowns."""
         return not self.bilinear_terms and not any(isinstance(term, Errors) for term in self.terms)
+
+    @property
+    def is_convex(self) -> bool:
+        """Whether all terms and all structural constraints are convex in the unknowns."""
+        return self.has_convex_terms and all(
+            one.cone != "other" or one.limit.member.is_dcp() for one in self._at_start if self._is_own(one))
 
     # -- layout
 
@@ -205,12 +225,12 @@ class Problem:
 
     def _read(self, x: Values, only: set[int] | None = None) -> list[Constraint]:
         further = {} if self.further is None else self.further(self.space.variables, x)
-        reader = ConstraintReader(self.name, self.space, self.facts, self.is_convex, self.about)
-        return reader.read(self.builders, x, further, only)
+        reader = ConstraintReader(self.name, self.space, self.facts, self.has_convex_terms, self.about)
+        return reader.read(self.restrictions, self.builders, x, further, only)
 
     @cached_property
     def _at_start(self) -> tuple[Constraint, ...]:
-        return tuple(self._read(self.start)) if self.builders else ()
+        return tuple(self._read(self.start)) if self.restrictions or self.builders else ()
 
     @cached_property
     def _read_about(self) -> dict[bytes, tuple[Constraint, ...]]:
@@ -231,7 +251,15 @@ class Problem:
     @property
     def constraint_names(self) -> tuple[str, ...]:
         """Names of the constraints of the user."""
-        return tuple(name for name in dict.fromkeys(one.name for one in self._at_start) if name not in self.structural)
+        return tuple(dict.fromkeys(one.name for one in self._at_start if not self._is_own(one)))
+
+    @property
+    def structural(self) -> frozenset[str]:
+        """Names of the constraints that belong to the formulation."""
+        return frozenset(one.name for one in self._at_start if self._is_own(one))
+
+    def _is_own(self, one: Constraint) -> bool:
+        return one.builder < len(self.restrictions)
 
     @cached_property
     def fixes_signs(self) -> bool:
@@ -239,7 +267,7 @@ class Problem:
 
         Those about ``mu bᵀ`` do not, nor do equations such as a symmetry of f.
         """
-        if not self._at_start:
+        if not self.constraint_names:
             return False
         rng = np.random.default_rng(0)
         for _ in range(TRIALS):
@@ -262,9 +290,11 @@ class Problem:
         return start
 
     def _violations(self, x: Values) -> Array:
-        """Return the violation of every row (of a matrix: the largest) at a point."""
+        """Return the violation of every row (of a matrix: the largest) of the user's constraints at a point."""
         y, found = self.leaf_values(x), []
         for one in self.constraints():
+            if self._is_own(one):
+                continue
             g = one.residual(self.space, y)
             found.append(np.array([one.violation(self.space, y)]) if one.cone in ("psd", "other") else
                          np.abs(g) if one.cone == "zero" else np.maximum(g, 0.0))

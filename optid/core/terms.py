@@ -38,14 +38,14 @@ class Squares:
     """``‖root z - target‖² + remainder``, z the leaves one after another.
 
     Attributes:
-        root: (k, n).
+        root: (k, n), sparse where it is large.
         target: (k,).
         remainder: what no leaf changes.
         z: names of the leaves.
         lifted: what special methods know of it: the same numbers with their rank-one blocks, or with groups.
     """
 
-    root: Array
+    root: Any
     target: Array
     remainder: float
     z: tuple[str, ...]
@@ -91,7 +91,7 @@ class Squares:
         """Return value and gradient."""
         r = self.residual(y)
         return Pull(float(r @ r) + self.remainder, split(2 * r @ self.root, y, self.z),
-                    split(2 * np.abs(r) @ np.abs(self.root), y, self.z))
+                    split(2 * np.abs(r) @ abs(self.root), y, self.z))
 
     def tangent(self, y: Values) -> "Squares":
         """Return the term itself: it is least squares already."""

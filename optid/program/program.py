@@ -267,6 +267,11 @@ class Program:
                     constraints[name], limits[name] = tuple(limit.member for limit in group), group
         return replace(self, constraints=constraints, variables=variables, limits=limits, core=core)
 
+    def stating(self, core: Any, convex: bool | None) -> "Program":
+        """Return the programme with the restrictions of a problem of the core, and the constraints of its user."""
+        return self.subject_to(*core.restrictions, convex=False, core=core).subject_to(
+            *core.builders, convex=convex, core=core)
+
     def under(self, core: Any) -> "Program":
         """Return a deferred programme under the constraints that a problem of the core has read.
 
@@ -277,7 +282,7 @@ class Program:
 
         def statement() -> dict[str, Any]:
             _ = self.objective
-            whole = self.subject_to(*core.builders, core=core)
+            whole = self.stating(core, None)
             return {part: getattr(whole, part) for part in STATED}
 
         return self._copied(core=core, _statement=statement, _held={})

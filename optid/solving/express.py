@@ -17,6 +17,7 @@ from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, NuclearNorms, Squares, stacked_expression, sum_of
 from optid.errors import StructureError
 from optid.program.program import Program
+from optid.program.solution import Bound
 from optid.program.structure import GAUGE
 from optid.program.view import View
 from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
@@ -42,7 +43,8 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
     several = [term for term in problem.terms if isinstance(term, Squares)]
     factorised = len(several) == 1 and several[0].lifted is not None
     if len(several) < len(problem.terms) or problem.products and not factorised or not (
-            step or len(several) > 1 or _is_triangular(several[0].root)):
+            all(isinstance(term.root, np.ndarray) for term in several) and (
+                step or len(several) > 1 or _is_triangular(several[0].root))):
         return _of_terms(problem, step)
     if len(several) > 1:
         sizes = {name: place.stop - place.start for name, place in problem.space.places.items()}
@@ -69,7 +71,7 @@ def as_program(problem: Problem, max_size: int = MAX_SIZE, step: bool = False) -
         scale=problem.scale, unit=problem.unit, compressed=problem.compressed, step=step,
         certify=partial(certify_rank_one, max_size=max_size) if products else None,
         core=replace(problem, builders=()))
-    return made.under(problem) if problem.builders else made
+    return made.under(problem) if problem.restrictions or problem.builders else made
 
 
 def _of_terms(problem: Problem, step: bool) -> Program:
@@ -80,7 +82,7 @@ def _of_terms(problem: Problem, step: bool) -> Program:
             raise StructureError(f"{type(term).__name__}, a term of {problem.name!r}, is no expression of its "
                                  "unknowns: state its squares near a point (Problem.tangent)")
     unknowns, leaves = _expressions(problem)
-    structural = {GAUGE: tuple(one.condition(unknowns) for one in problem.products)} if problem.products else {}
+    structural = {GAUGE: tuple(one.condition(unknowns) for one in problem.gauged)} if problem.gauged else {}
     parts, derived = [], {}
     for term in terms:
         expression = term.express(leaves)
@@ -88,7 +90,8 @@ def _of_terms(problem: Problem, step: bool) -> Program:
             derived["X"], expression = expression, cp.Variable(expression.shape, name="X")
             structural["structure"] = (expression == derived["X"],)
             unknowns, expression = {**unknowns, "X": expression}, cp.normNuc(expression)
-        if isinstance(term, Squares) and "residual" not in unknowns:  # a small dense matrix makes a sparse programme
+        # a small dense matrix makes a sparse programme
+        if isinstance(term, Squares) and isinstance(term.root, np.ndarray) and "residual" not in unknowns:
             derived["residual"] = term.root @ stacked_expression(leaves, term.z) - term.target
             r = unknowns["residual"] = cp.Variable(len(term.target), name="residual")
             structural["residual"], expression = (r == derived["residual"],), cp.sum_squares(r) + term.remainder
@@ -96,17 +99,23 @@ def _of_terms(problem: Problem, step: bool) -> Program:
     program = Program(
         problem.name, cp.Minimize(sum_of(parts)), structural, unknowns, problem.start, problem.model,
         _view(problem, leaves), problem.structural | structural.keys(), derived=derived, scale=problem.scale,
-        unit=problem.unit, compressed=problem.compressed, step=step, core=replace(problem, builders=()),
-        **_special(problem))
-    return program.subject_to(*problem.builders)
+        unit=problem.unit, compressed=problem.compressed, step=step, core=problem, courses=problem.courses,
+        settled=problem.settled, **_special(problem))
+    return program.stating(problem, problem.is_convex)
 
 
 def _is_triangular(root: Any) -> bool:
-    return isinstance(root, np.ndarray) and root.shape[0] == root.shape[1] and not np.tril(root, -1).any()
+    return root.shape[0] == root.shape[1] and not np.tril(root, -1).any()
 
 
 def _special(problem: Problem) -> dict[str, Any]:
     """Return what special methods and proofs know of a form of terms: arguments of a `Program`."""
+    if isinstance(problem.proof, str) and problem.proof:
+        bound = Bound.none(problem.proof)
+        return {"certify": lambda program, values, duals: (bound, None), "note": problem.proof}
+    if problem.proof:
+        proof = problem.proof
+        return {"certify": lambda program, values, duals: (proof(problem, values, duals), None)}
     match problem.terms:
         case (Squares(lifted=RankOne() as numbers, z=z), NuclearNorms() as norms) if z == tuple(problem.start):
             return {"certify": partial(certify_nuclear, numbers, z, norms)}
@@ -122,8 +131,8 @@ def _special(problem: Problem) -> dict[str, Any]:
 
 def _expressions(problem: Problem) -> tuple[dict[str, cp.Variable], dict[str, Any]]:
     """Return new variables of the unknowns, and the expressions of all leaves in them."""
-    unknowns = {name: cp.Variable(np.shape(value), name=name, symmetric=name in problem.symmetric)
-                for name, value in problem.start.items()}
+    unknowns = {name: cp.Variable(np.shape(value), name=name, symmetric=name in problem.symmetric,
+                                  bounds=problem.bounds.get(name)) for name, value in problem.start.items()}
     leaves: dict[str, Any] = {one.name: one.express(unknowns) for one in problem.leaves
                               if isinstance(one, Product | Affine)}
     return unknowns, {**unknowns, **leaves}

@@ -77,8 +77,7 @@ def fit_processes(errors: ProcessErrors, pose: Callable[[Array, Sequence[Any]], 
         return evidence if certify is None else replace(evidence, bound=partial(certify, errors, box, best.value))
     ends = []
     for point in [best, *points][: 1 + len(points)]:
-        within = pose(point.x, (*constraints, partial(_cell, errors)))
-        within = replace(within, structural=within.structural | {CELL})
+        within = replace(pose(point.x, constraints), restrictions=(partial(_cell, errors),))
         fit = TangentFit(within, errors, partial(CompressedErrors, errors))
         end = yield from refine(fit, _descent(errors, point.x), dict(figures), point.x)
         if end is None:
