@@ -18,16 +18,18 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
+import scipy.sparse as sp
 
 from optid.arrays import LARGEST_INTEGER, check_integer
+from optid.core.problem import Problem
+from optid.core.terms import Squares, Values
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.identify.physical import CompressedPhysical, PhysicalErrors
 from optid.identify.prediction_error.descent import best_of
 from optid.models.equations import Equations
 from optid.models.equations import equations as read
-from optid.program.program import Program, Values
-from optid.program.solution import Bound, Status
+from optid.program.solution import Status
 from optid.program.view import View
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
@@ -76,93 +78,95 @@ def _procedure(errors: PhysicalErrors, starts: int, seed: int, constraints: tupl
     collocation = _Collocation(errors)
     settled = bool(found) and np.isfinite(found[0].value)
     start = collocation.along(found[0].x) if settled else collocation.measured()
-    program = replace(collocation.program(constraints, start), settled=settled)
-    solution = yield program
+    problem = replace(collocation.problem(start), settled=settled).subject_to(*constraints)
+    solution = yield problem
     for _ in range(REWEIGHTED if errors.data.l > 1 and solution.has_point else 0):
         errors = errors.reweighted(errors.places.pack(solution.values))
-        program = replace(_Collocation(errors).program(constraints, solution.values), settled=True)
-        solution = yield program
+        start = {name: solution.values[name] for name in problem.start}
+        problem = replace(_Collocation(errors).problem(start), settled=True).subject_to(*constraints)
+        solution = yield problem
     if not solution.has_point:
         return None
-    program.assign(solution.values)
-    if isinstance(program.compressed, CompressedPhysical):
-        program.compressed.settle(program)
+    if isinstance(problem.compressed, CompressedPhysical):
+        problem.compressed.settle(solution.values)
         if solution.status in (Status.LOCAL, Status.OPTIMAL):
-            program.compressed.refuse_undetermined(program)
-    return program.recover(solution.values)
+            problem.compressed.refuse_undetermined(problem, solution.values)
+    return problem.model(solution.values)
 
 
 class _Collocation:
-    """Writes the programme of one record."""
+    """States the problem of one record."""
 
     def __init__(self, errors: PhysicalErrors) -> None:
         self.errors, self.data, self.equations = errors, errors.data, errors.equations
-        self.labels = errors.labels
-        self.variables = errors.places.variables()
-        sizes = errors.usual[errors.unknowns.n :]
-        self.view = {name: size * self.variables[name] for name, size in zip(self.equations.parameters, sizes)}
-        self.derived: dict[str, Any] = {}
-        self.structural: dict[str, Any] = {}
-        self.residuals = [one for i, label in enumerate(self.labels) for one in self._experiment(i, label)]
+        self.labels, self.apart = errors.labels, max(errors.steps, 1)
 
-    def program(self, constraints: Sequence[Any], start: Values) -> Program:
-        """Return the programme under the user's constraints."""
-        errors = self.errors
-        objective = cp.Minimize(sum(cp.sum_squares(one) for one in self.residuals))
-        bounds = {f"bounds of {name}": limits for name in self.equations.parameters
-                  if (limits := _within(self.view[name], *self.equations.interval(name)))}
-        for name, value in start.items():
-            self.variables[name].value = value
-        start = {**start, **{name: np.asarray(expression.value) for name, expression in self.derived.items()}}
-        bound = Bound.none(NO_BOUND)
-        program = Program(
-            "physical", objective, self.structural, self.variables, start,
-            lambda values: errors.model(errors.places.pack(values)), View(self.view),
-            frozenset(self.structural), derived=self.derived, scale=errors.energy,
-            certify=lambda program, values, duals: (bound, None), note=NO_BOUND,
-            compressed=CompressedPhysical(errors), unit=errors.unit,
-            courses=frozenset(name for name in self.variables if name.startswith("states of ")))
-        return program.subject_to(*([bounds] if bounds else []), *constraints, convex=False)
+    def problem(self, start: Values) -> Problem:
+        """Return the problem with a start, under the bounds that the equations give their parameters."""
+        errors, terms = self.errors, []
+        open_ended = {name: self.equations.interval(name) for name in self.equations.states}
+        bounds = {f"states of {name}{label}": tuple(np.full(np.shape(start[f"states of {name}{label}"]), end / size)
+                                                    for end in open_ended[name])
+                  for label in self.labels for name, size in zip(open_ended, errors.usual)}
+        for e, label in zip(self.data.experiments, self.labels):
+            for o, name in enumerate(self.data.outputs):
+                there, weight = np.isfinite(e.y[:, o]), float(np.sqrt(errors.weight[o, o]))
+                terms.append(Squares(weight * sp.eye_array(e.n_samples).tocsr()[there], weight * e.y[there, o], 0.0,
+                                     (f"output {name}{label}",)))
+        return Problem(
+            "physical", start, tuple(terms), model=lambda values: errors.model(errors.places.pack(values)),
+            further=lambda v, _: self._in_words(v), restrictions=(self._equations,), builders=(self._within,),
+            scale=errors.energy, unit=errors.unit, energy=errors.unit * errors.energy,
+            compressed=CompressedPhysical(errors), bounds=bounds,
+            courses=frozenset(name for name in start if name.startswith(("states of ", "output "))), proof=NO_BOUND)
 
-    def _experiment(self, i: int, label: str) -> list[Any]:
-        """Enter the dynamics of one experiment; return its residuals, one variable per output."""
-        errors, equations, e = self.errors, self.equations, self.data.experiments[i]
-        names, apart = tuple(equations.states), max(errors.steps, 1)
-        x0, courses = self.variables["x0"], {}
-        for j, name in enumerate(names):
-            low, high = (end / errors.usual[j] for end in equations.interval(name))
-            rest = cp.Variable((e.n_samples - 1) * apart, name=f"states of {name}{label}", bounds=[low, high])
-            self.variables[rest.name()] = rest
-            first = x0[j] if x0.ndim == 1 else x0[j, i]
-            courses[name] = errors.usual[j] * cp.hstack([first, rest])
-            self.view[f"{name}{label}"] = courses[name][::apart]
-            if ends := _within(first, low, high):
-                self.structural[f"first value of {name}{label}"] = tuple(ends)
-        grid = errors.grid(i)
-        now, after = (grid[:-1], grid[:-1] if equations.hold == "zero" else grid[1:])
-        moves = self._right({name: course[:-1] for name, course in courses.items()}, now)
-        if errors.steps:
-            half = self.data.dt / apart / 2  # of a step
-            ends = self._right({name: course[1:] for name, course in courses.items()}, after)
-            moves = {name: courses[name][:-1] + half * (moves[name] + ends[name]) for name in names}
-        self.structural[f"dynamics{label}"] = tuple(
-            (courses[name][1:] - moves[name]) / errors.usual[j] == 0 for j, name in enumerate(names))
-        at = {name: course[::apart] for name, course in courses.items()}
-        shown, residuals = self._right(at, e.u), []
-        for o, name in enumerate(self.data.outputs):
-            there = np.flatnonzero(np.isfinite(e.y[:, o]))
-            key = f"residual of {name}{label}"
-            residuals.append(cp.Variable(there.size, name=key))
-            self.variables[key] = residuals[-1]
-            value = shown[name] if there.size == e.n_samples else shown[name][there]
-            self.derived[key] = float(np.sqrt(errors.weight[o, o])) * (value - e.y[there, o])
-            self.structural[key] = (residuals[-1] == self.derived[key],)
-        return residuals
+    def _in_words(self, v: Mapping[str, Any]) -> dict[str, Any]:
+        """Return parameters and states in the units of the equations."""
+        sizes = self.errors.usual[self.errors.unknowns.n :]
+        found = {name: size * v[name] for name, size in zip(self.equations.parameters, sizes)}
+        for i, label in enumerate(self.labels):
+            found |= {f"{name}{label}": course[:: self.apart] for name, course in self._courses(i, v).items()}
+        return found
 
-    def _right(self, states: Mapping[str, Any], u: Array) -> dict[str, Any]:
+    def _courses(self, i: int, v: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the states of an experiment at the steps of integration."""
+        x0, label = v["x0"], self.labels[i]
+        return {name: self.errors.usual[j] * cp.hstack([x0[j] if x0.ndim == 1 else x0[j, i],
+                                                        v[f"states of {name}{label}"]])
+                for j, name in enumerate(self.equations.states)}
+
+    def _within(self, view: View) -> dict[str, list[Any]]:
+        """Return the bounds of the parameters, which have prices."""
+        found = {f"bounds of {name}": _within(view[name], *self.equations.interval(name))
+                 for name in self.equations.parameters}
+        return {name: limits for name, limits in found.items() if limits}
+
+    def _equations(self, view: View) -> dict[str, Any]:
+        """Return the dynamics, the bounds of the first states, and what the outputs are."""
+        errors, equations, v, found = self.errors, self.equations, view.inner, {}
+        parameters = {name: view[name] for name in equations.parameters}
+        for i, (e, label) in enumerate(zip(self.data.experiments, self.labels)):
+            courses = self._courses(i, v)
+            for j, name in enumerate(equations.states):
+                first = v["x0"][j] if v["x0"].ndim == 1 else v["x0"][j, i]
+                if ends := _within(first, *(end / errors.usual[j] for end in equations.interval(name))):
+                    found[f"first value of {name}{label}"] = ends
+            grid = errors.grid(i)
+            now, after = (grid[:-1], grid[:-1] if equations.hold == "zero" else grid[1:])
+            moves = self._right({name: course[:-1] for name, course in courses.items()}, now, parameters)
+            if errors.steps:
+                half = self.data.dt / self.apart / 2  # of a step
+                ends = self._right({name: course[1:] for name, course in courses.items()}, after, parameters)
+                moves = {name: course[:-1] + half * (moves[name] + ends[name]) for name, course in courses.items()}
+            found[f"dynamics{label}"] = [(course[1:] - moves[name]) / errors.usual[j] == 0
+                                         for j, (name, course) in enumerate(courses.items())]
+            shown = self._right({name: course[:: self.apart] for name, course in courses.items()}, e.u, parameters)
+            found[f"outputs{label}"] = [v[f"output {name}{label}"] == shown[name] for name in self.data.outputs]
+        return found
+
+    def _right(self, states: Mapping[str, Any], u: Array, parameters: Mapping[str, Any]) -> dict[str, Any]:
         """Evaluate the equations on courses of states and inputs (T, m)."""
         inputs = {name: cp.Constant(u[:, c]) for c, name in enumerate(self.data.inputs)}
-        parameters = {name: self.view[name] for name in self.equations.parameters}
         found = self.equations.evaluated({**inputs, **parameters, **states}, self.data.outputs)
         return {name: cp.Constant(np.zeros(len(u))) + value for name, value in found.items()}
 
@@ -189,6 +193,12 @@ class _Collocation:
             for j, name in enumerate(self.equations.states):  # a run may pass a bound, where equations stay as they are
                 start[f"states of {name}{label}"] = np.clip(
                     course[:, j], *(end / errors.usual[j] for end in self.equations.interval(name)))
+        v: dict[str, Any] = {name: cp.Constant(value) for name, value in start.items()}
+        words = self._in_words(v)
+        for i, (e, label) in enumerate(zip(self.data.experiments, self.labels)):
+            at = {name: course[:: self.apart] for name, course in self._courses(i, v).items()}
+            shown = self._right(at, e.u, {name: words[name] for name in self.equations.parameters})
+            start |= {f"output {name}{label}": np.asarray(shown[name].value) for name in self.data.outputs}
         return start
 
 

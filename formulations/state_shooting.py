@@ -36,6 +36,10 @@ from formulations.latent_signals import latent_channels
 from formulations.state_space import state_space_fit, state_space_model
 from optid.bases import Bases, Polynomial, Trigonometric
 from optid.bases.basis import Basis, span
+from optid.core.judge import largest_excess
+from optid.core.leaves import Product
+from optid.core.problem import Problem
+from optid.core.terms import Squares, Values
 from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.errors import StructureError
@@ -49,9 +53,8 @@ from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
 from optid.models.roots import spectral_radius
-from optid.program.judging import measure_violation
-from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
+from optid.program.structure import GAUGE
 from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
@@ -140,18 +143,17 @@ def _fit(name: str, data: Data, nx: int | str, constraints: Sequence[Any], stabi
 
 def _shoot(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: Descent,
            figures: Mapping[str, Any]) -> Procedure:
-    """Solve the programme from the result of the descents, and judge the model by its run."""
+    """Solve the problem from the result of the descents, and judge the model by its run."""
     fit = StateShooting(plan.name, errors, constraints, plan.units)
     x = with_signs(errors, best.x, fit.excess if constraints else None)
-    program = replace(fit.pose(x), settled=best.converged)
-    solution = yield program
+    problem = replace(fit.pose(x), settled=best.converged)
+    solution = yield problem
     if not solution.has_point:
         return None
-    program.assign(solution.values)
     x = fit.places.pack(solution.values)
     status, reason = _judged(errors, x, solution)
-    if status is Status.LOCAL and isinstance(program.compressed, CompressedStates):
-        program.compressed.settle(program)
+    if status is Status.LOCAL and isinstance(problem.compressed, CompressedStates):
+        problem.compressed.settle(solution.values)
     model = fit.recover(solution.values)
     bound = Bound.none(NO_BOUND.format(errors.errors))
     return Evidence(model, solution.objective, bound, status, reason, {**figures, "Gauss-Newton steps": best.steps})
@@ -193,84 +195,93 @@ class StateShooting:
 
     def excess(self, z0: Array) -> float:
         """Return the largest relative violation of a constraint at the start z0."""
-        program = self.pose(z0)
-        program.assign(program.start)
-        return measure_violation(program)[0]
+        problem = self.pose(z0)
+        return largest_excess(problem, problem.start)
 
-    def pose(self, z0: Array) -> Program:
-        """State the programme with the start z0."""
-        errors, variables, units = self.criterion, self.places.variables(), self.units
-        start = dict(self.places.values(z0))
-        compressed = CompressedStates(errors, errors.linearise(z0), z0, units, fixed=True)
+    def pose(self, z0: Array) -> Problem:
+        """State the problem with the start z0."""
+        errors, start = self.criterion, dict(self.places.values(z0))
+        compressed = CompressedStates(errors, errors.linearise(z0), z0, self.units, fixed=True)
         rows = np.pad(errors.gauge_rows(z0), ((0, 0), (0, z0.size - errors.unknowns.shared)))
-        structural: dict[str, Any] = {}
         if len(rows := np.vstack([rows, compressed.free])):
             rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-            structural["gauge"] = (rows @ (self.places.stacked(variables) - z0) == 0,)
-        for name, value in start.items():
-            variables[name].value = value
-        runs = errors.visited(errors.unknowns.unpack(z0))
-        derived = {}
+        runs, terms, courses = errors.visited(errors.unknowns.unpack(z0)), [], {}
         for i, label in enumerate(errors.labels):
-            structural |= self._experiment(i, label, variables, runs[i])
+            courses |= self._courses(i, label, runs[i], start)
             weights, measured = self._weights(i), np.nan_to_num(errors.data.experiments[i].y).ravel(order="F")
-            residual: Any = weights @ cp.vec(variables[f"output{label}"], order="F") - weights @ measured
-            r = variables[f"residual{label}"] = cp.Variable(residual.size, name=f"residual{label}")
-            derived[r.name()] = residual
-            structural[r.name()] = (r == residual,)
-            r.value = residual.value
-        start = {name: np.asarray(variable.value) for name, variable in variables.items()}
-        courses = frozenset(variables) - set(self.places.names) - set(derived)
-        expansion, key = errors.unknowns.expansion, errors.key
-        products = {key("Theta", c): cp.outer(variables[key("mu", c)] if free else np.ones(1), variables[key("b", c)])
-                    for c, free in enumerate(errors.unknowns.free)}
-        view = View({**variables, **products}, gauge="norm", channels=expansion.input_names,
-                    outputs=expansion.output_names, reference=start, units=units,
-                    bases=dict(zip(expansion.input_names, outer_bases(expansion.inputs, units))))
-        objective = cp.Minimize(sum(cp.sum_squares(variables[name]) for name in derived))
-        program = Program(self.name, objective, structural, variables, start, self.recover, view,
-                          frozenset(structural), derived=derived, compressed=compressed, scale=errors.energy,
-                          courses=courses,
-                          note=NO_BOUND.format(errors.errors))
-        return program.subject_to(*self.constraints)
+            terms.append(Squares(weights, weights @ measured, 0.0, (f"output{label}",)))
+        limits = {name: np.broadcast_to(WILD * np.max(np.abs(one), axis=0), one.shape) for name, one in courses.items()}
+        bounds = {name: (-limit, limit) for name, limit in limits.items()}
+        unknowns, key = errors.unknowns, errors.key
+        fixed = [c for c, free in enumerate(unknowns.free) if not free]
 
-    def _experiment(self, i: int, label: str, variables: dict[str, Any], run: Array) -> dict[str, Any]:
-        """Enter the courses of one experiment, their values those of a run; return the equations that tie them."""
-        e, unknowns, key = self.criterion.data.experiments[i], self.criterion.unknowns, self.criterion.key
-        expansion, n, found = unknowns.expansion, unknowns.n, {}
+        def equations(v: View) -> dict[str, Any]:
+            found = {GAUGE: rows @ (self.places.stacked(v.inner) - z0) == 0} if len(rows) else {}
+            for i, label in enumerate(errors.labels):
+                found |= self._equations(i, label, v.inner)
+            return found
 
-        def course(name: str, value: Array) -> cp.Variable:
-            limit = np.broadcast_to(WILD * np.max(np.abs(value), axis=0), value.shape)
-            one = variables[f"{name}{label}"] = cp.Variable(value.shape, name=f"{name}{label}", bounds=[-limit, limit])
-            one.value = value
-            return one
+        return Problem(
+            self.name, {**start, **courses}, tuple(terms),
+            tuple(Product(key("mu", c), key("b", c), "") for c, free in enumerate(unknowns.free) if free), self.recover,
+            {"gauge": "norm", "channels": unknowns.expansion.input_names, "outputs": unknowns.expansion.output_names,
+             "reference": {**start, **courses}, "units": self.units,
+             "bases": dict(zip(unknowns.expansion.input_names, outer_bases(unknowns.expansion.inputs, self.units)))},
+            further=lambda v, _: {key("Theta", c): cp.reshape(v[key("b", c)], (1, -1), order="C") for c in fixed},
+            restrictions=(equations,), scale=errors.energy, compressed=compressed, bounds=bounds,
+            courses=frozenset(courses), proof=NO_BOUND.format(errors.errors)).subject_to(*self.constraints)
 
-        x = course("states", run)
-        following, shown = x @ variables["A"].T, x @ variables["C"].T
-        for c, basis in enumerate(expansion.inputs):
-            b, eta = variables[key("b", c)], basis.values(e.u[:, c])
-            f = eta @ variables[key("mu", c)] if unknowns.free[c] else cp.Constant(eta[:, 0])
+    def _courses(self, i: int, label: str, run: Array, start: Values) -> dict[str, Array]:
+        """Return the courses of one experiment, its states those of a run."""
+        v: dict[str, Any] = {name: cp.Constant(value) for name, value in start.items()}
+        found = {f"states{label}": run}
+        v[f"states{label}"] = cp.Constant(run)
+        for name, argument in self._arguments(i, label, v).items():
+            found[name] = np.asarray(argument.value)
+            v[name] = cp.Constant(found[name])
+        return {**found, f"output{label}": np.asarray(self._acting(i, label, v)[1].value)}
+
+    def _arguments(self, i: int, label: str, v: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the latent signals of one experiment are equal to."""
+        x, u, n, found = v[f"states{label}"], self.criterion.data.experiments[i].u, self.criterion.unknowns.n, {}
+        for j, one in enumerate(self.criterion.unknowns.latent):
+            name = self.criterion.key("z", j)
+            row = v[name]
+            found[f"signal of {name}{label}"] = x @ row[:n] + row[-1] + (u @ row[n:-1] if one.moved else 0.0)
+        return found
+
+    def _acting(self, i: int, label: str, v: Mapping[str, Any]) -> tuple[Any, Any]:
+        """Return the states that follow, without what outputs feed back, and the outputs."""
+        e, unknowns, key, x = (self.criterion.data.experiments[i], self.criterion.unknowns, self.criterion.key,
+                               v[f"states{label}"])
+        n, following, shown = unknowns.n, x @ v["A"].T, x @ v["C"].T
+        for c, basis in enumerate(unknowns.expansion.inputs):
+            b, eta = v[key("b", c)], basis.values(e.u[:, c])
+            f = eta @ v[key("mu", c)] if unknowns.free[c] else cp.Constant(eta[:, 0])
             following = following + cp.outer(f, b[:n])
             shown = shown + cp.outer(f, b[n:]) if unknowns.feedthrough[c] else shown
         for j, one in enumerate(unknowns.latent):
-            row, matrix = variables[key("z", j)], variables[key("g", j)]
-            argument = x @ row[:n] + row[-1] + (e.u @ row[n:-1] if one.moved else 0.0)
-            z = course(f"signal of {key('z', j)}", argument.value)
-            found[f"{z.name()}"] = (z == argument,)
-            h = _values(one.basis, z, one.vectors @ variables[key("c", j)])
+            matrix = v[key("g", j)]
+            h = _values(one.basis, v[f"signal of {key('z', j)}{label}"], one.vectors @ v[key("c", j)])
             following = following + cp.outer(h, matrix[:n])
             shown = shown + cp.outer(h, matrix[n:]) if one.direct else shown
         if unknowns.constant:
-            shown = shown + cp.outer(cp.Constant(np.ones(len(run))), variables["offset"])
-        output = course("output", shown.value)
-        for j, family in enumerate(expansion.feedback):
-            nu = variables[key("nu", j)] if family.size > 1 else np.ones(1)
+            shown = shown + cp.outer(cp.Constant(np.ones(e.n_samples)), v["offset"])
+        return following, shown
+
+    def _equations(self, i: int, label: str, v: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the equations that tie the courses of one experiment."""
+        output, key = v[f"output{label}"], self.criterion.key
+        following, shown = self._acting(i, label, v)
+        for j, family in enumerate(self.criterion.unknowns.expansion.feedback):
+            nu = v[key("nu", j)] if family.size > 1 else np.ones(1)
             g = (_values(family.basis, output[:, family.output], family.vectors @ nu)
                  - family.intercept @ nu - output @ (family.slope.T @ nu))
-            following = following + cp.outer(g, variables[key("e", j)])
-        first = variables["x0"] if len(self.criterion.labels) == 1 else variables["x0"][:, i]
-        return {**found, f"initial state{label}": (x[0] == first,), f"dynamics{label}": (x[1:] == following[:-1],),
-                f"outputs{label}": (output == shown,)}
+            following = following + cp.outer(g, v[key("e", j)])
+        first = v["x0"] if len(self.criterion.labels) == 1 else v["x0"][:, i]
+        return {**{name: v[name] == argument for name, argument in self._arguments(i, label, v).items()},
+                f"initial state{label}": v[f"states{label}"][0] == first,
+                f"dynamics{label}": v[f"states{label}"][1:] == following[:-1], f"outputs{label}": output == shown}
 
     def _weights(self, i: int) -> sp.csr_array:
         """Return the matrix that weighs the outputs of an experiment, column by column, as far as they are present."""

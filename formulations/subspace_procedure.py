@@ -112,8 +112,8 @@ def realisation_problem(realisation: Realisation, plan: Plan) -> Problem:
              "bases": dict(zip(x.input_names, outer_bases(x.inputs, units))),
              "gauge": "norm" if realisation.factored else "", "reference": {"A": form.a, "C": form.c}}
     return Problem("split", start, (objective,), products, partial(realisation.model, plan.data), facts,
-                   partial(_matrices, realisation), plan.about("coefficients"), realisation.problem.scale,
-                   1.0 if relative else energy_unit(units))
+                   partial(_matrices, realisation), builders=plan.about("coefficients"),
+                   scale=realisation.problem.scale, unit=1.0 if relative else energy_unit(units))
 
 
 def _matrices(realisation: Realisation, variables: Mapping[str, Any], x: object) -> dict[str, Any]:

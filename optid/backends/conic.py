@@ -186,7 +186,7 @@ def _has_rows_alone(program: Program) -> bool:
         return False
     if problem.symmetric or not all(isinstance(leaf, Affine) for leaf in problem.leaves):
         return False
-    return problem.is_measured
+    return problem.is_in_rows
 
 
 def _least_squares_in_rows(problem: Problem, settings: Settings) -> Answer:

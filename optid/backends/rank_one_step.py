@@ -19,7 +19,7 @@ from optid.arrays import Array
 from optid.backends.back_end import Answer, Settings
 from optid.backends.conic import SHARP, solve_least_squares, tolerances
 from optid.core.constraint import Constraint, join_by_name
-from optid.core.judge import ACTIVE, gauges, size_of_terms
+from optid.core.judge import ACTIVE, gauges, sizes_of_terms
 from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.terms import Values, flat
@@ -133,7 +133,7 @@ class RankOneStep:
             return None
         counts = np.cumsum([pins, *map(len, self.tangents), *map(len, self.convex)])
         multipliers = [unit**2 * found.duals["rows"][a:b] / u
-                       for a, b, u in zip(counts, counts[1:], [*units, *[1.0] * len(self.convex)])]
+                       for a, b, u in zip(counts, counts[1:], [*units, *(1 / one.sizes for one in self.convex)])]
         named = join_by_name((*self.tangents, *self.convex), multipliers)
         if not pinned:
             named[GAUGE] = unit**2 * found.duals["rows"][:pins]
@@ -198,7 +198,8 @@ class RankOneStep:
         held = [gauge * units for gauge, _ in gauges(problem, x)]
         rows = np.vstack([np.zeros((0, problem.size)), *(one.rows @ slope * units for one in self.constraints)])
         equal = np.concatenate([np.full(len(one), one.cone == "zero") for one in self.constraints])
-        active = np.concatenate([one.residual(problem.space, y) > -ACTIVE * size_of_terms(one, problem.space, y)
+        active = np.concatenate([(g := one.residual(problem.space, y)) > -ACTIVE * sizes_of_terms(
+            one, one.rows, g, problem.space, y)[0]
                                  for one in self.constraints]) | equal
         gauged, fitted = np.array(held).reshape(-1, problem.size), np.zeros(len(rows))
         both = np.vstack([gauged, rows[active]])

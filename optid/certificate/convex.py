@@ -75,7 +75,8 @@ def _bound_by_rows(problem: Problem, form: LeastSquaresStructure, values: Values
         if one.name not in duals:
             return -np.inf
         dual = in_dual_cone(one, duals[one.name][one.span])
-        columns = np.concatenate([one.rows[:, problem.space.places[name]] for name in form.linear], axis=1)
+        rows = one.slope(problem.space, x)  # a convex one lies above its tangent
+        columns = np.concatenate([rows[:, problem.space.places[name]] for name in form.linear], axis=1)
         pull, value = pull + columns.T @ dual, value + float(dual @ one.residual(problem.space, x))
     step = solve_triangular(root, pull, trans=1)
     return value - float(step @ step) / 4

@@ -8,6 +8,7 @@ values of an iterate is *moving*: it is read again at every iterate.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,12 @@ from optid.arrays import Array
 from optid.core.leaves import LeafSpace
 from optid.core.terms import Values
 from optid.errors import StructureError
-from optid.program.expressions import affine_parts, flat_value, jacobians, side_by_side
+from optid.program.expressions import KINKS, affine_parts, flat_value, jacobians, row_sizes
 from optid.program.limits import EQUALITIES, Limit, rows_of
 from optid.program.program import named
 from optid.program.view import View
 
 NEGLIGIBLE = 64 * float(np.finfo(float).eps)  # share of its constant beneath which a row has no size of its own
-DENSE = 1_000_000  # entries of the rows of a constraint up to which they are an array
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,7 @@ class Constraint:
         rows: (m, leaves), but for a matrix divided by their sizes; sparse where there are many, without entries where
             the cone is "other".
         right: (m,).
+        expression: of an "other" one what it holds at zero or not above it; None for a cone that is not read.
         moving: whether its builder looked at values of an iterate.
         builder: position of its builder.
         position: of it in its group.
@@ -54,9 +55,21 @@ class Constraint:
     builder: int
     position: int = 0
     first: int = 0
+    expression: Any = None
 
     def __len__(self) -> int:
         return len(self.right)
+
+    @property
+    def is_equality(self) -> bool:
+        """Whether its rows are zero."""
+        return isinstance(self.limit.member, EQUALITIES)
+
+    @cached_property
+    def is_smooth(self) -> bool:
+        """Whether it has a slope everywhere: no cone that is not read, no atom with a kink."""
+        return self.cone != "other" or self.expression is not None and not (
+            {atom.__name__ for atom in self.expression.atoms()} & KINKS)
 
     @property
     def span(self) -> slice:
@@ -87,24 +100,26 @@ class Constraint:
         if self.cone != "other":
             return self.rows @ space.vector(y) - self.right
         space.assign(y)
-        expression = rows_of(self.limit.member)
-        return np.atleast_1d(self.limit.member.violation()).ravel() if expression is None else flat_value(expression)
+        if self.expression is None:
+            return np.full(len(self), float(np.max(np.asarray(self.limit.member.violation()), initial=0.0)))
+        return flat_value(self.expression) / self.sizes
 
     def slope(self, space: LeafSpace, y: Values) -> Any:
         """Return the derivative (m, leaves) of g at values of the leaves; NaN where CVXPY knows none."""
         if self.cone != "other":
             return self.rows
         space.assign(y)
-        expression = rows_of(self.limit.member)
-        parts = None if expression is None else jacobians(expression)
+        parts = None if self.expression is None else jacobians(self.expression)
         if parts is None:
             return np.full((len(self), space.size), np.nan)
-        return np.asarray(side_by_side(parts, space.variables.values(), len(self)))
+        names = {variable.id: name for name, variable in space.variables.items()}
+        return space.rows({names[one.id]: sp.diags_array(1 / self.sizes) @ part for one, part in parts.items()
+                           if one.id in names}, len(self))
 
     def violation(self, space: LeafSpace, y: Values) -> float:
         """Return the sum of the violations of its rows, or the largest one of a matrix."""
         g = self.residual(space, y)
-        if self.cone == "zero":
+        if self.is_equality:
             return float(np.sum(np.abs(g)))
         if self.cone == "psd":
             return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
@@ -202,7 +217,7 @@ class ConstraintReader:
                 first = 0
                 # a straight line has no curvature
                 for position, limit in enumerate(limit for limit in limits if limit.member.size):
-                    one = replace(self._rows(view, name, limit, moving, number), position=position, first=first)
+                    one = replace(self._rows(view, name, limit, moving, number, number < len(own)), position=position, first=first)
                     if number < len(own):
                         convex = convex and (one.cone != "other" or limit.member.is_dcp())
                     elif convex:
@@ -211,8 +226,11 @@ class ConstraintReader:
                     first += len(one)
         return found
 
-    def _rows(self, view: View, name: str, limit: Limit, moving: bool, number: int) -> Constraint:
-        """Return one member as rows on the leaves, where it is affine in them."""
+    def _rows(self, view: View, name: str, limit: Limit, moving: bool, number: int, own: bool) -> Constraint:
+        """Return one member as rows on the leaves, where it is affine in them.
+
+        Rows are divided by their sizes, but for those of the formulation itself that are not affine.
+        """
         member, leaves = limit.member, {variable.id: leaf for leaf, variable in self.space.variables.items()}
         foreign = sorted({v.name() for v in member.variables() if v.id not in leaves and not view.owns(v)})
         if foreign:
@@ -222,9 +240,12 @@ class ConstraintReader:
         parts = None if expression is None else affine_parts(expression)
         if parts is None or any(variable.id not in leaves for variable in parts[0]):
             count = sum(dual.size for dual in member.dual_variables)
-            return Constraint(name, limit, "other", sp.csr_array((count, self.space.size)), np.zeros(count), moving,
-                              number)
-        rows, right = self._in_leaves({leaves[variable.id]: part for variable, part in parts[0].items()},
+            if expression is not None and cone != "psd" and not own:
+                usual = {self.space.variables[leaf].id: size for leaf, size in self.space.usual_sizes.items()}
+                limit = replace(limit, sizes=row_sizes(expression, usual))
+            return Constraint(name, limit, "other", self.space.rows({}, count), np.zeros(count), moving, number,
+                              expression=expression if cone != "psd" else None)
+        rows, right = self.space.rows({leaves[variable.id]: part for variable, part in parts[0].items()},
                                       parts[1].size), -parts[1]
         if cone == "psd":
             return Constraint(name, limit, cone, rows, right, moving, number)
@@ -233,15 +254,6 @@ class ConstraintReader:
         rows = rows / sizes[:, None] if isinstance(rows, np.ndarray) else sp.diags_array(1 / sizes) @ rows
         return Constraint(name, replace(limit, sizes=sizes), cone, rows, right / sizes, moving, number)
 
-    def _in_leaves(self, parts: Mapping[str, Any], count: int) -> Any:
-        """Return slopes by some leaves as rows (count, leaves), sparse where there are many."""
-        if count * self.space.size > DENSE:
-            return sp.csr_array(sp.hstack([parts.get(name, sp.csr_array((count, place.stop - place.start)))
-                                           for name, place in self.space.places.items()]))
-        rows = np.zeros((count, self.space.size))
-        for name, part in parts.items():
-            rows[:, self.space.places[name]] = part.toarray() if sp.issparse(part) else part
-        return rows
 
 
 def _in_cone(member: Member) -> tuple[Any, str]:

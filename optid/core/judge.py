@@ -7,15 +7,16 @@ follows from the objective not depending on the scale between its factors.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.core.constraint import Constraint, symmetric_part
 from optid.core.leaves import LeafSpace
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
-from optid.program.judging import term_size
 from optid.program.prices import ACTIVE
 from optid.program.solution import Residuals
 from optid.program.structure import relative_gradient, variable_size
@@ -23,6 +24,8 @@ from optid.structures.multipliers import fit_multipliers
 
 UNCONFIRMED = 1e-7  # stationarity above which multipliers fitted to the point are tried as well
 NOTHING = 1e-7  # share of the objective below which a part that has almost vanished counts as zero
+INSIDE = 1e-6  # distance from a bound of an unknown, relative to its size, within which it holds
+LARGEST = 4_000_000  # entries of the slopes of active rows up to which multipliers are fitted to a point
 ANGLES = 24  # directions in a plane of null vectors of a matrix constraint
 
 
@@ -52,14 +55,14 @@ class RowsAtPoint:
     Attributes:
         constraint: it.
         residual: g (m,).
-        slope: (m, unknowns).
+        slope: (m, unknowns), sparse where it has many entries.
         size: of what the rows add up.
         size_in_words: the same in the units in which the user wrote it.
     """
 
     constraint: Constraint
     residual: Array
-    slope: Array
+    slope: Any
     size: float
     size_in_words: float
 
@@ -68,7 +71,7 @@ class RowsAtPoint:
         """How far it is violated, relative to its size."""
         return _excess(self.constraint, self.residual) / self.size
 
-    def gradients(self) -> tuple[Array, Array]:
+    def gradients(self) -> tuple[Any, Array]:
         """Return the slopes of what is active, and the multipliers that one unit of each stands for."""
         g, m = self.residual, len(self.constraint)
         if self.constraint.cone == "psd":
@@ -77,7 +80,7 @@ class RowsAtPoint:
             parts = [flat(np.outer(null @ turn, null @ turn)) for turn in _directions(null.shape[1])]
             weights = np.array(parts).reshape(-1, m)
             return weights @ self.slope, weights
-        active = np.flatnonzero((g > -ACTIVE * self.size) | (self.constraint.cone == "zero"))
+        active = np.flatnonzero((g > -ACTIVE * self.size) | self.constraint.is_equality)
         return self.slope[active], np.eye(m)[active]
 
 
@@ -99,14 +102,23 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
         amount = float(np.max(np.abs(x[name] - x[name].T), initial=0.0)) / (1.0 + float(np.max(np.abs(x[name]))))
         if not amount <= violation:
             violation, worst = amount, f"symmetry of {name}"
+    for name, (low, high) in problem.bounds.items():
+        amount = float(np.max(np.maximum(low - x[name], x[name] - high), initial=0.0)) / _width(problem, x, name)
+        if not amount <= violation:
+            violation, worst = amount, name
     for row in rows:
         if not row.excess <= violation:
             violation, worst = row.excess, row.constraint.name
 
     lagrangian = LagrangianAtPoint.of(problem, x)
-    given = _projected(rows, duals)
-    best, fitted = (np.inf, np.inf) if given is None else lagrangian.measure(rows, given), False
-    if rows and not best[0] <= UNCONFIRMED and (own := _fitted(problem, x, rows, lagrangian)) is not None:
+    given, fitted = _projected(rows, duals), False
+    if not problem.is_measured:
+        best = np.nan, np.nan
+    elif given is not None:
+        best = lagrangian.measure(rows, given)
+    else:
+        best = (np.inf, np.inf) if _size(problem, rows) <= LARGEST else (np.nan, np.nan)
+    if rows and not np.isnan(best[0]) and not best[0] <= UNCONFIRMED and (own := _fitted(problem, x, rows, lagrangian)) is not None:
         again = lagrangian.measure(rows, own)
         if not again[0] >= best[0]:
             given, best, fitted = own, again, True
@@ -118,14 +130,22 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
                      lagrangian.gauge_multipliers(rows, given or ()))
 
 
+def _width(problem: Problem, x: Values, name: str) -> float:
+    """Return the size of an unknown with bounds: its own, or that of a bound."""
+    ends = [float(np.max(np.abs(end[np.isfinite(end)]), initial=0.0)) for end in problem.bounds[name]]
+    return max([variable_size(x[name], problem.space.usual_sizes.get(name)), *ends])
+
+
 def rows_at(problem: Problem, x: Values) -> list[RowsAtPoint]:
     """Return the constraints of a problem at a point."""
     held = problem.constraints(x)
     if not held:
         return []
-    y, slope = problem.leaf_values(x), problem.slope(x)
-    return [RowsAtPoint(one, one.residual(problem.space, y), one.slope(problem.space, y) @ slope,
-                *sizes_of_terms(one, problem.space, y)) for one in held]
+    y, slope, found = problem.leaf_values(x), problem.slope(x), []
+    for one in held:
+        rows, g = one.slope(problem.space, y), one.residual(problem.space, y)
+        found.append(RowsAtPoint(one, g, rows @ slope, *sizes_of_terms(one, rows, g, problem.space, y)))
+    return found
 
 
 def largest_excess(problem: Problem, x: Values, unknowns: frozenset[str] = frozenset()) -> float:
@@ -136,7 +156,8 @@ def largest_excess(problem: Problem, x: Values, unknowns: frozenset[str] = froze
     y, worst = problem.leaf_values(x), 0.0
     for one in problem.constraints(x):
         if not unknowns or one.leaves(problem.space) <= unknowns:
-            amount = _excess(one, one.residual(problem.space, y)) / size_of_terms(one, problem.space, y)
+            g = one.residual(problem.space, y)
+            amount = _excess(one, g) / sizes_of_terms(one, one.slope(problem.space, y), g, problem.space, y)[0]
             worst = worst if amount <= worst else amount  # also nan
     return worst if np.isfinite(worst) else float("inf")
 
@@ -145,30 +166,27 @@ def _excess(one: Constraint, g: Array) -> float:
     """Return the largest violation of a row, in its own units, or of a matrix."""
     if one.cone == "psd":
         return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
-    return float(np.max(np.abs(g) if one.cone == "zero" else np.maximum(g, 0.0), initial=0.0))
+    return float(np.max(np.abs(g) if one.is_equality else np.maximum(g, 0.0), initial=0.0))
 
 
-def size_of_terms(one: Constraint, space: LeafSpace, y: Values) -> float:
-    """Return the size of what the rows of a constraint add up, in units of the rows; one where they are empty."""
-    return sizes_of_terms(one, space, y)[0]
-
-
-def sizes_of_terms(one: Constraint, space: LeafSpace, y: Values) -> tuple[float, float]:
-    """Return the size of what the rows of a constraint add up, in units of the rows and in the user's.
+def sizes_of_terms(one: Constraint, rows: Any, g: Array, space: LeafSpace, y: Values) -> tuple[float, float]:
+    """Return the size of what the rows of a constraint (m, leaves) add up, in units of the rows and in the user's.
 
     Every leaf counts with its largest entry, but not below its usual size: where it vanishes only rounding is left.
     """
-    if one.cone == "other":
-        space.assign(y)
-        size = term_size(one.limit.member)
-        return size, size
-    total = np.abs(one.right)
+    if one.cone == "other" and (one.expression is None or not np.all(np.isfinite(g)) or _has_gap(rows)):
+        size = max((float(np.max(np.abs(arg.value), initial=0.0)) for arg in one.limit.member.args), default=0.0)
+        return (size or 1.0) / float(np.min(one.sizes)), size or 1.0
+    total = np.abs(one.right if one.cone != "other" else rows @ space.vector(y) - g)
     for name, place in space.places.items():
-        part = np.abs(one.rows[:, place])
-        if part.any():
-            largest = float(np.max(np.abs(y[name]), initial=0.0))
-            total = total + part.sum(axis=1) * max(largest, space.usual_sizes.get(name, 0.0))
+        largest = max(float(np.max(np.abs(y[name]), initial=0.0)), space.usual_sizes.get(name, 0.0))
+        total = total + largest * np.asarray(abs(rows[:, place]).sum(axis=1)).ravel()
     return float(np.max(total, initial=0.0)) or 1.0, float(np.max(total * one.sizes, initial=0.0)) or 1.0
+
+
+def _has_gap(rows: Any) -> bool:
+    """Whether a slope is not known everywhere."""
+    return not np.all(np.isfinite(rows.data if sp.issparse(rows) else rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +217,7 @@ class LagrangianAtPoint:
             terms += np.abs(dual) @ np.abs(row.slope)
             if row.constraint.cone == "psd":  # in this cone only the sum of the products vanishes
                 products += abs(float(dual @ row.residual))
-            elif row.constraint.cone != "zero":
+            elif not row.constraint.is_equality:
                 products += float(np.sum(np.abs(dual * row.residual)))
         for weight, (gauge, _) in zip(self.gauge_multipliers(rows, duals), gauges(problem, self.x)):
             total += weight * gauge
@@ -252,6 +270,11 @@ class LagrangianAtPoint:
     def _free_part(self, name: str, part: Array, terms: Array) -> tuple[Array, Array]:
         """Return the gradient by an unknown with the nearest subgradient of terms with kinks, and its magnitudes."""
         shape = np.shape(self.x[name])
+        if name in self.problem.bounds:
+            low, high = self.problem.bounds[name]
+            margin = INSIDE * variable_size(self.x[name], self.problem.space.usual_sizes.get(name))
+            down, up = flat(self.x[name] <= low + margin), flat(self.x[name] >= high - margin)
+            part = np.where(down & (part > 0) | up & (part < 0), 0.0, part)
         for term in self.problem.terms:
             if isinstance(term, NuclearNorms | GroupNorms) and name in term.weights:
                 rest = NOTHING * self.yardstick
@@ -289,7 +312,7 @@ def in_dual_cone(constraint: Constraint, dual: Array) -> Array:
     if constraint.cone == "psd":
         values, vectors = np.linalg.eigh(symmetric_part(dual))
         return flat((vectors * np.maximum(values, 0.0)) @ vectors.T)
-    return dual if constraint.cone == "zero" else np.maximum(dual, 0.0)
+    return dual if constraint.is_equality else np.maximum(dual, 0.0)
 
 
 def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian: LagrangianAtPoint
@@ -299,16 +322,23 @@ def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian
     for name, place in problem.slices.items():
         units[place] = variable_size(x[name], problem.space.usual_sizes.get(name))
     held = [gauge[None] for gauge, _ in gauges(problem, x)]
+    if _size(problem, rows) > LARGEST or not np.all(np.isfinite(lagrangian.gradient)):
+        return None
     parts = [row.gradients() for row in rows]
     slopes = np.vstack([np.zeros((0, problem.size)), *held, *(slope for slope, _ in parts)])
     equal = np.concatenate([np.ones(len(held), dtype=bool), *(
-        np.full(len(slope), row.constraint.cone == "zero") for row, (slope, _) in zip(rows, parts))])
+        np.full(len(slope), row.constraint.is_equality) for row, (slope, _) in zip(rows, parts))])
     try:
         weights, _ = fit_multipliers(slopes * units, -lagrangian.gradient * units, equal)
     except RuntimeError:
         return None
     counts = np.cumsum([len(held), *(len(slope) for slope, _ in parts)])
     return [weights[a:b] @ stands for a, b, (_, stands) in zip(counts, counts[1:], parts)]
+
+
+def _size(problem: Problem, rows: Sequence[RowsAtPoint]) -> int:
+    """Return the number of entries of the slopes of all constraints."""
+    return sum(len(row.constraint) for row in rows) * problem.size
 
 
 def _directions(count: int) -> Array:

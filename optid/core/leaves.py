@@ -11,9 +11,12 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
+import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.core.terms import Values, flat
+
+DENSE = 1_000_000  # entries of a matrix up to which it is an array
 
 
 @dataclass(frozen=True)
@@ -193,6 +196,16 @@ class LeafSpace:
         """Write values into the variables, also a point just outside what a variable allows."""
         for name, variable in self.variables.items():
             variable.save_value(np.asarray(y[name], dtype=float))
+
+    def rows(self, parts: Mapping[str, Any], count: int) -> Any:
+        """Return slopes by some leaves as rows (count, leaves), sparse where there are many entries."""
+        if count * self.size > DENSE:
+            return sp.csr_array(sp.hstack([parts.get(name, sp.csr_array((count, place.stop - place.start)))
+                                           for name, place in self.places.items()]))
+        rows = np.zeros((count, self.size))
+        for name, part in parts.items():
+            rows[:, self.places[name]] = part.toarray() if sp.issparse(part) else part
+        return rows
 
     def vector(self, y: Values) -> Array:
         """Return values one after another."""

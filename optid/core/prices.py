@@ -47,7 +47,7 @@ def price_constraints(problem: Problem, x: Values, duals: Mapping[str, Array], o
 def _slacks(row: RowsAtPoint) -> Array:
     """Distance of every row from its bound, in units of the constraint; zero for equalities."""
     sizes = row.constraint.sizes
-    if row.constraint.cone == "zero":
+    if row.constraint.is_equality:
         return np.zeros(len(row.constraint))
     if row.constraint.cone == "psd":
         return np.array([float(np.linalg.eigvalsh(-symmetric_part(row.residual * sizes))[0])])
@@ -68,7 +68,7 @@ def least_multipliers(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], 
     parts = [row.gradients() for row in rows]
     columns = np.vstack([np.zeros((0, problem.size)), *(gauge[None] for gauge in held), *(part for part, _ in parts)])
     equality = np.concatenate([np.ones(len(held), dtype=bool), *(
-        np.full(len(part), row.constraint.cone == "zero") for row, (part, _) in zip(rows, parts))])
+        np.full(len(part), row.constraint.is_equality) for row, (part, _) in zip(rows, parts))])
     places = [(GAUGE, slice(k, k + 1), np.ones(1)) for k in range(len(held))]
     for row, (_, stands) in zip(rows, parts):
         places += [(row.constraint.name, row.constraint.span, direction) for direction in stands]

@@ -1,16 +1,17 @@
 """A problem: unknowns with a start, terms of the objective, leaves and constraints; values and slopes without CVXPY."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
+import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.core.constraint import Constraint, ConstraintReader
-from optid.core.leaves import Affine, Leaf, LeafSpace, Product, slices_of
+from optid.core.leaves import DENSE, Affine, Leaf, LeafSpace, Product, slices_of
 from optid.core.terms import Errors, Squares, Term, Values, flat
 from optid.program.solution import Bound
 from optid.program.structure import GAUGE
@@ -55,6 +56,7 @@ class Problem:
     model: Callable[[Values], Any] = dict
     facts: Mapping[str, Any] = field(default_factory=dict)
     further: Callable[[Mapping[str, Any], Values], Mapping[str, Any]] | None = None
+    _: KW_ONLY
     restrictions: tuple[Any, ...] = ()
     builders: tuple[Any, ...] = ()
     scale: float = 1.0
@@ -138,8 +140,8 @@ class Problem:
     @property
     def is_convex(self) -> bool:
         """Whether all terms and all structural constraints are convex in the unknowns."""
-        return self.has_convex_terms and all(
-            one.cone != "other" or one.limit.member.is_dcp() for one in self._at_start if self._is_own(one))
+        return self.has_convex_terms and (not self.restrictions or all(
+            one.cone != "other" or one.limit.member.is_dcp() for one in self._at_start if self._is_own(one)))
 
     # -- layout
 
@@ -211,8 +213,15 @@ class Problem:
                     found[self.slices[name]] += part
         return found
 
-    def slope(self, x: Values) -> Array:
-        """Return the derivative (leaves, unknowns) of all leaves."""
+    def slope(self, x: Values) -> Any:
+        """Return the derivative (leaves, unknowns) of all leaves, sparse where it has many entries."""
+        if self.space.size * self.size > DENSE:
+            blocks = {name: {name: sp.eye_array(place.stop - place.start)} for name, place in self.slices.items()}
+            blocks |= {leaf.name: leaf.slope(x) for leaf in self.leaves}
+            sizes = {name: place.stop - place.start for name, place in self.slices.items()}
+            return sp.csr_array(sp.vstack([sp.hstack([
+                parts.get(name, sp.csr_array((self.space.places[leaf].stop - self.space.places[leaf].start, size)))
+                for name, size in sizes.items()]) for leaf, parts in blocks.items()]))
         found = np.zeros((self.space.size, self.size))
         for name, place in self.slices.items():
             found[self.space.places[name], place] = np.eye(place.stop - place.start)
@@ -256,7 +265,7 @@ class Problem:
     @property
     def structural(self) -> frozenset[str]:
         """Names of the constraints that belong to the formulation."""
-        return frozenset(one.name for one in self._at_start if self._is_own(one))
+        return frozenset(one.name for one in self._at_start if self._is_own(one)) if self.restrictions else frozenset()
 
     def _is_own(self, one: Constraint) -> bool:
         return one.builder < len(self.restrictions)
@@ -297,17 +306,22 @@ class Problem:
                 continue
             g = one.residual(self.space, y)
             found.append(np.array([one.violation(self.space, y)]) if one.cone in ("psd", "other") else
-                         np.abs(g) if one.cone == "zero" else np.maximum(g, 0.0))
+                         np.abs(g) if one.is_equality else np.maximum(g, 0.0))
         return np.concatenate(found)
 
     @cached_property
     def is_measured(self) -> bool:
-        """Whether CVXPY is not needed to measure a point.
+        """Whether the stationarity of a point can be measured.
 
-        Every constraint is read into rows or a matrix, and every term has a gradient or nearest subgradients.
+        Every constraint has a slope, and every term a gradient or nearest subgradients.
         """
-        return all(one.cone != "other" for one in self._at_start) and all(
+        return all(one.is_smooth for one in self._at_start) and all(
             hasattr(term, "pull") or hasattr(term, "nearest") for term in self.terms)
+
+    @cached_property
+    def is_in_rows(self) -> bool:
+        """Whether every constraint is read into rows or a matrix."""
+        return all(one.cone != "other" for one in self._at_start)
 
     def violation(self, x: Values, constraints: tuple[Constraint, ...] | None = None) -> float:
         """Return the sum of the violations at a point, of rows divided by their sizes."""

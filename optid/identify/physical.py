@@ -10,6 +10,8 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.backends.casadi import function_of
+from optid.core.problem import Problem
+from optid.core.terms import Values
 from optid.data.channels import Transform, model_meta
 from optid.data.record import Data
 from optid.data.stretches import interpolated, with_whole_inputs
@@ -21,7 +23,6 @@ from optid.identify.tangent import constraint_rows
 from optid.models.equations import Equations
 from optid.models.physical import PhysicalModel, Runs
 from optid.program.compressed import Spread
-from optid.program.program import Program
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.unknowns import Unknowns
 
@@ -308,9 +309,9 @@ class CompressedPhysical(CompressedStates):
     def __init__(self, errors: PhysicalErrors) -> None:
         self.criterion, self.outward = errors, Transform.identity(errors.data.m, errors.data.l)
 
-    def settle(self, program: Program) -> None:
-        """Linearise the errors at the values of the variables; a run that diverges there is a `StructureError`."""
-        super().settle(program)
+    def settle(self, values: Values) -> None:
+        """Linearise the errors at values of the unknowns; a run that diverges there is a `StructureError`."""
+        super().settle(values)
         if not np.isfinite(self.at.value):
             names, (p, _) = self.criterion.unknowns.names, self.criterion.split(self.reference)
             at = ", ".join(f"{name} = {value:.4g}" for name, value in zip(names, p))
@@ -322,9 +323,9 @@ class CompressedPhysical(CompressedStates):
         found = super().spread(z, moves)
         return replace(found, noise=found.noise / self.criterion.unit)
 
-    def refuse_undetermined(self, program: Program) -> None:
+    def refuse_undetermined(self, problem: Problem, values: Values) -> None:
         """Refuse parameters that neither the record nor binding constraints determine (`RankError`)."""
-        equal, above, slack = constraint_rows(program, tuple(self.places.names))
+        equal, above, slack = constraint_rows(problem, values, tuple(self.places.names))
         rows = np.vstack([equal, above[slack <= BINDING * (1 + np.abs(slack).max(initial=0.0))]])
         matrix, errors = self.at.whole[0], self.criterion
         initial = [f"initial {name}" for name in errors.equations.states] * errors.unknowns.experiments

@@ -11,21 +11,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from cvxpy.constraints.constraint import Constraint
-from cvxpy.constraints.psd import PSD
-from cvxpy.constraints.second_order import SOC
-from cvxpy.expressions.expression import Expression
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
+from optid.core.constraint import Constraint, symmetric_part
+from optid.core.problem import Problem
+from optid.core.terms import Values
 from optid.errors import RankError, StructureError
 from optid.identify.intervals import LocalEstimate
-from optid.program.expressions import differences, flat_value, jacobians, side_by_side
-from optid.program.limits import EQUALITIES, rows_of
-from optid.program.program import Program
+from optid.program.expressions import differences
 from optid.program.solution import Status
 from optid.structures.whitening import symmetric_root
 
+FAR = 1e-3  # smallest eigenvalue of a matrix that must be definite, relative to its largest, that is far from active
 NO_EFFECT = 1e-10
 """Size of an effect on the predictions, relative to the largest, below which a direction counts as undetermined."""
 STEP = 1e-5  # step of the central differences, relative to the size of the parameter
@@ -150,17 +148,18 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
         RankError: a parameter without effect on the predictions, such as the numerator of an input whose f is zero.
     """
     _refuse(fit)
-    program, compressed, found = fit.program, fit.program.compressed, fit.solution.values
-    shapes = {name: v.shape for name, v in program.variables.items() if name not in program.implied}
+    problem: Problem = fit.program.core
+    compressed, found = problem.compressed, fit.solution.values
+    shapes = {name: np.shape(value) for name, value in problem.start.items() if name not in problem.courses}
     x = np.concatenate([np.ravel(found[name], order="F") for name in shapes])
-    program.assign(found)
-    equalities, inequalities, slack = constraint_rows(program, tuple(shapes))
+    point = {name: found[name] for name in problem.start}
+    equalities, inequalities, slack = constraint_rows(problem, point, tuple(shapes))
 
     lift, lifted = differences(lambda x: compressed.lifted(_unpacked(shapes, x)), x)
-    problem = compressed.problem
-    free, triangle, basis = whitened(problem.root @ lift, equalities, shapes)
+    squares = compressed.problem
+    free, triangle, basis = whitened(squares.root @ lift, equalities, shapes)
     directions = free @ np.linalg.inv(triangle)
-    pull = basis.T @ (problem.root @ lifted - problem.target)
+    pull = basis.T @ (squares.root @ lifted - squares.target)
     centre = -pull if len(slack) else np.zeros_like(pull)
 
     spread = compressed.spread(lifted + lift @ (directions @ centre), lift @ directions)
@@ -173,7 +172,7 @@ def linearise(fit: Any, rebuild: Callable[[dict[str, Array]], Any], draws: int, 
     criterion = getattr(compressed, "criterion", None)
     objective = None if criterion is None else lambda values: (
         criterion.value(z) if criterion.admissible(z := compressed.lifted(values)) else np.inf)
-    return Tangent(rebuild, shapes, x, directions, local, program.unit * spread.noise * np.outer(scale, scale),
+    return Tangent(rebuild, shapes, x, directions, local, problem.unit * spread.noise * np.outer(scale, scale),
                    kind, spread.words, objective)
 
 
@@ -225,43 +224,43 @@ def whitened(effect: Array, equalities: Array, shapes: dict[str, tuple[int, ...]
     return free, triangle, basis
 
 
-def constraint_rows(program: Program, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
-    """Return the gradients of the equalities, and the gradients and slacks of the inequalities (>= 0), at the point.
+def constraint_rows(problem: Problem, x: Values, names: tuple[str, ...]) -> tuple[Array, Array, Array]:
+    """Return the gradients of the equalities, and the gradients and slacks of the inequalities (>= 0), at a point.
 
-    Constraints about variables that the others imply are left out.
+    The gradients are those by the named unknowns. Constraints about courses are left out, which the others imply.
     """
-    variables, implied = ([program.variables[name] for name in group] for group in (names, program.implied))
-    nothing = np.zeros((0, sum(variable.size for variable in variables)))
+    columns = np.concatenate([np.arange(problem.size)[problem.slices[name]] for name in names])
+    y, slope = problem.leaf_values(x), problem.slope(x)[:, columns]
+    nothing = np.zeros((0, columns.size))
     equal, above, slack = [nothing], [nothing], [np.zeros(0)]
-    for name, group in program.constraints.items():
-        for member in group:
-            level = None if {v.id for v in member.variables()} & {v.id for v in implied} else _level(name, member)
-            if level is None:
-                continue
-            if (slopes := jacobians(level)) is None:
-                raise StructureError(f"constraint {name!r} has no gradient at the solution: use optid.bootstrap "
-                                     "instead")
-            rows = side_by_side(slopes, variables, level.size)
-            if isinstance(member, EQUALITIES):
-                equal.append(rows)
-            else:
-                above.append(rows)
-                slack.append(np.maximum(flat_value(level), 0.0))
+    for product in problem.gauged:
+        row = np.zeros((1, problem.size))
+        for name, part in product.level(x)[1].items():
+            row[0, problem.slices[name]] = part
+        equal.append(row[:, columns])
+    for one in problem.constraints(x):
+        if one.leaves(problem.space) & problem.courses:
+            continue
+        g = one.residual(problem.space, y)
+        if one.cone == "psd" or one.expression is None and one.cone == "other":
+            _refuse_active(one, g)
+            continue
+        rows = one.slope(problem.space, y) @ slope
+        if not np.all(np.isfinite(rows)):
+            raise StructureError(f"constraint {one.name!r} has no gradient at the solution: use optid.bootstrap instead")
+        if one.is_equality:
+            equal.append(rows)
+        else:
+            above.append(-rows)
+            slack.append(np.maximum(-g, 0.0))
     return np.vstack(equal), np.vstack(above), np.concatenate(slack)
 
 
-def _level(name: str, member: Constraint) -> Expression | None:
-    """Return an expression that must be zero, or >= 0; None for a matrix or cone constraint far from active."""
-    if (rows := rows_of(member)) is not None:
-        return -rows
-    if isinstance(member, PSD):
-        values = np.linalg.eigvalsh(np.atleast_2d(member.args[0].value))
-        if values[0] > 1e-3 * np.max(np.abs(values)):
-            return None
-    if isinstance(member, SOC):
-        head, tail = np.atleast_1d(member.args[0].value), np.atleast_1d(member.args[1].value)
-        if np.all(head - np.linalg.norm(tail, axis=0) > 1e-3 * np.abs(head)):
-            return None
-    raise StructureError(f"constraint {name!r} is an active {type(member).__name__}, which has no linearisation: "
-                         "use optid.bootstrap for intervals")
-
+def _refuse_active(one: Constraint, g: Array) -> None:
+    """Refuse a matrix inequality that is not far from active, and any other cone."""
+    if one.cone == "psd":
+        values = np.linalg.eigvalsh(-symmetric_part(g))
+        if values[0] > FAR * np.max(np.abs(values)):
+            return
+    raise StructureError(f"constraint {one.name!r} is an active {type(one.limit.member).__name__}, which has no "
+                         "linearisation: use optid.bootstrap for intervals")

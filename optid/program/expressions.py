@@ -24,6 +24,10 @@ MOVES = {"index", "special_index", "reshape", "transpose", "Hstack", "Vstack", "
          "psd_wrap", "nsd_wrap", "real"}
 """Atoms that only move entries about."""
 
+KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
+         "sum_largest", "lambda_sum_largest", "pos", "neg"}
+"""Atoms whose gradient says nothing where they have a kink."""
+
 PROBES = 3  # random points at which the size of an expression is tried
 
 

@@ -8,15 +8,11 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
-from optid.program.expressions import flat_value, jacobians
+from optid.program.expressions import KINKS, flat_value, jacobians
 from optid.program.limits import EQUALITIES, INEQUALITIES, rows_of, spans
 from optid.program.program import Program, Values
 from optid.program.solution import Residuals
 from optid.program.structure import variable_size
-
-KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNuc", "lambda_max", "sigma_max",
-         "sum_largest", "lambda_sum_largest", "pos", "neg"}
-"""Atoms whose gradient says nothing where they have a kink."""
 
 
 def judge(program: Program, values: Values, duals: Values) -> tuple[Values, float, Residuals]:

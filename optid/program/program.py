@@ -9,6 +9,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
+from cvxpy.constraints.second_order import SOC
 from cvxpy.lin_ops.lin_utils import ID_COUNTER, get_id
 
 from optid.errors import StructureError, nearest
@@ -45,6 +46,8 @@ def _limit(name: str, member: Any) -> Limit:
     if not isinstance(member, Constraint | Limit):
         raise StructureError(
             f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1")
+    if isinstance(member, SOC):  # in rows, with one multiplier each
+        member = cp.norm(member.args[1], 2, axis=None if member.args[1].ndim < 2 else member.axis) <= member.args[0]
     return member if isinstance(member, Limit) else Limit.of(member)
 
 
@@ -232,7 +235,7 @@ class Program:
         if core is None and self.core is not None:
             core = self.core.subject_to(*builders)
         if core is not None:
-            sizes = {(one.name, one.position): one.limit.sizes for one in core.constraints() if one.cone in AFFINE}
+            sizes = {(one.name, one.position): one.sizes for one in core.constraints()}
         for position, builder in enumerate(builders):
             default = getattr(builder, "name", None) or f"constraint {position + 1}"
             built = builder(self.view) if callable(builder) else builder

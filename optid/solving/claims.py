@@ -12,11 +12,12 @@ from optid.certificate.convex import TANGENT, certify_convex
 from optid.certificate.infeasibility import satisfiable
 from optid.certificate.multipliers import fitted_multipliers
 from optid.core.judge import judge as judge_in_core
-from optid.core.problem import Problem
+from optid.core.low_rank import LowRank
 from optid.core.terms import Squares
 from optid.program.judging import judge, measure_violation
 from optid.program.program import Program, Values
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
+from optid.program.structure import GAUGE
 from optid.solving.answers import answer_of
 from optid.structures.least_squares import rank_one_of
 
@@ -97,11 +98,29 @@ def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -
 
     Where the solver's multipliers do not make it stationary, those count that come nearest to it.
     """
-    duals = _usable(program, answer.duals)
-    if program.core is not None and program.core.is_measured and (
-            program.is_restricted or program.structure is None):
-        return _judged_in_core(program.core, answer.values, duals, base)
+    duals, problem = _usable(program, answer.duals), program.core
+    if problem is None:
+        return _judged_in_cvxpy(program, answer, duals, base, accuracy)
+    x = {name: np.reshape(np.asarray(answer.values[name], dtype=float), np.shape(start), order="F")
+         for name, start in problem.start.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
+        found = judge_in_core(problem, x, duals)
+        values, structural = dict(x), {GAUGE: found.gauge} if problem.gauged else {}
+        if "residual" in program.structural:  # then it is a variable of its own
+            squares = next(term for term in problem.terms if isinstance(term, Squares))
+            values["residual"] = squares.residual(problem.leaf_values(x))
+            structural["residual"] = duals.get("residual", -2.0 * values["residual"])
+        if "structure" in program.structural:
+            (matrix,) = (term for term in problem.terms if isinstance(term, LowRank))
+            values["X"] = matrix.matrix(x)
+            structural |= {"structure": duals["structure"]} if "structure" in duals else {}
+    return replace(base, values=values, duals={**structural, **found.duals},
+                   objective=found.objective, residuals=found.residuals)
+
+
+def _judged_in_cvxpy(program: Program, answer: Answer, duals: Values, base: Solution, accuracy: float) -> Solution:
+    """Return a solution at a point of a programme without a problem."""
+    with np.errstate(over="ignore", invalid="ignore"):
         values, objective, residuals = judge(program, answer.values, duals)
         claims = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE)
         unsure = program.user_constraints or np.isnan(residuals.stationarity)
@@ -111,20 +130,6 @@ def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -
             if own is not None and not again.stationarity >= residuals.stationarity:
                 duals, residuals = own, again
     return replace(base, values=values, duals=duals, objective=objective, residuals=residuals)
-
-
-def _judged_in_core(problem: Problem, values: Values, duals: Values, base: Solution) -> Solution:
-    """Return a solution at a point of a problem of the core; a value of another shape is a `ValueError`."""
-    x = {name: np.reshape(np.asarray(values[name], dtype=float), np.shape(start), order="F")
-         for name, start in problem.start.items()}
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = judge_in_core(problem, x, duals)
-        values, structural = dict(x), {"gauge": found.gauge} if problem.products else {}
-        if len(problem.terms) == 1 and isinstance(problem.terms[0], Squares):  # then it is a variable of its own
-            values["residual"] = problem.terms[0].residual(problem.leaf_values(x))
-            structural["residual"] = -2.0 * values["residual"]
-    return replace(base, values=values, duals={**structural, **found.duals},
-                   objective=found.objective, residuals=found.residuals)
 
 
 def _reference(program: Program, back_end: BackEnd) -> BackEnd | None:

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.core.terms import Values
 from optid.data.channels import Transform
 from optid.identify.prediction_error.descent import Criterion
 from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.prediction_error.state_errors import StateErrors
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.program.compressed import Spread, degrees_of_freedom, white_spread
-from optid.program.program import Program
 from optid.program.units import energy_unit
 from optid.statistics.coloured import scattered
 from optid.statistics.linearised import Linearised
@@ -164,9 +164,9 @@ class CompressedStates(CompressedErrors):
     outward: Transform  # from the units of the programme's models to those of the record
     fixed: bool = False  # whether the programme fixes by rows what changes no output
 
-    def settle(self, program: Program) -> None:
-        """Linearise the errors again, at the values of the variables of the programme."""
-        self.reference = self.places.pack(program.values())
+    def settle(self, values: Values) -> None:
+        """Linearise the errors again, at values of the unknowns."""
+        self.reference = self.places.pack(values)
         self.at = self.criterion.linearise(self.reference)
 
     @property
