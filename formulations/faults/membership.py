@@ -19,6 +19,8 @@ import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 
+from optid.core.problem import Problem
+from optid.core.terms import Inner, Values
 from optid.data.record import Data
 from optid.errors import StructureError
 from optid.faults.consistency.bounded_noise import (
@@ -30,7 +32,6 @@ from optid.faults.consistency.bounded_noise import (
     parity_proof,
 )
 from optid.faults.signatures import Candidate, Dictionary
-from optid.program.program import Program, Values
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure
@@ -68,7 +69,7 @@ def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictiona
     """
     window = bounded_window(model, data, bounds)
     tried = _onsets(onsets, window.count)
-    solution = yield _programme(window).subject_to(*constraints)
+    solution = yield _posed(window).subject_to(*constraints)
     factor, proof = _factor(solution), _proof_of(solution)
     factors: dict[str, float] = {}
     where: dict[str, int | None] = {}
@@ -94,13 +95,13 @@ def membership(model: Any, data: Data, *, bounds: Any = SIGMAS, faults: Dictiona
 
 
 def _possible(window: BoundedWindow, candidate: Candidate, unit: Signature, tried: list[int] | None
-              ) -> Generator[Program, Solution, tuple[float, int | None, dict[tuple[int, int], ParityProof]]]:
+              ) -> Generator[Problem, Solution, tuple[float, int | None, dict[tuple[int, int], ParityProof]]]:
     """Return a factor and onset at which a candidate is possible; or the least factor proved, with all proofs.
 
     The factor is NaN where the solver gave neither; `unit` is the addition of a unit course in each sample.
     """
     if tried is None:
-        solution = yield _programme(window, _between(candidate, unit, 0, window.count))
+        solution = yield _posed(window, _between(candidate, unit, 0, window.count))
         proof = _proof_of(solution)
         return (_factor(solution), None, {}) if proof is None else (proof.factor, None, {(0, window.count - 1): proof})
     proofs: dict[tuple[int, int], ParityProof] = {}
@@ -108,7 +109,7 @@ def _possible(window: BoundedWindow, candidate: Candidate, unit: Signature, trie
     while waiting:
         waiting.sort()  # the smallest factor first
         _, first, last = waiting.pop(0)
-        solution = yield _programme(window, _between(candidate, unit, tried[first], tried[last]))
+        solution = yield _posed(window, _between(candidate, unit, tried[first], tried[last]))
         proof, middle = _proof_of(solution), (first + last) // 2
         if proof is not None:
             proofs[tried[first], tried[last]] = proof
@@ -144,8 +145,8 @@ def _between(candidate: Candidate, unit: Signature, first: int, last: int) -> Si
     return state[:, :, seen] / sizes[seen], output[:, :, seen] / sizes[seen]
 
 
-def _programme(window: BoundedWindow, signature: Signature | None = None) -> Program:
-    """Build the linear programme of the healthy plant, or with additions of unknown sizes."""
+def _posed(window: BoundedWindow, signature: Signature | None = None) -> Problem:
+    """State the linear problem of the healthy plant, or with additions of unknown sizes."""
     n, count = window.A.shape[0], window.count
     later, earlier = (sp.diags_array(np.ones(count - 1), offsets=k, shape=(count - 1, count)) for k in (1, 0))
     steps = sp.kron(later, np.eye(n)) - sp.kron(earlier, window.A)
@@ -153,50 +154,47 @@ def _programme(window: BoundedWindow, signature: Signature | None = None) -> Pro
     level = np.concatenate([np.zeros((count - 1) * n), window.e.ravel()])
     bounds = np.concatenate([np.tile(window.process, count - 1), np.tile(window.output, count)])
     known = np.concatenate([np.repeat(window.steps[:-1], n), window.present.ravel()])
-    t, x = cp.Variable(name="t"), cp.Variable(count * n, name="states")
-    variables: dict[str, cp.Variable] = {"t": t, "states": x}
-    expressions: dict[str, cp.Expression] = {"t": t, "x": cp.reshape(x, (count, n), order="C")}
-    added = np.zeros((level.size, 0))
+    start, added = {"t": np.zeros(()), "states": np.zeros(count * n)}, np.zeros((level.size, 0))
     if signature is not None and signature[0].shape[2]:
         d = signature[0].shape[2]
-        variables["size"] = expressions["size"] = cp.Variable(d, name="size")
+        start["size"] = np.zeros(d)
         added = np.vstack([signature[0][1:].reshape(-1, d), signature[1].reshape(-1, d)])
     bounded, exact = np.flatnonzero(known & (bounds > 0)), np.flatnonzero(known & (bounds == 0))
 
-    def noise(rows: Array, units: Array) -> Any:
+    def noise(v: View, rows: Array, units: Array) -> Any:
         """Return the noise in some rows, in units, as an expression of few parts, because it is evaluated often."""
-        found = level[rows] / units - (sp.diags_array(1 / units) @ matrix[rows]) @ x
-        return found - (added[rows] / units[:, None]) @ variables["size"] if "size" in variables else found
+        found = level[rows] / units - (sp.diags_array(1 / units) @ matrix[rows]) @ v["states"]
+        return found - (added[rows] / units[:, None]) @ v["size"] if "size" in v else found
 
-    relative = noise(bounded, bounds[bounded])
-    constraints: dict[str, tuple[Any, ...]] = {"noise": (relative <= t, -relative <= t)}
-    if exact.size:
-        constraints["no noise"] = (noise(exact, np.ones(exact.size)) == 0,)
-    return Program(
-        "fault.membership", cp.Minimize(t), constraints, variables,
-        {name: np.zeros(v.shape) for name, v in variables.items()}, dict, View(expressions),
-        structural=frozenset(constraints), scale=1.0,
-        certify=partial(_certified, window, signature, bounded, exact, bounds))
+    def possible(v: View) -> dict[str, Any]:
+        relative = noise(v, bounded, bounds[bounded])
+        held = {"no noise": noise(v, exact, np.ones(exact.size)) == 0} if exact.size else {}
+        return {"noise": [relative <= v["t"], -relative <= v["t"]], **held}
+
+    return Problem(
+        "fault.membership", start, (Inner({"t": np.array(1.0)}),),
+        further=lambda v, _: {"x": cp.reshape(v["states"], (count, n), order="C")}, restrictions=(possible,),
+        proof=partial(_certified, window, signature, bounded, exact, bounds))
 
 
 def _certified(window: BoundedWindow, signature: Signature | None, bounded: Array, exact: Array, bounds: Array,
-               program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
+               problem: Problem, values: Values, duals: Values) -> Bound:
     """Return the factor that the parity vector near the multipliers proves."""
-    program.assign(values)
-    objective = float(np.asarray(program.objective.expr.value))
+    sizes = {one.name: np.concatenate([part.sizes for part in problem.constraints() if part.name == one.name])
+             for one in problem.constraints()}
     if np.size(duals.get("noise", ())) != 2 * bounded.size:
-        return Bound.none("the solver gave no multipliers"), None
+        return Bound.none("the solver gave no multipliers")
     weights = np.zeros(bounds.size)
-    upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
+    upper, lower = np.split(np.asarray(duals["noise"], dtype=float) / sizes["noise"], 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
     if exact.size and np.size(duals.get("no noise", ())) == exact.size:
-        weights[exact] = np.asarray(duals["no noise"], dtype=float)
+        weights[exact] = np.asarray(duals["no noise"], dtype=float) / sizes["no noise"]
     p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
     proof = parity_proof(window, p, window.unseen(*(signature or (None, None))))
-    gap = relative_gap(objective, proof.factor, program.scale)
-    free, words = not program.user_constraints, f"parity vector, relative gap {gap:.1e}"
+    gap = relative_gap(problem.value(values), proof.factor, problem.scale)
+    free, words = not problem.constraint_names, f"parity vector, relative gap {gap:.1e}"
     return Bound(proof.factor, free and gap < PROVED, "parity",
-                 words if free else "the bound is that without the further constraints", multipliers=proof), None
+                 words if free else "the bound is that without the further constraints", multipliers=proof)
 
 
 def _onsets(onsets: Sequence[int] | str, count: int) -> list[int] | None:
