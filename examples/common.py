@@ -1,4 +1,4 @@
-"""A plant that can break, a controller in its loop, and the picture of both, for faults_end_to_end.py."""
+"""A plant that can break, the inputs that hold its outputs, and the picture of both, for faults_end_to_end.py."""
 
 from pathlib import Path
 
@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 import optid
 from optid.bases import Triangular
-from optid.faults import allocate
+from optid.faults import allocate, inject
 from optid.models import HammersteinSS, NoiseCovariances, Nonlinearity
 from optid.models.kalman import kalman_gain
 
@@ -33,18 +33,9 @@ def levels(count: int, seed: int) -> np.ndarray:
 
 
 def held(true: HammersteinSS, believed: HammersteinSS, r: np.ndarray, count: int = 60) -> np.ndarray:
-    """Return the outputs (N, l) of a plant whose controller and observer believe in a model of it."""
-    controller, rng = allocate(believed).controller(30), np.random.default_rng(0)
-    x, seen, outputs = np.zeros(true.nx), np.zeros(believed.nx), []
-    for _ in range(count):
-        u = controller.step(seen, r).u
-        v, w = true.expanded(u[None])[0], believed.expanded(u[None])[0]
-        y = true.C @ x + 0.05 * rng.standard_normal(2)
-        e = y - believed.C @ seen - believed.D @ w - believed.offset_y
-        x = true.A @ x + true.B @ v + 0.02 * rng.standard_normal(3)
-        seen = believed.A @ seen + believed.B @ w + believed.offset_x + believed.K @ e
-        outputs.append(y)
-    return np.array(outputs)
+    """Return the outputs (N, l) of a plant under the inputs that hold a reference according to a model of it."""
+    u = np.tile(allocate(believed).attainable(r).u, (count, 1))
+    return inject(true, u, seed=0)
 
 
 def fit(truth: np.ndarray, simulated: np.ndarray) -> float:
@@ -53,7 +44,7 @@ def fit(truth: np.ndarray, simulated: np.ndarray) -> float:
 
 def draw(path: Path, record: tuple[np.ndarray, np.ndarray], events: list, rebuilt: optid.faults.Reformulation,
          courses: dict[str, np.ndarray], r: np.ndarray) -> None:
-    """Draw the stream with its events, the nonlinearity before and now, what can be held, and the control."""
+    """Draw the stream with its events, the nonlinearity before and now, what can be held, and outputs that are."""
     figure = Figure(figsize=(11, 7), layout="constrained")
     stream, shape, reach, control = figure.subplots(2, 2).ravel()
     shown = slice(ONSET - 60, None)
@@ -89,6 +80,6 @@ def draw(path: Path, record: tuple[np.ndarray, np.ndarray], events: list, rebuil
         control.plot(course[:, 1], color=colour, linestyle="--", label=f"y2, {name}")
     for value in r:
         control.axhline(value, color="black", linewidth=0.6)
-    control.set(title="control of the damaged plant", xlabel="sample")
+    control.set(title="outputs of the damaged plant", xlabel="sample")
     control.legend(fontsize=8, ncols=2)
     figure.savefig(path, dpi=120)

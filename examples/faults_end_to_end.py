@@ -15,7 +15,7 @@ from optid.faults import Fault, Monitor, allocate, diagnose, inject, reformulate
 
 
 def main(folder: Path) -> dict[str, float]:
-    """Return the delay of the alarm, the share lost, fits before and after, and the errors of control."""
+    """Return the delay of the alarm, the share lost, fits before and after, and the errors of what is held."""
     folder.mkdir(parents=True, exist_ok=True)
     true, damaged, u = plant(), plant(1 - LOST), levels(3000, 1)
     identified = optid.fit(Data(u, inject(true, u, seed=1)), "hammerstein_ss.asivid", nx=3, basis="triangular:6")

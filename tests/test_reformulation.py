@@ -465,9 +465,6 @@ def test_unreachable_targets_are_never_clipped_silently(healthy):
     target = allocate(dead).attainable([2.0, 2.0])
     assert not target.reachable and target.distance > 0.1 and "actuator:u1" in target.limiting
     assert "cannot be reached" in str(target)
-    with pytest.warns(DataWarning, match="cannot be reached"):
-        move = allocate(dead).controller(10).step(np.zeros(3), [2.0, 2.0])
-    assert not move.reachable
 
 
 def test_corners_bound_what_can_be_held():
@@ -487,63 +484,29 @@ def test_corners_bound_what_can_be_held():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("m", [2, 3])
-def test_the_compiled_controller_solves_the_programme(m):
-    found = allocate(plant(m), weights=[1.0, 0.5])
-    rng = np.random.default_rng(m)
-    for _ in range(4):
-        controller = found.controller(12, effort=1e-2)
-        x, r = rng.normal(0, 2, 3), found.problem.members[0].rest_output(rng.uniform(
-            0.8 * found.problem.low, 0.8 * found.problem.high))
-        move = controller.step(x, r)
-        program = fault_formulation("allocation.track")(
-            found.problem, reference=r, states=[x], goal=found.attainable(r).v, horizon=12, effort=1e-2)
-        other = solve(program, "clarabel", accuracy=1e-10)
-        assert move.residual < 1e-8
-        assert move.v == pytest.approx(other.values["v"][0], abs=2e-3)
-        assert np.all((move.u >= -1.2) & (move.u <= 1.2))
-
-
-@pytest.mark.slow
-def test_the_nlp_agrees_with_the_programme_in_v(healthy):
+def test_the_nlp_agrees_with_the_problem_in_v(healthy):
     smooth = replace(healthy, nonlinearities=tuple(
         Nonlinearity(Polynomial(3, (-1.2, 1.2)), mu) for mu in (np.array([1.4, 0.0, 0.2]), np.array([1.0, 0.0, -0.1]))))
-    found = allocate(smooth)
-    qp, nlp = found.controller(10, effort=1e-5), found.controller(10, effort=1e-5, route="nlp")
-    for x in ([1.0, -1.0, 0.5], [-2.0, 0.3, 0.0]):
-        assert qp.step(x, [0.5, -0.2]).u == pytest.approx(nlp.step(x, [0.5, -0.2]).u, abs=0.02)
+    for r in ([0.5, -0.2], [3.0, 2.0]):
+        qp, nlp = allocate(smooth).attainable(r), allocate(smooth, route="nlp").attainable(r)
+        assert qp.u == pytest.approx(nlp.u, abs=1e-4) and qp.distance == pytest.approx(nlp.distance, abs=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["turning", "feedback"])
-def test_any_nlp_back_end_takes_the_programme_in_u_and_its_point_is_the_plants(healthy, kind):
+def test_any_nlp_back_end_takes_the_problem_in_u_and_its_point_is_the_plants(healthy, kind):
     model = exchanged(healthy, 1, TURNING) if kind == "turning" else with_feedback(healthy)
-    found, x = allocate(model, route="nlp"), np.array([1.0, 0.0, -1.0])
-    goal = found.attainable([0.3, 0.1])
+    goal = allocate(model, route="nlp").attainable([0.3, 0.1])
     assert goal.reachable and goal.y == pytest.approx(model.equilibrium(goal.u)[1], abs=1e-6)
-    move, near = found.controller(6).step(x, [0.3, 0.1], np.zeros(2)), found.controller(6)
     for solver in ("ipopt", "uno", "fatrop"):
-        program = fault_formulation("allocation.nonlinear")(
-            found.problem, reference=[0.3, 0.1], states=[x], goal=goal.u, rests=[goal.x], horizon=6)
-        program.assign(near._course(x, np.array([0.3, 0.1]), goal, np.zeros(2)))
-        other = solve(program, solver, warm=False)
-        assert other.residuals.violation < 1e-6 and other.values["u"][0] == pytest.approx(move.u, abs=1e-4)
-    y = model.simulate(np.vstack([other.values["u"], goal.u]), x0=x)
-    assert other.values["y"] == pytest.approx(y[:6], abs=1e-4)
+        other = allocate(model, route="nlp", solver=solver).attainable([0.3, 0.1])
+        assert other.solution.solver == solver and other.solution.residuals.violation < 1e-6
+        assert other.reachable and other.y == pytest.approx(goal.y, abs=1e-6)
 
 
-def test_rates_and_shared_limits_hold(healthy):
-    found = allocate(healthy)
-    controller, u, x = found.controller(8, rates=0.2), np.zeros(2), np.array([2.0, -1.0, 0.5])
-    for _ in range(4):
-        new = controller.step(x, [0.4, 0.1], u).u
-        assert np.all(np.abs(new - u) <= 0.2 + 1e-12)
-        x, u = healthy.A @ x + healthy.B @ healthy.expanded(new[None])[0], new
-    with pytest.raises(StructureError, match="inputs of the sample before"):
-        controller.step(x, [0.4, 0.1])
+def test_shared_limits_hold(healthy):
     shared = allocate(healthy, limit=0.6)
     target = shared.attainable([1.0, 1.0])
     assert np.linalg.norm(target.v) <= 0.6 + 1e-6
-    assert np.linalg.norm(shared.controller(6).step(x, [0.3, 0.1]).v) <= 0.6 + 1e-6
     limited = allocate(healthy, limit=0.6, route="nlp").attainable([1.0, 1.0])
     assert np.linalg.norm(limited.v) <= 0.6 + 1e-6 and limited.distance == pytest.approx(target.distance, abs=1e-4)
 
@@ -586,11 +549,7 @@ def test_robust_control_is_the_best_for_the_worst_member(healthy, faults):
     near = target.v + 0.05 * rng.standard_normal((500, 2))
     near = np.clip(near, robust.problem.low, robust.problem.high)
     assert min(worst(v) for v in np.vstack([grid, near])) >= target.distance - 1e-4
-    with pytest.warns(DataWarning, match="cannot be reached"):
-        u = robust.controller(8).step([np.zeros(3)] * 2, r).u
-    assert u.shape == (2,) and np.all(np.abs(u) <= 1.2)
-    with pytest.raises(StructureError, match="1 states for 2 members"):
-        robust.controller(8).step([np.zeros(3)], r)
+    assert target.u.shape == (2,) and np.all(np.abs(target.u) <= 1.2)
 
 
 def test_a_probe_separates_more_than_chance_and_less_than_its_bound(healthy, faults):

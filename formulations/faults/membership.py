@@ -180,15 +180,13 @@ def _posed(window: BoundedWindow, signature: Signature | None = None) -> Problem
 def _certified(window: BoundedWindow, signature: Signature | None, bounded: Array, exact: Array, bounds: Array,
                problem: Problem, values: Values, duals: Values) -> Bound:
     """Return the factor that the parity vector near the multipliers proves."""
-    sizes = {one.name: np.concatenate([part.sizes for part in problem.constraints() if part.name == one.name])
-             for one in problem.constraints()}
     if np.size(duals.get("noise", ())) != 2 * bounded.size:
         return Bound.none("the solver gave no multipliers")
-    weights = np.zeros(bounds.size)
-    upper, lower = np.split(np.asarray(duals["noise"], dtype=float) / sizes["noise"], 2)
+    weights, duals = np.zeros(bounds.size), problem.as_written(duals)
+    upper, lower = np.split(duals["noise"], 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
     if exact.size and np.size(duals.get("no noise", ())) == exact.size:
-        weights[exact] = np.asarray(duals["no noise"], dtype=float) / sizes["no noise"]
+        weights[exact] = duals["no noise"]
     p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
     proof = parity_proof(window, p, window.unseen(*(signature or (None, None))))
     gap = relative_gap(problem.value(values), proof.factor, problem.scale)

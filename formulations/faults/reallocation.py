@@ -1,147 +1,142 @@
-"""Re-allocation of a plant to its remaining actuators: resting points, and control to reach them.
+"""Re-allocation of a plant to its remaining actuators: the resting point nearest to a reference.
+
+    minimise ‖W (y - r)‖²   subject to   x = A x + B v + d,   y = C x + D v + c,   and the bounds of the actuators
 
 A monotone nonlinearity maps the range of its input onto a range of v = f(u) exactly, so that the problem is linear in
 v: the bounds of the inputs are those of v, and u = f^-1(v) keeps them. A stuck actuator is one whose range is a point.
+Where the reference cannot be reached, the distance is positive, and the multipliers of the bounds say which actuator
+limits it.
 
-* ``target``: the resting point nearest to a reference, min ‖W (y - r)‖² over x = A x + B v + d, y = C x + D v + c and
-  the bounds of v. Where the reference cannot be reached, the distance is positive, and the multipliers of the bounds
-  say which actuator limits it.
-* ``track``: model predictive control over a horizon, ‖W (y_k - r)‖² + ‖(v_k - v_s) / q‖² and a terminal cost.
-* both with several members, the possible damages: the same v for all, with the least cost of the worst of them
-  (min-max), each a plant with its own gains and constants in the v of the healthy nonlinearities.
-* with ``norm``: ‖S v_k‖ <= limit, a limit that actuators share (a pump, a power supply); a second-order cone.
-* with ``equations``: in the inputs u themselves, as `formulations.faults.reallocation_nlp` does it.
+* ``resting``: in the inputs u themselves, v = f(u) as equations, for nonlinearities without an inverse and for
+  feedback. A function is written as a straight line and softened kinks, ``width log(1 + exp((u - node) / width))``: of
+  a piecewise linear one at its corners, with a width that does not show; of any other at even nodes, as wide as their
+  distance, which gives smooth functions to about 1e-6 of their range. Local minima: there is no bound.
+* With several members, the possible damages: the same v for all, with the least cost of the worst of them (min-max),
+  each a plant with its own gains and constants in the v of the healthy nonlinearities.
+* With ``norm``: ‖S v‖ <= limit, a limit that actuators share (a pump, a power supply).
 
 Named variables: ``v``, ``x``, ``y`` (``x[i]``, ``y[i]`` of member i), ``worst`` where there are several, and ``u``.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 
-from optid.faults.repair.allocation_problem import AllocationProblem, Member
-from optid.program.program import Program
+from optid.bases import Triangular
+from optid.core.problem import Problem
+from optid.core.terms import Inner, Squares, Values
+from optid.faults.repair.allocation_problem import AllocationProblem
 from optid.program.view import View
 
+Array = np.ndarray
+
 TIE = 1e-8
-"""Weight of the distance of v from the middle of its range, to decide between resting points of the same outputs."""
+"""Weight of the distance from the middle of the range, to decide between resting points of the same outputs."""
 
-Equations = Callable[[AllocationProblem, Any, Any, Any], dict[str, tuple[Any, ...]]]
-"""(problem, u, v, y) -> the constraints that tie v to u and y, with u and v (r,) or (horizon, r)."""
+NODES = 16
+"""Cells of a function that is not piecewise linear."""
+
+SHARP = 1e-5
+"""Width of a corner, as a share of the range."""
 
 
-def target(problem: AllocationProblem, *, reference: Any, equations: Equations | None = None,
-           constraints: Sequence[Any] = ()) -> Program:
-    """Build the programme of the resting point nearest to a reference.
+def target(problem: AllocationProblem, *, reference: Any, constraints: Sequence[Any] = ()) -> Problem:
+    """State the problem of the resting point nearest to a reference, in v.
 
     Args:
         problem: the damaged plant.
         reference: (l,) of the outputs.
-        equations: constraints between v and the inputs u, which are then variables, too; by default v is free in its
-            bounds.
         constraints: builders of further constraints in v, x and y.
     """
-    r = np.asarray(reference, dtype=float)
-    v, structural, costs = cp.Variable(problem.columns, name="v"), {}, []
-    variables = {"v": v}
-    for label, member in _labelled(problem):
-        x = variables[f"x{label}"] = cp.Variable(member.A.shape[0], name=f"x{label}")
-        y = variables[f"y{label}"] = cp.Variable(member.C.shape[0], name=f"y{label}")
-        structural[f"rest{label}"] = (x == member.A @ x + member.B @ v + member.d,)
-        structural[f"outputs{label}"] = (y == member.C @ x + member.D @ v + member.c,)
-        costs.append(cp.sum_squares(cp.multiply(problem.weights, y - r)))
-    middle = problem.middle if equations is None else (problem.u_low + problem.u_high) / 2
-    return _posed("allocation.target", problem, variables, structural, costs, TIE * problem.scale, middle, r,
-                  equations, constraints, {})
+    start = _rests(problem, np.append(problem.middle, np.zeros(len(problem.feedback))))
+    return _posed("allocation.target", problem, start, "v", reference).subject_to(*constraints)
 
 
-def track(problem: AllocationProblem, *, reference: Any, states: Sequence[Any], goal: Any, rests: Any = None,
-          horizon: int = 40, effort: float = 1e-3, rates: Any = None, previous: Any = None,
-          equations: Equations | None = None, constraints: Sequence[Any] = ()) -> Program:
-    """Build the control of a horizon; reference, states, goal, rests and previous are parameters of the programme.
-
-    Args:
-        problem: the damaged plant.
-        reference: (l,) of the outputs.
-        states: (n,) of every member.
-        goal: v (r,) of the resting point, or its u (m,) with equations.
-        rests: (n,) state of every member there; that of v by default.
-        horizon: samples.
-        effort: weight of ((v - goal) / half its range)², of u with equations.
-        rates: (m,) largest steps of u; None for none; with equations.
-        previous: (m,) u of the sample before, where there are rates.
-        equations: as in `target`.
-        constraints: builders of further constraints.
-    """
-    parameters: dict[str, cp.Parameter] = {}
-
-    def given(name: str, value: Any) -> cp.Parameter:
-        value = np.asarray(value, dtype=float)
-        return parameters.setdefault(name, cp.Parameter(value.shape, value=value, name=name))
-
-    wanted, goal = given("reference", reference), given("goal", goal)
-    v, structural, costs = cp.Variable((horizon, problem.columns), name="v"), {}, []
-    variables, ones = {"v": v}, np.ones((horizon, 1))
-    if rests is None:
-        rests = [member.rest_state(np.asarray(goal.value)) for member in problem.members]
-    for (label, member), state, rest in zip(_labelled(problem), states, rests, strict=True):
-        x = variables[f"x{label}"] = cp.Variable((horizon + 1, member.A.shape[0]), name=f"x{label}")
-        y = variables[f"y{label}"] = cp.Variable((horizon, member.C.shape[0]), name=f"y{label}")
-        structural[f"dynamics{label}"] = (
-            x[0] == given(f"state{label}", state),
-            x[1:] == x[:-1] @ member.A.T + v @ member.B.T + ones @ member.d[None, :],
-        )
-        structural[f"outputs{label}"] = (y == x[:-1] @ member.C.T + v @ member.D.T + ones @ member.c[None, :],)
-        cost = cp.sum_squares(cp.multiply(ones @ problem.weights[None, :], y - cp.vstack([wanted] * horizon)))
-        costs.append(cost + cp.sum_squares(member.terminal_root(problem) @ (x[horizon] - given(f"rest{label}", rest))))
-    program = _posed("allocation.track", problem, variables, structural, costs, effort * problem.scale,
-                     cp.vstack([goal] * horizon), wanted.value, equations, constraints, parameters)
-    if rates is None:
-        return program
-    u: Any = program.variables["u"]
-    before: Any = cp.reshape(given("previous", previous), (1, u.shape[1]), order="C")
-    steps, most = cp.diff(cp.vstack([before, u]), axis=0), ones @ np.asarray(rates, dtype=float)[None, :]
-    return program.subject_to({"rates": [steps >= -most, steps <= most]})
+def resting(problem: AllocationProblem, *, reference: Any, constraints: Sequence[Any] = ()) -> Problem:
+    """State the problem of the resting point nearest to a reference, in the inputs u; arguments as of `target`."""
+    u = (problem.u_low + problem.u_high) / 2
+    values = [float(one.f(u[c])) for one, c in zip(problem.inverses, problem.input_of)]
+    start = {**_rests(problem, np.append(values, np.zeros(len(problem.feedback)))), "u": u}
+    return _posed("allocation.resting", problem, start, "u", reference).subject_to(*constraints)
 
 
-def _labelled(problem: AllocationProblem) -> Iterator[tuple[str, Member]]:
-    """Yield the members with the suffixes of the names of their variables."""
-    for number, member in enumerate(problem.members):
-        yield f"[{number + 1}]" if len(problem.members) > 1 else "", member
+def _posed(name: str, problem: AllocationProblem, start: Values, free: str, reference: Any) -> Problem:
+    """State the problem: the cost, or the worst cost of several members, and the tie-break of what is free."""
+    r, labels = np.asarray(reference, dtype=float), _labels(problem)
+    costs = [Squares(np.diag(problem.weights), problem.weights * r, 0.0, (f"y{label}",)) for label in labels]
+    low, high, half, words = problem.low, problem.high, problem.half, problem.names
+    if free == "u":
+        low, high = problem.u_low, problem.u_high
+        half, words = (high - low) / 2, tuple(f"actuator:{one}" for one in problem.inputs)
+    tie = np.sqrt(TIE * problem.scale) / half
+    chosen = np.eye(len(half), np.size(start[free]))  # feedback has columns of v, but no range
+    effort = Squares(tie[:, None] * chosen, tie * (low + high) / 2, 0.0, (free,))
 
+    def equations(v: View) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for label, member in zip(labels, problem.members):
+            x, y = v[f"x{label}"], v[f"y{label}"]
+            found[f"rest{label}"] = x == member.A @ x + member.B @ v["v"] + member.d
+            found[f"outputs{label}"] = y == member.C @ x + member.D @ v["v"] + member.c
+        for i, word in enumerate(words):
+            if low[i] == high[i]:
+                found[f"held {word}"] = v[free][i] == low[i]
+            else:
+                found[f"least {word}"], found[f"most {word}"] = v[free][i] >= low[i], v[free][i] <= high[i]
+        if problem.norm is not None:
+            found["shared limit"] = cp.sum_squares(problem.norm @ v["v"]) <= problem.limit**2
+        if len(costs) > 1:
+            found["worst member"] = [cost.express(v) <= v["worst"] for cost in costs]
+        return {**found, **(_functions(problem, v) if free == "u" else {})}
 
-def _posed(name: str, problem: AllocationProblem, variables: dict[str, cp.Variable],
-           structural: dict[str, tuple[Any, ...]], costs: list[Any], weight: float, goal: Any, reference: Any,
-           equations: Equations | None, constraints: Sequence[Any], parameters: dict[str, cp.Parameter]) -> Program:
-    """Add the bounds, by actuator, and the objective: the cost, or the worst cost of several members, and the effort.
-
-    Both are of v, or of u where equations tie v to it.
-    """
-    free = v = variables["v"]
-    words, low, high, half = problem.names, problem.low, problem.high, problem.half
-    if equations is not None:
-        words, low, high = tuple(f"actuator:{one}" for one in problem.inputs), problem.u_low, problem.u_high
-        half = (high - low) / 2
-        free = variables["u"] = cp.Variable((*v.shape[:-1], low.size), name="u")
-        structural |= equations(problem, free, v, variables["y"])
-    for i, word in enumerate(words):
-        column = free[..., i]
-        if low[i] == high[i]:
-            structural[f"held {word}"] = (column == low[i],)
-        else:
-            structural[f"least {word}"], structural[f"most {word}"] = (column >= low[i],), (column <= high[i],)
-    if problem.norm is not None:
-        rows = [v] if v.ndim == 1 else [v[k] for k in range(v.shape[0])]
-        structural["shared limit"] = tuple(cp.sum_squares(problem.norm @ row) <= problem.limit**2 for row in rows)
-    effort = weight * cp.sum_squares((free - goal) @ np.diag(1 / half))
+    terms = (costs[0], effort)
     if len(costs) > 1:
-        worst = variables["worst"] = cp.Variable(name="worst")
-        structural["worst member"] = tuple(cost <= worst for cost in costs)
-        costs = [worst]
+        start = {**start, "worst": np.array(max(cost.value(start) for cost in costs))}
+        terms = (Inner({"worst": np.array(1.0)}), effort)
     rest = problem.members[0].rest_output(np.append(problem.middle, np.zeros(len(problem.feedback))))
-    scale = (1 if v.ndim == 1 else v.shape[0]) * float(np.sum((problem.weights * (reference - rest)) ** 2))
-    view = View(dict(variables), channels=problem.names, outputs=problem.outputs)
-    return Program(name, cp.Minimize(costs[0] + effort), structural, variables, {}, lambda values: values["v"], view,
-                   frozenset(structural), parameters=parameters, scale=scale or 1.0).subject_to(*constraints)
+    return Problem(name, start, terms, model=lambda values: values["v"],
+                   facts={"channels": problem.names, "outputs": problem.outputs}, restrictions=(equations,),
+                   scale=float(np.sum((problem.weights * (r - rest)) ** 2)) or 1.0)
+
+
+def _labels(problem: AllocationProblem) -> list[str]:
+    """Return the suffixes of the names of the unknowns of every member."""
+    count = len(problem.members)
+    return [f"[{number + 1}]" if count > 1 else "" for number in range(count)]
+
+
+def _rests(problem: AllocationProblem, v: Array) -> dict[str, Array]:
+    """Return v, and the states and outputs at which every member rests."""
+    found = {"v": v}
+    for label, member in zip(_labels(problem), problem.members):
+        found |= {f"x{label}": member.rest_state(v), f"y{label}": member.rest_output(v)}
+    return found
+
+
+def _functions(problem: AllocationProblem, view: View) -> dict[str, Any]:
+    """Return v = [f(u); g(y)], by column."""
+    u, v, y, found = view["u"], view["v"], view["y"], {}
+    for i, (one, c, name) in enumerate(zip(problem.inverses, problem.input_of, problem.names)):
+        found[f"f {i + 1} of {name}"] = v[i] == _written(one.f, one.low, one.high, u[c])
+    for j, (g, o) in enumerate(problem.feedback):
+        low, high = g.basis.interval or (-1.0, 1.0)
+        margin = 0.0 if g.basis.outside == "error" else (high - low) / 2
+        found[f"feedback of {problem.outputs[o]} {j + 1}"] = (
+            v[problem.low.size + j] == _written(g, low - margin, high + margin, y[o]))
+    return found
+
+
+def _written(f: Any, low: float, high: float, z: Any) -> Any:
+    """Return f(z) as an expression of smooth atoms; straight lines beyond the range."""
+    cell = (high - low) / NODES
+    nodes, width = low + cell * np.arange(-2, NODES + 3), 0.7 * cell
+    if isinstance(f.basis, Triangular):
+        nodes, width = f.basis.nodes, SHARP * (high - low)
+        nodes = nodes[(nodes > low) & (nodes < high)]
+    grid = np.union1d(np.linspace(low, high, 801), nodes[(nodes >= low) & (nodes <= high)])
+    bends = width * np.logaddexp(0.0, (grid[:, None] - nodes) / width)
+    heights = np.linalg.lstsq(np.column_stack([np.ones(grid.size), grid, bends]), f(grid), rcond=1e-11)[0]
+    kinks = [float(c * width) * cp.logistic((z - node) / width) for node, c in zip(nodes, heights[2:])]
+    return sum(kinks, heights[0] + heights[1] * z)

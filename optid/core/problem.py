@@ -323,6 +323,13 @@ class Problem:
         """Whether every constraint is read into rows or a matrix."""
         return all(one.cone != "other" for one in self._at_start)
 
+    def as_written(self, duals: Mapping[str, Array]) -> dict[str, Array]:
+        """Return flat multipliers by constraint for its rows as they were written, not divided by their sizes."""
+        sizes: dict[str, list[Array]] = {}
+        for one in self.constraints():
+            sizes.setdefault(one.name, []).append(one.sizes)
+        return {name: np.ravel(duals[name]) / np.concatenate(parts) for name, parts in sizes.items() if name in duals}
+
     def violation(self, x: Values, constraints: tuple[Constraint, ...] | None = None) -> float:
         """Return the sum of the violations at a point, of rows divided by their sizes."""
         held, y = self.constraints(x) if constraints is None else constraints, self.leaf_values(x)

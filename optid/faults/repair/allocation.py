@@ -1,7 +1,7 @@
-"""Control of a damaged plant by the remaining actuators: attainable outputs and the inputs that hold them."""
+"""What the remaining actuators of a damaged plant can hold: attainable outputs, the inputs for them, what limits."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -16,10 +16,9 @@ from optid.faults.repair.inversion import inverse
 from optid.faults.repair.virtual_sensor import check_stabilisable
 
 if TYPE_CHECKING:
-    from optid.faults.repair.control import Controller
+    from optid.core.problem import Problem
     from optid.faults.repair.damage import Damage
     from optid.models import HammersteinSS
-    from optid.program.program import Program
     from optid.program.solution import Solution
 
 REACHED = 1e-4
@@ -61,7 +60,7 @@ class Target:
 
 @dataclass(frozen=True, eq=False)
 class Allocation:
-    """Control of a plant within the bounds of its inputs: `attainable` and `controller`.
+    """What a plant can hold within the bounds of its inputs.
 
     With several members (`robust_allocation`) the cost of the worst of them is minimised.
 
@@ -110,33 +109,35 @@ class Allocation:
         if not self.moving:
             return self._target(r, self.middle, self.model.expanded(self.middle[None, :])[0], None)
         if self.route == "qp":
-            solution = self.solved(fault_formulation("allocation.target")(problem, reference=r), {})
+            posed = fault_formulation("allocation.target")(problem, reference=r)
+            solution = self._solved(posed, posed.start)
             v = np.clip(solution.values["v"], problem.low, problem.high)
-            return self._target(r, self.inputs(v), v, solution)
-        program, third = fault_formulation("allocation.resting")(problem, reference=r), (self.high - self.low) / 3
+            return self._target(r, self.inputs(v), v, solution, posed)
+        posed, third = fault_formulation("allocation.resting")(problem, reference=r), (self.high - self.low) / 3
         found, failure = [], None
         for u in (self.middle, self.middle + third, self.middle - third):
             v = self.model.expanded(u[None, :])[0]
             x, y = self._rests(u, v)[0]
             try:
-                solution = self.solved(program, {"u": u, "v": self.columns(u, y), "x": x, "y": y})
+                solution = self._solved(posed, {"u": u, "v": self.columns(u, y), "x": x, "y": y})
             except StructureError as error:
                 failure = error
                 continue
             u = np.clip(solution.values["u"], self.low, self.high)
-            found.append(self._target(r, u, self.model.expanded(u[None, :])[0], solution))
+            found.append(self._target(r, u, self.model.expanded(u[None, :])[0], solution, posed))
         if failure is not None and not found:
             raise failure
         return min(found, key=lambda one: one.distance)
 
-    def _target(self, r: Array, u: Array, v: Array, solution: "Solution | None") -> Target:
+    def _target(self, r: Array, u: Array, v: Array, solution: "Solution | None", posed: "Problem | None" = None
+                ) -> Target:
         """The steady state of the plant, of several members the worst, at u and v."""
         weights, points = self.problem.weights, self._rests(u, v)
         distances = [float(np.linalg.norm(weights * (y - r))) for _, y in points]
         distance, (x, y) = max(distances), points[int(np.argmax(distances))]
         scale = self.problem.scale if self.moving else np.sum((weights * (np.abs(r) + np.abs(y))) ** 2)
         reachable = distance <= REACHED * (np.sqrt(scale) or 1.0)
-        limiting = {} if reachable else self._limiting(solution, distance)
+        limiting = {} if reachable else self._limiting(solution, posed, distance)
         return Target(r, y, u, v, x, distance, reachable, limiting, solution, self.idle)
 
     def _rests(self, u: Array, v: Array) -> list[tuple[Array, Array]]:
@@ -145,12 +146,12 @@ class Allocation:
             return [self.model.equilibrium(u)]
         return [(one.rest_state(v), one.rest_output(v)) for one in self.problem.members]
 
-    def _limiting(self, solution: "Solution | None", distance: float) -> dict[str, float]:
+    def _limiting(self, solution: "Solution | None", posed: "Problem | None", distance: float) -> dict[str, float]:
         """Actuators at a bound whose relaxation reduces the distance, with the multipliers of the distance."""
-        if solution is None:
+        if solution is None or posed is None:
             return {f"actuator:{name}": float("nan") for name in self.model.inputs}
         prices = {}
-        for name, dual in solution.duals.items():  # of the square of the distance
+        for name, dual in posed.as_written(solution.duals).items():  # of the square of the distance
             side, _, word = name.partition(" ")
             if side in ("held", "least", "most"):
                 prices[word] = prices.get(word, 0.0) + abs(float(dual[0])) / (2 * distance)
@@ -171,19 +172,18 @@ class Allocation:
                                  f"output ({', '.join(self.model.outputs)}).")
         return r
 
-    def solved(self, program: "Program", start: dict[str, Array], prove: bool = True) -> "Solution":
-        """Return the solution of a programme from a start; `StructureError` where there is no point."""
+    def _solved(self, posed: "Problem", start: Mapping[str, Array]) -> "Solution":
+        """Return the solution of a problem from a start; `StructureError` where there is no point."""
         from optid.backends.choice import find
+        from optid.solving.express import as_program
         from optid.solving.solve import solve
 
-        program.assign(start)
-        solver = self.solver
+        program, solver = as_program(posed.beginning(start)), self.solver
         if isinstance(solver, str) and solver != "auto" and program.kind == "NLP" and find(solver).refuses(program):
             solver = "auto"
-        solution = solve(program, solver, prove=prove, warm=False)
+        solution = solve(program, solver)
         if not solution.has_point or solution.status.value not in ("optimal", "locally optimal", "inaccurate"):
-            what = "steady state was" if program.name == "allocation.target" else "move was"
-            raise StructureError(f"no {what} found: {solution.status} ({solution.reason or solution.claimed})")
+            raise StructureError(f"no steady state was found: {solution.status} ({solution.reason or solution.claimed})")
         return solution
 
     def inputs(self, v: Array, near: Array | None = None) -> Array:
@@ -221,17 +221,6 @@ class Allocation:
         """Names of the inputs that have an effect."""
         live = {c for one, c in zip(self.problem.inverses, self.problem.input_of) if not one.dead}
         return tuple(self.model.inputs[c] for c in sorted(live))
-
-    def controller(self, horizon: int = 40, *, effort: float = 1e-3, rates: ArrayLike | None = None,
-                   route: str | None = None) -> "Controller":
-        """Return a predictive controller for this plant; see `optid.faults.repair.control.Controller`."""
-        from optid.faults.repair.control import Controller
-
-        if self.idle:
-            rest = ", ".join(f"{value:.4g}" for value in self.attainable(np.zeros(self.model.l)).y)
-            raise StructureError(f"not reachable: {self.idle}, so that there is nothing to control. The outputs settle "
-                                 f"at ({rest}); attainable(reference) gives the distance from a reference.")
-        return Controller(self, horizon, effort=effort, rates=rates, route=route or self.route)
 
     def __str__(self) -> str:
         """Return the actuators, their ranges, and the route."""

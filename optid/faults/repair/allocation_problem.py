@@ -47,22 +47,6 @@ class Member:
         """Return the static gain (l, r)."""
         return np.asarray(self.C @ np.linalg.lstsq(np.eye(len(self.A)) - self.A, self.B, rcond=None)[0] + self.D)
 
-    def terminal_root(self, problem: "AllocationProblem") -> Array:
-        """Return T (n, n) with T'T the cost to go after the horizon: at constant v, or under the optimal feedback.
-
-        The optimal feedback serves a plant that is not stable.
-        """
-        from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
-
-        weighted, r = problem.weights[:, None] * self.C, problem.low.size
-        if np.max(np.abs(np.linalg.eigvals(self.A)), initial=0.0) < 1 - 1e-9:
-            P = solve_discrete_lyapunov(self.A.T, weighted.T @ weighted)
-        else:
-            R = problem.scale * np.diag(1 / problem.half**2)
-            P = solve_discrete_are(self.A, self.B[:, :r], weighted.T @ weighted + 1e-9 * np.eye(len(self.A)), R)
-        sizes, axes = np.linalg.eigh((P + P.T) / 2)
-        return np.asarray(np.sqrt(np.maximum(sizes, 0.0))[:, None] * axes.T)
-
 
 @dataclass(frozen=True, eq=False)
 class AllocationProblem:
