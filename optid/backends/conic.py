@@ -184,6 +184,8 @@ def _has_rows_alone(program: Program) -> bool:
     problem: Problem | None = program.core
     if problem is None or len(problem.terms) != 1 or not isinstance(problem.terms[0], Squares):
         return False
+    if not problem.start.keys() <= set(problem.terms[0].z):  # the record tells no size of an unknown without effect
+        return False
     if problem.symmetric or not all(isinstance(leaf, Affine) for leaf in problem.leaves):
         return False
     return problem.is_in_rows
