@@ -59,16 +59,20 @@ def excess_of_signed(seed: int) -> tuple[float, str]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         fit = optid.fit(signed(seed), na=2, nb=2, basis=optid.Triangular(6, interval=(-1.0, 1.0)), constraints=rules)
-        half = fit.program.freeze(b=np.array([1.0, 0.0]))
+        b = cp.Parameter(2, value=np.array([1.0, 0.0]))  # what is left of the problem for a given b is convex
+        swap = {id(fit.program.variables["b"]): b}
+        left = [member.tree_copy(swap) for name, group in fit.program.constraints.items() if name != "gauge"
+                for member in group]
+        half = cp.Problem(fit.program.objective.tree_copy(swap), left)
         values = []
         for angle in np.linspace(0, 2 * np.pi, 145)[:-1]:
-            half.parameters["b"].value = np.array([np.cos(angle), np.sin(angle)])
+            b.value = np.array([np.cos(angle), np.sin(angle)])
             try:
-                half.problem.solve(solver=cp.CLARABEL)
+                half.solve(solver=cp.CLARABEL)
             except cp.SolverError:
                 continue
-            if half.problem.status == cp.OPTIMAL:
-                values.append(fit.program.unit * float(half.problem.value))
+            if half.status == cp.OPTIMAL:
+                values.append(fit.program.unit * float(half.value))
     return fit.solution.objective / min(values) - 1, str(fit.solution.status)
 
 

@@ -29,9 +29,9 @@ import numpy as np
 import optid
 from formulations.nuclear_subspace import low_rank
 from optid.backends import Settings, find
+from optid.core.program import as_program
 from optid.identify.subspace.low_rank import held_out_fit, order_scores, structure
 from optid.identify.subspace.plan import Plan
-from optid.solving.express import as_program
 from optid.solving.solve import solve
 
 

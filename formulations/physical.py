@@ -104,10 +104,11 @@ class _Collocation:
     def problem(self, start: Values) -> Problem:
         """Return the problem with a start, under the bounds that the equations give their parameters."""
         errors, terms = self.errors, []
-        open_ended = {name: self.equations.interval(name) for name in self.equations.states}
-        bounds = {f"states of {name}{label}": tuple(np.full(np.shape(start[f"states of {name}{label}"]), end / size)
-                                                    for end in open_ended[name])
-                  for label in self.labels for name, size in zip(open_ended, errors.usual)}
+        bounds = {}
+        for key, (name, size) in ((f"states of {name}{label}", (name, size)) for label in self.labels
+                                  for name, size in zip(self.equations.states, errors.usual)):
+            low, high = self.equations.interval(name)
+            bounds[key] = np.full(np.shape(start[key]), low / size), np.full(np.shape(start[key]), high / size)
         for e, label in zip(self.data.experiments, self.labels):
             for o, name in enumerate(self.data.outputs):
                 there, weight = np.isfinite(e.y[:, o]), float(np.sqrt(errors.weight[o, o]))

@@ -20,7 +20,7 @@ from optid.core.problem import Problem
 from optid.core.terms import Inner, Length
 from optid.identify.subspace import shift
 from optid.identify.subspace.shift import Shifting, ShiftStep
-from optid.program.program import named
+from optid.program.limits import named
 
 DEFINITE = 1e-3  # least eigenvalue of P where its trace is n: bounds the norm of P^-1
 

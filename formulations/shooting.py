@@ -23,7 +23,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 

@@ -30,12 +30,10 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
-import scipy.sparse as sp
 
 from formulations.latent_signals import latent_channels
 from formulations.state_space import state_space_fit, state_space_model
-from optid.bases import Bases, Polynomial, Trigonometric
-from optid.bases.basis import Basis, span
+from optid.bases import Bases
 from optid.core.judge import largest_excess
 from optid.core.leaves import Product
 from optid.core.problem import Problem
@@ -46,14 +44,14 @@ from optid.errors import StructureError
 from optid.identify.arguments import in_memory
 from optid.identify.prediction_error.compressed_errors import CompressedStates
 from optid.identify.prediction_error.descent import Descent
-from optid.identify.prediction_error.state_errors import WILD, StateErrors, weight_root
+from optid.identify.prediction_error.simultaneous import expressed, judged_by_run
+from optid.identify.prediction_error.state_errors import WILD, StateErrors
 from optid.identify.prediction_error.tangent_descent import NO_BOUND
 from optid.identify.prediction_error.tangent_fit import Places, with_signs
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
-from optid.models.roots import spectral_radius
-from optid.program.solution import Bound, Solution, Status
+from optid.program.solution import Bound, Status
 from optid.program.structure import GAUGE
 from optid.program.units import outer_bases
 from optid.program.view import View
@@ -62,8 +60,6 @@ from optid.solving.solve import Evidence, Procedure
 Array = np.ndarray
 
 LIMIT = 5_000  # samples up to which the programme is built
-# relative difference between the objective and the squared errors of a run of the model that is rounding
-SAME_RUN = 1e-6
 
 
 @subspace_steps({"ss.shooting": "NLP"})
@@ -151,28 +147,12 @@ def _shoot(plan: Plan, errors: StateErrors, constraints: tuple[Any, ...], best: 
     if not solution.has_point:
         return None
     x = fit.places.pack(solution.values)
-    status, reason = _judged(errors, x, solution)
+    status, reason = judged_by_run(errors, x, solution)
     if status is Status.LOCAL and isinstance(problem.compressed, CompressedStates):
         problem.compressed.settle(solution.values)
     model = fit.recover(solution.values)
     bound = Bound.none(NO_BOUND.format(errors.errors))
     return Evidence(model, solution.objective, bound, status, reason, {**figures, "Gauss-Newton steps": best.steps})
-
-
-def _judged(errors: StateErrors, x: Array, solution: Solution) -> tuple[Status, str]:
-    """Take the solver's status only where the model is stable and its run has the errors of the programme."""
-    if solution.status not in (Status.LOCAL, Status.OPTIMAL):
-        return solution.status, solution.reason
-    radius = spectral_radius(errors.unknowns.unpack(x).A)
-    if radius >= errors.limit:
-        return Status.INACCURATE, (f"the model is unstable (spectral radius of A {radius:.6g}): its states satisfy the "
-                                   "equations, but no run from x0 will; use the .exact formulation or stability='free'")
-    value = errors.value(x)
-    if not abs(value - solution.objective) <= SAME_RUN * abs(value) + 1e-9 * errors.energy:
-        return Status.INACCURATE, (f"a run of the model has the squared errors {value:.6g}, the programme "
-                                   f"{solution.objective:.6g}: it is unstable, or leaves the interval of a function, "
-                                   "where this programme continues it; give that basis outside='extrapolate'")
-    return Status.LOCAL, NO_BOUND.format(errors.errors)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,7 +188,7 @@ class StateShooting:
         runs, terms, courses = errors.visited(errors.unknowns.unpack(z0)), [], {}
         for i, label in enumerate(errors.labels):
             courses |= self._courses(i, label, runs[i], start)
-            weights, measured = self._weights(i), np.nan_to_num(errors.data.experiments[i].y).ravel(order="F")
+            weights, measured = errors.output_weights(i), np.nan_to_num(errors.data.experiments[i].y).ravel(order="F")
             terms.append(Squares(weights, weights @ measured, 0.0, (f"output{label}",)))
         limits = {name: np.broadcast_to(WILD * np.max(np.abs(one), axis=0), one.shape) for name, one in courses.items()}
         bounds = {name: (-limit, limit) for name, limit in limits.items()}
@@ -262,7 +242,7 @@ class StateShooting:
             shown = shown + cp.outer(f, b[n:]) if unknowns.feedthrough[c] else shown
         for j, one in enumerate(unknowns.latent):
             matrix = v[key("g", j)]
-            h = _values(one.basis, v[f"signal of {key('z', j)}{label}"], one.vectors @ v[key("c", j)])
+            h = expressed(one.basis, v[f"signal of {key('z', j)}{label}"], one.vectors @ v[key("c", j)])
             following = following + cp.outer(h, matrix[:n])
             shown = shown + cp.outer(h, matrix[n:]) if one.direct else shown
         if unknowns.constant:
@@ -275,41 +255,10 @@ class StateShooting:
         following, shown = self._acting(i, label, v)
         for j, family in enumerate(self.criterion.unknowns.expansion.feedback):
             nu = v[key("nu", j)] if family.size > 1 else np.ones(1)
-            g = (_values(family.basis, output[:, family.output], family.vectors @ nu)
+            g = (expressed(family.basis, output[:, family.output], family.vectors @ nu)
                  - family.intercept @ nu - output @ (family.slope.T @ nu))
             following = following + cp.outer(g, v[key("e", j)])
         first = v["x0"] if len(self.criterion.labels) == 1 else v["x0"][:, i]
         return {**{name: v[name] == argument for name, argument in self._arguments(i, label, v).items()},
                 f"initial state{label}": v[f"states{label}"][0] == first,
                 f"dynamics{label}": v[f"states{label}"][1:] == following[:-1], f"outputs{label}": output == shown}
-
-    def _weights(self, i: int) -> sp.csr_array:
-        """Return the matrix that weighs the outputs of an experiment, column by column, as far as they are present."""
-        here, covariance = np.isfinite(self.criterion.data.experiments[i].y), np.linalg.inv(self.criterion.weight)
-        blocks = []
-        for pattern in np.unique(here[here.any(axis=1)], axis=0):
-            there = np.flatnonzero(pattern)
-            picked = sp.eye_array(len(here)).tocsr()[np.flatnonzero((here == pattern).all(axis=1))]
-            blocks.append(sp.kron(weight_root(covariance, ~pattern)[there], picked))
-        return sp.csr_array(sp.vstack(blocks))
-
-
-def _values(basis: Basis, v: Any, coefficients: Any) -> Any:
-    """Return sum_j coefficients[j] eta_j(v) of a basis with a formula, as an expression of a course v."""
-    low, high = span(basis)
-    if isinstance(basis, Polynomial):
-        t = (2 * v - low - high) / (high - low)
-        before, now = cp.Constant(np.ones(v.size)), t
-        functions = [t]
-        for k in range(1, basis.p):
-            before, now = now, ((2 * k + 1) * cp.multiply(t, now) - k * before) / (k + 1)
-            functions.append(now)
-    elif isinstance(basis, Trigonometric):
-        angle = np.pi / (basis.half_range * (high - low) / 2) * (v - (low + high) / 2)
-        atoms: Any = cp  # the stubs know no trigonometric functions
-        functions = [atom(j * angle) for j in range(1, basis.p + 1) for atom in (atoms.cos, atoms.sin)]
-    else:
-        raise StructureError(f"a {type(basis).__name__.lower()} basis of outputs or latent signals has no formula that "
-                             "NLP solvers can differentiate: use 'polynomial:p' or 'trigonometric:p', or the .exact "
-                             "formulation")
-    return sum(coefficients[j] * function for j, function in enumerate(functions))

@@ -37,6 +37,7 @@ from optid.bases import Linear
 from optid.certificate.hankel import simulation_bound
 from optid.core.leaves import Product
 from optid.core.problem import Problem
+from optid.core.program import as_program
 from optid.core.terms import Squares
 from optid.errors import DataWarning
 from optid.identify.noise import with_noise_or_reason
@@ -46,7 +47,6 @@ from optid.identify.subspace.realisation import Realisation
 from optid.models.roots import spectral_radius
 from optid.program.solution import Bound, Solution, Status
 from optid.program.units import energy_unit, outer_bases
-from optid.solving.express import as_program
 from optid.solving.solve import Evidence, Procedure
 
 # multipliers up to which the proof of this step, which says nothing of (A, C), is worth a semidefinite programme

@@ -56,10 +56,18 @@ def raw_problem(phi, y, na, shapes, loss, weight=0.0, constrain=lambda a, thetas
     return float(problem.value), [t.value for t in thetas]
 
 
+def with_b_given(program):
+    """Return the CVXPY problem that is left of a bilinear programme for a given b, and the parameter for b."""
+    b = cp.Parameter(2, value=np.array([1.0, 0.0]))
+    swap = {id(program.variables["b"]): b}
+    left = [member.tree_copy(swap) for name, group in program.constraints.items() if name != "gauge"
+            for member in group]
+    return cp.Problem(program.objective.tree_copy(swap), left), b  # those of b alone hold or not
+
+
 def search(program, points=72):
     """Global minimum of a programme with one input and n_b = 2: for a fixed direction b a convex problem is left."""
-    frozen = program.freeze(b=np.array([1.0, 0.0]))
-    problem, b = frozen.problem, frozen.parameters["b"]
+    problem, b = with_b_given(program)
 
     def value(angle):
         b.value = np.array([np.cos(angle), np.sin(angle)])

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 import optid
 from optid.cli.app import app
 from optid.cli.terminal import spread
+from optid.core.program import programme_of
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
 from optid.registry import CONSTRAINTS, FORMULATIONS, registered
-from optid.solving.express import programme_of
 from optid.solving.solve import solve
 
 

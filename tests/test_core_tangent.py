@@ -12,13 +12,13 @@ from formulations.prediction_error import _problem as transfer_problem
 from optid.backends.back_end import Settings
 from optid.backends.conic import solve_with
 from optid.core.leaves import Affine, Product, Quantity
+from optid.core.program import as_program
 from optid.errors import StructureError
 from optid.identify.prediction_error.compressed_errors import CompressedErrors
 from optid.identify.prediction_error.static_curve import static_curve
 from optid.identify.prediction_error.tangent_fit import TangentFit
 from optid.identify.prediction_error.transfer_errors import transfer_errors
 from optid.program.solution import Status
-from optid.solving.express import as_program
 
 pytestmark = pytest.mark.numerical
 

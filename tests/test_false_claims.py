@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from zoo import anything
 
 import optid
 from optid.backends import Answer, BackEnd
 from optid.backends.choice import choose
 from optid.errors import OptidError
 from optid.program.solution import Status
-from optid.program.structure import Structure
 
 CLASSES = frozenset({"LP", "QP", "SOCP", "SDP", "conic", "NLP"})
 BASIS = optid.Triangular(4)
@@ -90,11 +90,11 @@ def test_no_lie_is_believed(fit):
     u = rng.uniform(-1, 1, 200)
     data = optid.Data(u, lfilter([0, 1], [1, -1.2, 0.4], np.tanh(2 * u)) + 0.3 * rng.standard_normal(200))
     best = optid.fit(data, name, **arguments).solution.objective
-    structures = () if "constraints" in arguments else (Structure,)
+    takes = None if "constraints" in arguments else anything
     for liar, run in LIARS.items():
         try:
             found = optid.fit(data, name, **arguments, raises=False,
-                              solver=BackEnd("liar", CLASSES, run, structures=structures)).solution
+                              solver=BackEnd("liar", CLASSES, run, takes=takes)).solution
         except OptidError:
             continue
         assert found.status not in (Status.INFEASIBLE, Status.UNBOUNDED), liar

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from problems import BASIS, record
 from refusals import refuses
+from zoo import anything
 
 import optid
 from formulations import hammerstein_arx
 from optid.backends import Answer, BackEnd
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, SolverFailed, StructureError
 from optid.program.solution import Status
-from optid.program.structure import Structure
 
 STRUCTURE = {"na": 2, "nb": 2, "basis": BASIS}
 
 
 def mine(run):
-    return BackEnd("mine", frozenset({"NLP", "QP", "SDP"}), run, structures=(Structure,))
+    return BackEnd("mine", frozenset({"NLP", "QP", "SDP"}), run, takes=anything)
 
 
 def truth(program, settings):

@@ -3,14 +3,17 @@
 from itertools import combinations
 
 import cvxpy as cp
+import numpy as np
 import pytest
 from problems import BASIS, record
 
 import optid
 from formulations.constraints import shape
 from optid.certificate.infeasibility import conflicting_subset, explain, satisfiable
+from optid.core.problem import Problem
+from optid.core.program import programme_of
+from optid.core.terms import Inner
 from optid.errors import InfeasibleError, UnboundedError
-from optid.solving.express import programme_of
 
 SETS = {
     "slope and gain": ([shape.slope(low=2, high=3), shape.gain(1.0, at=0.1), shape.coefficients("a", high=3)],
@@ -79,13 +82,9 @@ def test_failures_are_values_on_request():
 
 
 def test_an_unbounded_programme_says_so():
-    from optid.program.program import Program
-    from optid.program.view import View
-
     def falling(data):
-        x = cp.Variable(1, name="x")
-        return Program("falling", cp.Minimize(cp.sum(x)), {"cap": (x <= 1,)}, {"x": x}, {}, dict,
-                       View({"x": x}))
+        return Problem("falling", {"x": np.zeros(1)}, (Inner({"x": np.ones(1)}),),
+                       restrictions=(lambda v: {"cap": v["x"] <= 1},))
 
     with pytest.raises(UnboundedError, match="'falling' has no minimum"):
         optid.fit(record(), falling)

@@ -7,9 +7,10 @@ from problems import BASIS, record, search
 
 import optid
 from formulations.constraints import shape
-from optid.certificate.lifting import lift, places
+from optid.certificate.lifting import lift
+from optid.core.least_squares import RankOneForm
+from optid.core.program import as_program
 from optid.registry import formulation
-from optid.solving.express import as_program
 
 SETS = {
     "cone": [shape.monotone()],
@@ -73,7 +74,7 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
     """At random points of the factored problem both readings have the same left-hand sides."""
     rules = [shape.slope(0.5, 2.0), shape.dead_zone(-0.3, 0.3), lambda v: {"a": 2 * v["a"][0] - v["a"][1] <= 3}]
     program = stated(record(), constraints=rules, gauge=gauge)
-    lifted = lift(program, program.structure)
+    lifted = lift(program.core, RankOneForm.of(program.core))
     assert not lifted.refused and not lifted.cones
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     rng = np.random.default_rng(1)
@@ -83,8 +84,8 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
         program.assign({"a": a, "mu": mu, "b": b, "offset": d})
         z = np.concatenate([a, d, np.kron(b, mu)])
         values = rows @ z - right
-        member = [np.ravel(c.expr.value, order="F") for name, group in program.user_constraints.items()
-                  for c in group if name in ("slope", "a")]
+        member = [np.ravel(c.expr.value, order="F") for name in program.user_constraints
+                  for c in program.constraints[name] if name in ("slope", "a")]
         assert np.allclose(values[~equal], np.concatenate(member))
         (zone,) = program.constraints["dead_zone:-0.3,0.3"]
         flat = np.ravel(zone.expr.value)
@@ -93,23 +94,29 @@ def test_lifted_rows_are_the_constraints_themselves(gauge):
 
 def test_products_of_two_cones():
     program = stated(record(), constraints=[lambda v: {"rising": BASIS.increments() @ v["mu"] >= 0}, shape.sign("b")])
-    lifted = lift(program, program.structure)
+    lifted = lift(program.core, RankOneForm.of(program.core))
     assert set(lifted.cones) == set(lifted.directions) == {0}
-    assert lifted.add_products(program.structure.problem) == [] and set(lifted.cones) == {0}
+    assert lifted.add_products(RankOneForm.of(program.core).problem) == [] and set(lifted.cones) == {0}
     rows, right, equal = lifted.linear.rows, lifted.linear.right, lifted.linear.equality
     assert not right.any() and not equal.any()
     mu, b = np.random.default_rng(2).normal(size=6), np.array([0.3, 2.0])
     z = np.concatenate([np.zeros(3), np.kron(b, mu)])
-    (curve,), (sign,) = program.limits["rising"], program.limits["sign:b:positive"]
+    held = {one.name: one for one in program.core.constraints()}
+    curve, sign = held["rising"], held["sign:b:positive"]
     ratio = -rows @ z / np.kron(b / sign.sizes, BASIS.increments() @ mu / curve.sizes)
     assert ratio[0] > 0 and np.allclose(ratio, ratio[0])  # one factor, that of the units
 
 
-def test_places_read_bilinear_constraints_only():
-    program = stated(record())
-    where, v = places(program, program.structure), program.view.inner
-    rows, right = where.rows(v["Theta"][2, 1] - 3 * v["a"][1] <= 4)
-    assert rows.shape == (1, 15) and right == pytest.approx([4])
-    assert dict(zip(*[part.tolist() for part in (np.flatnonzero(rows), rows[rows != 0])])) == {1: -3.0, 11: 1.0}
-    assert where.rows(v["mu"][0] + v["a"][0] <= 1) is None
-    assert where.rows(cp.sum_squares(v["a"]) <= 1) is None
+def test_only_constraints_linear_in_the_products_are_lifted():
+    program = stated(record(), constraints=[lambda v: {"mixed": v["Theta"][2, 1] - 3 * v["a"][1] <= 4}])
+    program.assign(program.start)
+    found = lift(program.core, RankOneForm.of(program.core))
+    (one,) = program.core.constraints()
+    rows = found.linear.rows * one.sizes
+    assert rows.shape == (1, 15) and found.linear.right * one.sizes == pytest.approx([4]) and not found.refused
+    unit = float(program.view["Theta"].value[2, 1] / program.view.inner["Theta"].value[2, 1])
+    assert dict(zip(np.flatnonzero(rows).tolist(), rows[rows != 0])) == pytest.approx({1: -3.0, 11: unit})
+    for name, build in (("both", lambda v: v["mu"][0] + v["a"][0] <= 1),
+                        ("ball", lambda v: cp.sum_squares(v["a"]) <= 1)):
+        program = stated(record(), constraints=[lambda v, name=name, build=build: {name: build(v)}])
+        assert lift(program.core, RankOneForm.of(program.core)).refused == name

@@ -11,13 +11,16 @@ import optid
 from formulations.nuclear_subspace import low_rank
 from optid.backends import Answer, find
 from optid.backends.choice import choose
+from optid.certificate.low_rank import certify_low_rank
+from optid.core.low_rank import LowRankForm
+from optid.core.problem import Problem
+from optid.core.program import as_program
+from optid.core.terms import Squares
 from optid.errors import DataWarning, InfeasibleError, RankError, SolverFailed, StructureError
 from optid.identify.subspace.low_rank import held_out_fit, structure
 from optid.identify.subspace.plan import Plan
 from optid.program.solution import Status
-from optid.solving.express import as_program
 from optid.solving.solve import solve
-from optid.structures.nuclear_norm import NuclearNormStructure
 
 A = np.array([[0.8, 0.4], [-0.4, 0.8]])
 B, C = np.array([[1.0, 0.2], [0.5, -0.7]]), np.array([[1.0, 0.3], [-0.2, 0.8]])
@@ -140,8 +143,8 @@ def test_the_bound_is_recomputed_whatever_a_solver_says():
     rng = np.random.default_rng(0)
     for scale in (0.0, 1e-3, 1.0, 1e6):
         wrong = {"structure": own.duals["structure"] + scale * rng.normal(size=own.duals["structure"].size)}
-        bound, start = program.certify(program, own.values, wrong)
-        assert start is None and bound.value <= own.objective * (1 + 1e-9)
+        bound = certify_low_rank(program.core, own.values, wrong)
+        assert bound.value <= own.objective * (1 + 1e-9)
         assert bound.proved or scale
         assert np.linalg.norm(bound.multipliers, 2) <= 1 + 1e-9
 
@@ -156,10 +159,11 @@ def test_the_bound_is_recomputed_whatever_a_solver_says():
 def test_the_programme_chooses_the_admm_unless_something_else_is_asked_of_it():
     _, program = programme()
     assert choose(program)[0].name == "admm"
-    bounded = program.subject_to(lambda view: {"ceiling": view["output"] <= 4.0})
+    bounded = as_program(program.core.subject_to(lambda view: {"ceiling": view["output"] <= 4.0}))
     assert choose(bounded)[0].name == "clarabel"
     assert "takes no further constraints ('ceiling')" in find("admm").refuses(bounded)
-    assert "admm solves nuclear" in find("admm").refuses(replace(program, structure=None))
+    assert "admm solves nuclear" in find("admm").refuses(as_program(Problem("other", {"x": np.zeros(2)}, (
+        Squares(np.eye(2), np.ones(2), 0.0, ("x",)),))))
     free, held = solve(program), solve(bounded)
     assert held.status in (Status.OPTIMAL, Status.LOCAL) and held.objective >= free.objective - 1e-7
 
@@ -175,7 +179,7 @@ def test_weights_are_changed_in_one_problem():
 
 def test_an_iteration_limit_is_reported():
     def hasty(program, settings):
-        if not isinstance(program.structure, NuclearNormStructure):
+        if LowRankForm.of(program.core) is None:
             return find("clarabel").run(program, settings)
         return find("admm").run(program, replace(settings, options={"limit": 3}))
 

@@ -13,6 +13,7 @@ from formulations.constraints.shape import monotone
 from formulations.faults.refit import actuator, parameters
 from optid import Data
 from optid.bases import Polynomial, Triangular
+from optid.core.program import as_program
 from optid.errors import DataError, DataWarning, LookupFailed, RankError, StructureError
 from optid.faults import (
     Answer,
@@ -36,8 +37,6 @@ from optid.faults import (
 from optid.faults.repair.damage import Damage
 from optid.faults.repair.refitting import refitting
 from optid.models import Nonlinearity
-from optid.registry import fault_formulation
-from optid.solving.express import as_program
 from optid.solving.solve import run, solve
 
 ONSET, COUNT = 80, 140

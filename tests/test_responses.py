@@ -1,14 +1,16 @@
 """Constraints where B and D are chosen: responses written out by simulation, gains by the transfer function."""
 
-import cvxpy as cp
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import optid
 from formulations.constraints import responses, shape
+from optid.core.problem import Problem
+from optid.core.terms import Squares, flat
 from optid.data.record import Data
 from optid.errors import StructureError
-from optid.program.program import Program
 from optid.program.solution import Status
 from optid.program.view import View
 from optid.registry import named_constraint
@@ -19,21 +21,20 @@ INPUTS, OUTPUTS, N = ("u1", "u2"), ("y1", "y2"), 3
 
 
 def system(seed=0, direct=True, functions=None):
-    """A program that fits random targets Theta, with A and C held."""
+    """A problem that fits random targets Theta, with A and C held."""
     rng = np.random.default_rng(seed)
     a = rng.normal(size=(N, N))
     a *= 0.8 / np.max(np.abs(np.linalg.eigvals(a)))
     c = rng.normal(size=(2, N))
     bases = {name: _fitted(functions) for name in INPUTS}
     width = N + 2 * direct
-    thetas = {f"Theta[{name}]": cp.Variable((bases[name].size, width), name=f"Theta[{name}]") for name in INPUTS}
-    targets = {key: rng.normal(size=v.shape) for key, v in thetas.items()}
-    offset = cp.Variable(2, name="offset")
-    view = View({**thetas, "offset": offset}, channels=INPUTS, outputs=OUTPUTS, bases=bases,
-                reference={"A": a, "C": c})
-    cost = sum(cp.sum_squares(v - targets[key]) for key, v in thetas.items()) + cp.sum_squares(offset - 1)
-    program = Program("realisation", cp.Minimize(cost), {}, {**thetas, "offset": offset}, {}, dict, view)
-    return program, a, c, bases, targets
+    targets = {f"Theta[{name}]": rng.normal(size=(bases[name].size, width)) for name in INPUTS}
+    wanted = {**targets, "offset": np.ones(2)}
+    cost = Squares(np.eye(sum(map(np.size, wanted.values()))), np.concatenate([flat(one) for one in wanted.values()]),
+                   0.0, tuple(wanted))
+    problem = Problem("realisation", {name: np.zeros(np.shape(one)) for name, one in wanted.items()}, (cost,),
+                      facts={"channels": INPUTS, "outputs": OUTPUTS, "bases": bases, "reference": {"A": a, "C": c}})
+    return problem, a, c, bases, targets
 
 
 def _fitted(functions):
@@ -119,7 +120,7 @@ def test_positive_realness_is_that_of_the_frequency_response(seed, margin):
     assert least > margin - 1e-6
     if _passivity(a, c, [targets[f"Theta[{name}]"] for name in INPUTS]) < margin - 1e-3:
         assert least == pytest.approx(margin, abs=2e-3)  # it binds, and no more than needed
-    assert "P of positive_real" in constrained.variables and "P of positive_real" not in program.variables
+    assert solution.values[f"P of {constrained.constraint_names[0]}"].shape == (N, N)
 
 
 def _passivity(a, c, thetas):
@@ -138,11 +139,10 @@ def test_contradictions_are_infeasible():
 
 
 def test_a_pole_at_one_has_no_static_gain():
-    program, a, c, bases, _ = system(0)
-    view = View({name: program.view[name] for name in program.view}, channels=INPUTS,
-                outputs=OUTPUTS, bases=bases, reference={"A": np.eye(N), "C": c})
+    problem, _, c, _, _ = system(0)
+    whole = replace(problem, facts={**problem.facts, "reference": {"A": np.eye(N), "C": c}})
     with pytest.raises(StructureError, match="pole at 1"):
-        shape.gain(1.0, channel="u1", output="y1")(view)
+        whole.subject_to(shape.gain(1.0, channel="u1", output="y1")).constraints()
 
 
 @pytest.mark.parametrize("build, words", [
@@ -158,7 +158,7 @@ def test_a_pole_at_one_has_no_static_gain():
 ])
 def test_bad_arguments(build, words):
     with pytest.raises(StructureError, match=words):
-        build(system()[0].view)
+        system()[0].subject_to(build).constraints()
 
 
 @pytest.mark.parametrize("word", ["step_response:positive,30", "impulse_response:negative", "no_effect:u1,y2",

@@ -105,7 +105,7 @@ def test_a_pickled_fit_keeps_its_results_and_solves_again_when_its_programme_is_
     assert again.solution.proof and again.simulation_fit == fit.simulation_fit
     assert "outcome" not in vars(again)
     assert again.uncertainty.table() == fit.uncertainty.table()
-    assert again.program.user_constraints.keys() == fit.program.user_constraints.keys()
+    assert again.program.user_constraints == fit.program.user_constraints
 
 
 def test_a_constraint_that_cannot_be_pickled_is_named_when_it_is_needed():

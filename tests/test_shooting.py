@@ -10,11 +10,11 @@ import optid
 from formulations import shooting
 from formulations.constraints import shape
 from optid.bases import Polynomial
+from optid.core.program import as_program
 from optid.data.record import Data
 from optid.errors import DataError, OptidError, RankError, StructureError
 from optid.models import HammersteinTF, Nonlinearity
 from optid.program.solution import Status
-from optid.solving.express import as_program
 
 ORDERS = {"na": 2, "nb": 2, "nk": 1, "basis": BASIS}
 

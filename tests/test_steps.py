@@ -156,7 +156,7 @@ def test_formulations_without_declared_steps_are_refused_by_their_programmes():
 
 def test_a_back_end_of_the_user_serves_a_step():
     lstsq = back_ends()["lstsq"]
-    mine = BackEnd("mine", lstsq.classes, lstsq.run, structures=lstsq.structures)
+    mine = BackEnd("mine", lstsq.classes, lstsq.run, form=lstsq.form, takes=lstsq.takes)
     fit = fitted("hammerstein_ss.sid", {"split": mine}, basis="linear")
     assert fit.solution.solver == "mine"
     assert fitted("hammerstein_ss.sid", mine, basis="linear").solution.solver == "mine"

@@ -10,9 +10,9 @@ import pytest
 
 from optid import Data, fit
 from optid.backends import Answer, BackEnd, back_ends
+from optid.core.least_squares import RankOneForm
 from optid.errors import StudyError
 from optid.program.solution import Status
-from optid.structures.least_squares import RankOneStructure
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry, Study
 from optid.studies.execution import cell as cells
 from optid.studies.execution import machine as memory
@@ -36,8 +36,8 @@ def one(solver="gauss_newton", formulation="hammerstein_arx.exact", *, entry=Non
 def solver(monkeypatch):
     """Register a back end for the test."""
 
-    def register(run, classes=(), structures=(RankOneStructure,)):
-        monkeypatch.setitem(back_ends(), "mine", BackEnd("mine", frozenset(classes), run, structures=structures))
+    def register(run, classes=(), takes=RankOneForm.of):
+        monkeypatch.setitem(back_ends(), "mine", BackEnd("mine", frozenset(classes), run, form="rank-one", takes=takes))
         return "mine"
 
     return register

@@ -338,9 +338,13 @@ def test_refusals_name_the_reason_and_the_remedy(plain):
 
 def test_active_cones_are_refused_by_name(plain):
     a = float(np.linalg.norm(plain.model.a))
-    cone = [lambda v: {"short": cp.SOC(cp.Constant(0.9 * a), v["a"])}]
-    fit = optid.fit(plain.data, "arx", na=2, nb=2, constraints=cone)
-    refuses(StructureError, "'short' is an active SOC", lambda: fit.uncertainty)
+    matrix = [lambda v: {"short": cp.bmat([[0.9 * a * np.eye(2), v["a"][:, None]],
+                                           [v["a"][None], np.array([[0.9 * a]])]]) >> 0}]
+    fit = optid.fit(plain.data, "arx", na=2, nb=2, constraints=matrix)
+    refuses(StructureError, "'short' is an active PSD", lambda: fit.uncertainty)
+    cone = [lambda v: {"short": cp.SOC(cp.Constant(0.9 * a), v["a"])}]  # the same, as a row with a slope
+    same = optid.fit(plain.data, "arx", na=2, nb=2, constraints=cone)
+    assert same.solution.objective == pytest.approx(fit.solution.objective, rel=1e-6) and same.uncertainty.table()
 
 
 def test_a_dead_input_is_refused_by_name():

@@ -34,7 +34,7 @@ import numpy as np
 
 from optid.backends import Answer, BackEnd, find
 from optid.program.solution import Status
-from optid.structures.least_squares import RankOneStructure
+from optid.core.least_squares import RankOneForm
 
 
 def _segfaults(program, settings):
@@ -81,7 +81,7 @@ def _silent(program, settings):
 
 
 def family():
-    return [BackEnd(name, frozenset(), globals()["_" + name], structures=(RankOneStructure,))
+    return [BackEnd(name, frozenset(), globals()["_" + name], form="rank-one", takes=RankOneForm.of)
             for name in ("segfaults", "aborts", "leaves", "endless", "hungry", "nan", "lies", "raises", "silent",
                          "slow")]
 '''

@@ -166,13 +166,14 @@ def positive_real(margin: float = 0.0) -> Rule:
         columns = [cp.hstack([t[0], np.zeros(n + l - t.shape[1])]) for t in thetas]
         whole = cp.vstack(columns).T
         b, d = whole[:n], whole[n:]
-        p = view.auxiliary("P of positive_real", (n, n), symmetric=True)
+        p = view.auxiliary(f"P of {name}", (n, n), symmetric=True)
         corner = b - a @ p @ c.T
         lmi = cp.bmat([[p - a @ p @ a.T, corner], [corner.T, d + d.T - c @ p @ c.T - 2 * margin * np.eye(l)]])
         lowered = np.diag(np.repeat([0.0, 2.0], [n, l])).ravel()
         return [Limit(lmi - REAL * np.linalg.norm(c) * np.eye(n + l) >> 0, lowered)]
 
-    return Rule("positive_real" + (f":{margin:g}" if margin else ""), build, matrix=True)
+    name = "positive_real" + (f":{margin:g}" if margin else "")
+    return Rule(name, build, matrix=True)
 
 
 def markov_rows(view: View, channel: str | None, output: str | None, count: int) -> np.ndarray:

@@ -178,21 +178,21 @@ def _posed(window: BoundedWindow, signature: Signature | None = None) -> Problem
 
 
 def _certified(window: BoundedWindow, signature: Signature | None, bounded: Array, exact: Array, bounds: Array,
-               problem: Problem, values: Values, duals: Values) -> Bound:
+               problem: Problem, values: Values, duals: Values) -> tuple[Bound, None]:
     """Return the factor that the parity vector near the multipliers proves."""
     if np.size(duals.get("noise", ())) != 2 * bounded.size:
-        return Bound.none("the solver gave no multipliers")
-    weights, duals = np.zeros(bounds.size), problem.as_written(duals)
-    upper, lower = np.split(duals["noise"], 2)
+        return Bound.none("the solver gave no multipliers"), None
+    weights = np.zeros(bounds.size)
+    upper, lower = np.split(np.asarray(duals["noise"], dtype=float), 2)
     weights[bounded] = (upper - lower) / bounds[bounded]
     if exact.size and np.size(duals.get("no noise", ())) == exact.size:
-        weights[exact] = duals["no noise"]
+        weights[exact] = np.asarray(duals["no noise"], dtype=float)
     p = weights[(window.count - 1) * window.A.shape[0] :].reshape(window.e.shape)
     proof = parity_proof(window, p, window.unseen(*(signature or (None, None))))
     gap = relative_gap(problem.value(values), proof.factor, problem.scale)
     free, words = not problem.constraint_names, f"parity vector, relative gap {gap:.1e}"
     return Bound(proof.factor, free and gap < PROVED, "parity",
-                 words if free else "the bound is that without the further constraints", multipliers=proof)
+                 words if free else "the bound is that without the further constraints", multipliers=proof), None
 
 
 def _onsets(onsets: Sequence[int] | str, count: int) -> list[int] | None:

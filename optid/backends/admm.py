@@ -9,9 +9,10 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Minimum, Settings
-from optid.program.program import Program
+from optid.core.low_rank import LowRankForm
+from optid.core.program import Program
 from optid.program.solution import tolerance
-from optid.structures.nuclear_norm import NuclearNormStructure, NuclearProblem
+from optid.structures.nuclear_norm import NuclearProblem
 
 RELAXATION = 1.7
 CHECK = 10  # iterations between measurements of the gap
@@ -21,12 +22,12 @@ FIRST = 60, 3.0  # iterations in which the size of the step is found, and the fa
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a programme that carries a `NuclearNormStructure` and no further constraints.
+    """Solve a programme of the form `LowRankForm` without further constraints.
 
     Options: ``limit`` (iterations at most, default 20,000).
     """
-    form = program.structure
-    assert isinstance(form, NuclearNormStructure)
+    form = LowRankForm.of(program.core)
+    assert form is not None
     allowed = 0.5 * tolerance(settings.accuracy)  # half of what the judgement allows
     found = minimise(form.problem, form.weight, allowed, int(dict(settings.options).get("limit", 20_000)))
     v, theta = found.point

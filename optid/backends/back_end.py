@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optid.arrays import is_number, shown
+from optid.core.form import Form
 from optid.errors import StructureError
 from optid.program.solution import Status
-from optid.program.structure import Structure
 
 if TYPE_CHECKING:  # programmes import CVXPY, which the list of solvers does not need
-    from optid.program.program import Program
+    from optid.core.program import Program
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,8 @@ class BackEnd:
     run: Callable[["Program", Settings], Answer] = field(repr=False)  # (program, settings) -> Answer
     installed: bool = True  # whether it can run here
     pip: str = ""  # what to install where it cannot
-    structures: tuple[type[Structure], ...] = ()  # types of structure it accepts in any class of programme
+    form: str = ""  # word of the form of problems that it exploits, whatever their class
+    takes: Callable[[Any], Form | None] | None = field(default=None, repr=False)  # problem -> that form, or None
     duals: bool = True  # whether it returns multipliers
     warm: bool = False  # whether it can start from a given point
     # options with which it searches further for a better local optimum, for where the proof fails
@@ -89,19 +90,23 @@ class BackEnd:
 
     @property
     def accepted(self) -> tuple[str, ...]:
-        """Classes and structures it accepts, as words."""
-        return (*sorted(self.classes), *(structure.word for structure in self.structures))
+        """Classes and form it accepts, as words."""
+        return (*sorted(self.classes), *([self.form] if self.form else []))
+
+    def form_of(self, program: "Program") -> Form | None:
+        """Return the form of the problem that it exploits, None where it has another."""
+        return None if self.takes is None else self.takes(program.core)
 
     def exploits(self, program: "Program") -> bool:
-        """Whether it accepts the structure of the programme, with the user's constraints."""
-        structure = program.structure
-        return isinstance(structure, self.structures) and (structure.constrained or not program.is_restricted)
+        """Whether it accepts the form of the problem, with the user's constraints."""
+        form = self.form_of(program)
+        return form is not None and (form.constrained or not program.user_constraints)
 
     def refuses(self, program: "Program") -> str:
         """Return why this back end cannot take the programme, or an empty string."""
         if self.exploits(program):
             return ""
-        if isinstance(program.structure, self.structures):
+        if self.form_of(program) is not None:
             names = ", ".join(map(repr, program.user_constraints))
             return (f"{self.name} takes no further constraints ({names}); use a back end of class {program.kind} "
                     "(clarabel, scs)")

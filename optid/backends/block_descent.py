@@ -9,10 +9,11 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.backends.back_end import Answer, Minimum, Settings
+from optid.core.group_sparse import GroupSparseForm
+from optid.core.program import Program
 from optid.kernel_cache import cached_njit
-from optid.program.program import Program
 from optid.program.solution import Status, tolerance
-from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
+from optid.structures.group_sparse import GroupProblem
 
 ENTER = 40  # groups that may enter at a time
 SWEEPS = 25  # sweeps of block descent between Newton steps
@@ -20,12 +21,12 @@ STALLED = 30  # rounds without a better gap or value after which nothing more is
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a programme that carries a `GroupSparseStructure` and no further constraints.
+    """Solve a programme of the form `GroupSparseForm` without further constraints.
 
     Options: ``limit`` (rounds at most, default 2,000).
     """
-    form = program.structure
-    assert isinstance(form, GroupSparseStructure)
+    form = GroupSparseForm.of(program.core)
+    assert form is not None
     if not form.penalty > 0:
         return Answer(Status.FAILED, f"the penalty is {form.penalty}; this method needs a positive one")
     start = form.flat(program.start) if settings.warm and program.start else None

@@ -21,9 +21,9 @@ import scipy.sparse as sp
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Smooth, kept, smooth
+from optid.core.program import Program
 from optid.errors import StructureError
 from optid.program.expressions import MOVES, sources
-from optid.program.program import Program
 from optid.program.solution import Status
 
 LIMIT = 3000  # iterations

@@ -7,12 +7,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
+from operator import attrgetter
 from typing import Any
 
-from optid.backends.back_end import Answer, BackEnd
-from optid.structures.group_sparse import GroupSparseStructure
-from optid.structures.least_squares import LinearStructure, RankOneStructure
-from optid.structures.nuclear_norm import NuclearNormStructure
+from optid.backends.back_end import BackEnd
 
 CONIC: dict[str, tuple[str, str, str]] = {
     "clarabel": ("LP QP SOCP SDP conic", "clarabel", "clarabel"),
@@ -64,14 +62,17 @@ class _Function:
     target: str
     word: str = ""
 
-    def __call__(self, *arguments: Any) -> Answer:
+    def __call__(self, *arguments: Any) -> Any:
         module, _, name = self.target.partition(":")
-        return getattr(import_module(module), name)(*filter(None, [self.word]), *arguments)
+        return attrgetter(name)(import_module(module))(*filter(None, [self.word]), *arguments)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         with suppress(ImportError):  # which the call says
             import_module(self.target.partition(":")[0])  # before the time limit of another process begins
+
+
+_RANK_ONE = _Function("optid.core.least_squares:RankOneForm.of")
 
 
 def back_ends() -> list[BackEnd]:
@@ -88,18 +89,22 @@ def back_ends() -> list[BackEnd]:
         BackEnd("uno", frozenset({"LP", "QP", "NLP"}), _Function("optid.backends.uno:run"),
                 installed=_is_installed("unopy") and _is_installed("sparsediffpy"), pip="unopy sparsediffpy", warm=True,
                 about="SQP through CVXPY's derivative engine; small dense programmes"),
-        BackEnd("lstsq", frozenset(), _Function("optid.backends.lstsq:run"), structures=(LinearStructure,),
+        BackEnd("lstsq", frozenset(), _Function("optid.backends.lstsq:run"), form="linear",
+                takes=_Function("optid.core.least_squares:LinearForm.of"),
                 about="one factorisation, for least squares without products and constraints"),
         BackEnd("gauss_newton", frozenset(), _Function("optid.backends.gauss_newton:run"),
-                structures=(RankOneStructure,), warm=True, thorough={"starts": 32, "directions": 16, "descents": 12},
+                form="rank-one", takes=_RANK_ONE, warm=True,
+                thorough={"starts": 32, "directions": 16, "descents": 12},
                 about="own Gauss-Newton for rank-one least squares; QPs of the same layer under constraints"),
         BackEnd("alternating", frozenset(), _Function("optid.solving.alternating:run"),
-                structures=(RankOneStructure,), warm=True,
+                form="rank-one", takes=_RANK_ONE, warm=True,
                 about="alternating convex half-steps for rank-one least squares, through any convex back end"),
-        BackEnd("admm", frozenset(), _Function("optid.backends.admm:run"), structures=(NuclearNormStructure,),
+        BackEnd("admm", frozenset(), _Function("optid.backends.admm:run"), form="nuclear",
+                takes=_Function("optid.core.low_rank:LowRankForm.of"),
                 about="own ADMM for nuclear-norm subspace fits; stops by the duality gap"),
         BackEnd("block_descent", frozenset(), _Function("optid.backends.block_descent:run"),
-                structures=(GroupSparseStructure,), warm=True,
+                form="group-sparse",
+                takes=_Function("optid.core.group_sparse:GroupSparseForm.of"), warm=True,
                 about="own active-set block descent for group-sparse programmes; stops by the duality gap"),
     ]
 

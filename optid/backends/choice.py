@@ -13,7 +13,7 @@ from optid.errors import LookupFailed, SolverMissing, StructureError, nearest
 from optid.program.solution import Status
 
 if TYPE_CHECKING:
-    from optid.program.program import Program
+    from optid.core.program import Program
 
 GROUP = "optid.backends"
 
@@ -70,11 +70,10 @@ def choose(program: "Program") -> tuple[BackEnd, str]:
     Raises:
         StructureError: when no installed back end accepts the programme.
     """
-    if program.structure is not None:
-        preferred = AUTO.get(program.structure.word, ())
-        for back_end in sorted(back_ends().values(), key=lambda one: one.name not in preferred):
-            if back_end.installed and back_end.exploits(program):
-                return back_end, f"{back_end.name}: {program.structure.about}"
+    for back_end in sorted(back_ends().values(), key=lambda one: one.name not in AUTO.get(one.form, ())):
+        form = back_end.form_of(program) if back_end.installed else None
+        if form is not None and back_end.exploits(program):
+            return back_end, f"{back_end.name}: {form.about}"
     kind = program.kind
     for name in AUTO["convex" if kind != "NLP" else "small NLP" if program.size <= 200 else "NLP"]:
         back_end = back_ends().get(name)

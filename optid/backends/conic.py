@@ -17,9 +17,9 @@ from optid.backends.catalogue import WITHOUT_DUALS
 from optid.core.constraint import join_by_name
 from optid.core.leaves import Affine
 from optid.core.problem import Problem
+from optid.core.program import Program
 from optid.core.terms import Squares
 from optid.program.expressions import solve_quietly
-from optid.program.program import Program
 from optid.program.solution import Status
 
 SHARP = 1e-11  # accuracy of small least squares

@@ -22,9 +22,9 @@ from cvxpy.reductions.solution import Solution as ReducedSolution
 from cvxpy.reductions.solvers.nlp_solving_chain import _set_nlp_initial_point
 
 from optid.backends.back_end import Answer
+from optid.core.program import Program
 from optid.errors import StructureError
 from optid.program.limits import EQUALITIES, rows_of
-from optid.program.program import Program
 from optid.program.solution import Status
 
 CACHE = "optid"  # our entry in the problem's own cache of compiled solvers

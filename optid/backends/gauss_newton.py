@@ -6,25 +6,26 @@ from optid.backends.back_end import Answer, Settings
 from optid.backends.rank_one_sqp import DIRECTIONS, RankOneSQP
 from optid.certificate.ladder import certify
 from optid.certificate.lifting import certify_rank_one
+from optid.core.least_squares import RankOneForm
 from optid.core.problem import Problem
+from optid.core.program import Program
+from optid.core.terms import Values
 from optid.models.gauges import gauge_factor
-from optid.program.program import Program, Values
 from optid.program.solution import Status
 from optid.structures.bilinear import LocalSolution, minimise
-from optid.structures.least_squares import RankOneStructure, rank_one_of
 from optid.structures.rank_one import Point
 
 DESCENTS = 2  # how many of these are followed to the end
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a programme that carries a `RankOneStructure`.
+    """Solve a programme that carries a `RankOneForm`.
 
     Options: ``starts`` (number of starts, default 8), ``seed`` of the random ones; under constraints ``directions``
     (different b that are settled first, default 4) and ``descents`` (how many of these are then followed to their end,
     default 2).
     """
-    form = rank_one_of(program)
+    form = RankOneForm.of(program.core)
     assert form is not None
     options = dict(settings.options)
     count, seed = int(options.get("starts", 8)), int(options.get("seed", 0))
@@ -43,7 +44,7 @@ def _constrained(program: Program, free: Point, seed: int, directions: int, desc
     problem: Problem = program.core
 
     def is_proved(x: Values, duals: Values) -> bool:
-        return program.certify is not None and certify_rank_one(program, x, duals, max_size=0)[0].proved
+        return certify_rank_one(problem, x, max_size=0)[0].proved
 
     end = RankOneSQP(problem, program.start, free, is_proved).solve(seed, directions, descents)
     if not end.x:
@@ -53,7 +54,7 @@ def _constrained(program: Program, free: Point, seed: int, directions: int, desc
     return Answer(end.status, end.word, end.x, {"residual": -2.0 * residual, **end.duals}, end.steps)
 
 
-def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) -> LocalSolution:
+def _minimum(program: Program, form: RankOneForm, count: int, seed: int) -> LocalSolution:
     """Descend from the programme's start, and from others where the instant proof fails there."""
     found = minimise(form.problem, form.point(program.start)) if program.start else None
     if found is not None and certify(form.problem, found.point, effort="instant").bound.proved:
@@ -62,7 +63,7 @@ def _minimum(program: Program, form: RankOneStructure, count: int, seed: int) ->
     return found if found is not None and found.value <= others.value else others
 
 
-def to_values(program: Program, form: RankOneStructure, point: Point) -> dict[str, np.ndarray]:
+def to_values(program: Program, form: RankOneForm, point: Point) -> dict[str, np.ndarray]:
     """Name the parts of a point, in the programme's gauge."""
     values = form.named(point, program.shapes)
     for (mu, b), direction in zip(form.blocks, point.bs):

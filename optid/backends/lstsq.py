@@ -3,21 +3,21 @@
 import numpy as np
 
 from optid.backends.back_end import Answer, Settings
-from optid.program.program import Program
+from optid.core.least_squares import LinearForm
+from optid.core.program import Program
 from optid.program.solution import Status
-from optid.structures.least_squares import LinearStructure
 from optid.structures.rank_one import Point
 
 
 def run(program: Program, settings: Settings) -> Answer:
-    """Solve a programme that carries a `LinearStructure` and no further constraints; there are no options.
+    """Solve a programme of the form `LinearForm` without further constraints; there are no options.
 
     Of several minimisers it returns the shortest, with the columns at length one.
     """
     from scipy.linalg import lstsq
 
-    form = program.structure
-    assert isinstance(form, LinearStructure)
+    form = LinearForm.of(program.core)
+    assert form is not None
     root, target = form.problem.root, form.problem.target
     lengths = np.linalg.norm(root, axis=0)
     lengths[lengths == 0] = 1.0

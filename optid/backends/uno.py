@@ -13,7 +13,7 @@ import numpy as np
 
 from optid.backends.back_end import Answer, Settings
 from optid.backends.dnlp import Derivatives, Smooth, smooth
-from optid.program.program import Program
+from optid.core.program import Program
 from optid.program.solution import Status
 
 ENDED = {

@@ -12,20 +12,18 @@ x bounds the optimum from below, however inaccurate w is: bad multipliers give a
   curvature does not catch.
 """
 
-import cvxpy as cp
 import numpy as np
 from scipy.linalg import solve_triangular
 
 from optid.arrays import Array
 from optid.certificate.lifting import lift
-from optid.core.judge import in_dual_cone
+from optid.core.judge import in_dual_cone, rows_at
+from optid.core.least_squares import LeastSquaresForm, LinearForm
 from optid.core.problem import Problem
-from optid.program.expressions import differences, flat_value
-from optid.program.judging import Lagrangian, bounds_of
-from optid.program.program import Program, Values
+from optid.core.terms import Values, flat
+from optid.program.expressions import differences
 from optid.program.solution import Bound, relative_gap
 from optid.program.structure import variable_size
-from optid.structures.least_squares import LeastSquaresStructure
 from optid.structures.multipliers import least_distance
 
 CLOSED = 1e-6  # relative gap up to which a convex programme counts as solved to its optimum
@@ -36,130 +34,120 @@ TANGENT = "tangent"
 REACH = 2.0  # half-width of the box in which a bound from a tangent holds, in sizes of the variables
 
 
-def certify_convex(program: Program, values: Values, duals: Values, objective: float) -> Bound | None:
-    """Return the dual bound at a point with this objective, from multipliers of which some may be missing.
+def certify_convex(problem: Problem, values: Values, duals: Values, quadratic: bool = False) -> Bound | None:
+    """Return the dual bound at a point, from multipliers of which some may be missing.
 
-    None where it cannot be formed (no multipliers, an objective with kinks).
+    None where it cannot be formed (no multipliers, an objective with kinks). A quadratic objective has more to say.
     """
-    form = program.structure if isinstance(program.structure, LeastSquaresStructure) else None
-    if form is None or program.core is None or not program.core.is_measured:
-        program.assign(values)
-    if form is None:
-        found, method = _tangent_bound(program, duals, objective), TANGENT
+    x = {name: np.reshape(values[name], np.shape(start), order="F") for name, start in problem.start.items()}
+    form, objective = LinearForm.of(problem), problem.value(x)
+    if form is None or not _is_triangular(form.problem.root):
+        found, method = _tangent_bound(problem, x, duals, quadratic), TANGENT
     else:
-        found, method = _least_squares_bound(program, form, values, duals, objective), "convex dual"
+        found, method = _least_squares_bound(problem, form, x, duals, objective), "convex dual"
     if found is None or not np.isfinite(found[0]):
         return None
     value, words = found
-    gap = relative_gap(abs(objective), value + abs(objective) - objective, program.scale)
+    gap = relative_gap(abs(objective), value + abs(objective) - objective, problem.scale)
     state = "convex programme" if gap <= CLOSED else "not proved"
     return Bound(value, gap <= CLOSED, method, f"{state}: {words}, relative gap {gap:.1e}")
 
 
-def _least_squares_bound(program: Program, form: LeastSquaresStructure, values: Values, duals: Values, objective: float
+def _is_triangular(root: Array) -> bool:
+    return root.shape[0] == root.shape[1] and not np.tril(root, -1).any()
+
+
+def _least_squares_bound(problem: Problem, form: LeastSquaresForm, x: Values, duals: Values, objective: float
                          ) -> tuple[float, str]:
-    best = _quadratic_bound(program, form, values, duals, objective), "least-squares dual of the multipliers"
-    if relative_gap(objective, best[0], program.scale) > CLOSED and (own := _own_multipliers(program, form)):
-        value = _quadratic_bound(program, form, values, own, objective)
+    best = _quadratic_bound(problem, form, x, duals, objective), "least-squares dual of the multipliers"
+    if relative_gap(objective, best[0], problem.scale) > CLOSED and (own := _own_multipliers(problem, form)):
+        value = _quadratic_bound(problem, form, x, own, objective)
         best = max(best, (value, "least-squares dual of multipliers by least-distance programming"))
     return best
 
 
-def _bound_by_rows(problem: Problem, form: LeastSquaresStructure, values: Values, duals: Values, objective: float
-                   ) -> float:
-    """The same from the rows of a problem of the core, whose leaves are all in z."""
-    x = {name: np.reshape(values[name], np.shape(start), order="F") for name, start in problem.start.items()}
-    root, z = form.problem.root, form.flat(x)
-    pull, value = 2.0 * root.T @ (root @ z - form.problem.target), objective
+def _quadratic_bound(problem: Problem, form: LeastSquaresForm, x: Values, duals: Values, objective: float
+                     ) -> float:
+    """Minimum over all z of the Lagrangian of least squares; -inf without multipliers.
+
+    A convex constraint lies above its tangent. What is left of the gradient by unknowns that constraints have brought
+    with them counts over the box.
+    """
+    root, z, y = form.problem.root, form.flat(x), problem.leaf_values(x)
+    gradient, value = np.zeros(problem.space.size), objective
     for one in problem.constraints():
-        if one.name not in duals:
+        if one.name not in duals or not one.is_smooth:
             return -np.inf
         dual = in_dual_cone(one, duals[one.name][one.span])
-        rows = one.slope(problem.space, x)  # a convex one lies above its tangent
-        columns = np.concatenate([rows[:, problem.space.places[name]] for name in form.linear], axis=1)
-        pull, value = pull + columns.T @ dual, value + float(dual @ one.residual(problem.space, x))
+        gradient, value = gradient + dual @ one.slope(problem.space, y), value + float(dual @ one.residual(
+            problem.space, y))
+    pull = 2.0 * root.T @ (root @ z - form.problem.target) + np.concatenate(
+        [gradient[problem.space.places[name]] for name in form.linear])
     step = solve_triangular(root, pull, trans=1)
-    return value - float(step @ step) / 4
+    loose = sum(float(np.sum(np.abs(_free(problem, x, name, gradient[place])))) * _width(x[name])
+                for name, place in problem.slices.items() if name not in form.linear)
+    return value - float(step @ step) / 4 - loose
 
 
-def _quadratic_bound(program: Program, form: LeastSquaresStructure, values: Values, duals: Values, objective: float
-                     ) -> float:
-    """Minimum over all z of the Lagrangian of least squares, whose constraints are the user's; -inf without one."""
-    if program.core is not None and program.core.is_measured:
-        return _bound_by_rows(program.core, form, values, duals, objective)
-    lagrangian = Lagrangian.of(program, duals, program.user_constraints)
-    if lagrangian is None:
-        return -np.inf
-    root = form.problem.root
-    z = form.flat({name: program.variables[name].value for name in form.linear})
-    pull = 2.0 * root.T @ (root @ z - form.problem.target)
-    gradient, inner = lagrangian.total, {program.variables[name].id for name in form.linear}
-    pull = pull + np.concatenate([*(gradient[program.variables[name].id] for name in form.linear), np.zeros(0)])
-    step = solve_triangular(root, pull, trans=1)
-    others = [v for v in program.variables.values() if v.id not in inner]  # those that constraints brought with them
-    loose = sum(float(np.sum(np.abs(gradient[v.id]))) * _width(v) for v in others)
-    return objective + lagrangian.value - float(step @ step) / 4 - loose
-
-
-def _tangent_bound(program: Program, duals: Values, objective: float) -> tuple[float, str] | None:
-    lagrangian, variables = Lagrangian.of(program, duals, program.constraints), list(program.variables.values())
-    if lagrangian is None or not lagrangian.add(program.objective.expr, np.ones(1)) or any(
-            lagrangian.free_part(variable) is None for variable in variables):
+def _tangent_bound(problem: Problem, x: Values, duals: Values, quadratic: bool) -> tuple[float, str] | None:
+    if not problem.is_measured or any(not hasattr(term, "pull") for term in problem.terms):
         return None
-    plain = sum(_descent(lagrangian, variable) for variable in variables)
-    gradient = np.concatenate([lagrangian.total[v.id] for v in variables])
-    if program.kind == "QP" and gradient.size <= FEW:
-        widths = np.concatenate([np.full(v.size, _width(v)) for v in variables])
-        sizes, directions = np.linalg.eigh(_hessian(program))
+    value, gradient, _ = problem.pull(x)
+    for row in rows_at(problem, x):
+        if row.constraint.name not in duals:
+            return None
+        dual = in_dual_cone(row.constraint, duals[row.constraint.name][row.constraint.span])
+        gradient, value = gradient + dual @ row.slope, value + float(dual @ row.residual)
+    if not np.all(np.isfinite(gradient)):
+        return None
+    plain = sum(_descent(problem, x, name, gradient[place]) for name, place in problem.slices.items())
+    if quadratic and gradient.size <= FEW and not problem.bounds:
+        widths = np.concatenate([np.full(np.size(value), _width(value)) for value in x.values()])
+        sizes, directions = np.linalg.eigh(_hessian(problem, x))
         curved = sizes > 1e-12 * max(float(sizes[-1]), np.finfo(float).tiny)
         along = directions.T @ gradient
         caught = float(np.sum(along[curved] ** 2 / sizes[curved])) / 2
         plain = min(plain, caught + float(np.abs(directions[:, ~curved] @ along[~curved]) @ widths))
-    return objective + lagrangian.value - plain, f"tangent of the Lagrangian, within {REACH:g} times the solution"
+    return value - plain, f"tangent of the Lagrangian, within {REACH:g} times the solution"
 
 
-def _hessian(program: Program) -> Array:
+def _hessian(problem: Problem, x: Values) -> Array:
     """Second derivatives of a quadratic objective: differences of its gradient, which are exact."""
-    variables = list(program.variables.values())
-    point = np.concatenate([flat_value(v) for v in variables])
-
-    def assign(x: Array) -> None:
-        for v, part in zip(variables, np.split(x, np.cumsum([v.size for v in variables])[:-1])):
-            v.save_value(part.reshape(v.shape, order="F"))
-
-    def gradient(x: Array) -> Array:
-        assign(x)
-        lagrangian = Lagrangian(program)
-        lagrangian.add(program.objective.expr, np.ones(1))
-        return np.concatenate([lagrangian.total[v.id] for v in variables])
-
-    matrix, _ = differences(gradient, point)
-    assign(point)
+    matrix, _ = differences(lambda v: problem.pull(problem.unpack(v))[1], problem.pack(x))
     return (matrix + matrix.T) / 2
 
 
-def _width(variable: cp.Variable) -> float:
-    return REACH * variable_size(flat_value(variable), None)
+def _free(problem: Problem, x: Values, name: str, gradient: Array) -> Array:
+    """Return the flat gradient by an unknown, its symmetric part where the unknown is symmetric."""
+    if name not in problem.symmetric:
+        return gradient
+    matrix = gradient.reshape(np.shape(x[name]), order="F")
+    return flat((matrix + matrix.T) / 2)
 
 
-def _descent(lagrangian: Lagrangian, variable: cp.Variable) -> float:
-    """By how much the gradient can lower the Lagrangian inside the box and the bounds that the variable carries."""
-    gradient = lagrangian.gradient(variable)
-    room = np.full(variable.shape, _width(variable))
-    if (bounds := bounds_of(variable)) is not None:
-        value = np.asarray(variable.value, dtype=float)
-        room = np.clip(np.where(gradient > 0, value - bounds[0], bounds[1] - value), 0.0, room)
+def _width(value: Array) -> float:
+    return REACH * variable_size(value, None)
+
+
+def _descent(problem: Problem, x: Values, name: str, gradient: Array) -> float:
+    """By how much the gradient can lower the Lagrangian inside the box and the bounds of an unknown."""
+    value = flat(x[name])
+    room = np.full(value.size, _width(value))
+    gradient = _free(problem, x, name, gradient)
+    if name in problem.bounds:
+        low, high = (flat(end) for end in problem.bounds[name])
+        room = np.clip(np.where(gradient > 0, value - low, high - value), 0.0, room)
     return float(np.sum(np.abs(gradient) * room))
 
 
-def _own_multipliers(program: Program, form: LeastSquaresStructure) -> dict[str, Array] | None:
+def _own_multipliers(problem: Problem, form: LeastSquaresForm) -> dict[str, Array] | None:
     """Multipliers of linear constraints: those of the point of the polyhedron next to the least-squares estimate."""
-    problem, lifted = form.problem, lift(program, form)
+    numbers, lifted = form.problem, lift(problem, form)
     linear = lifted.linear
     if lifted.refused or not len(linear.right):
         return None
-    estimate = solve_triangular(problem.root, problem.target)
-    slopes = solve_triangular(problem.root, linear.rows.T, trans=1).T
+    estimate = solve_triangular(numbers.root, numbers.target)
+    slopes = solve_triangular(numbers.root, linear.rows.T, trans=1).T
     lengths = np.linalg.norm(slopes, axis=1)
     lengths[lengths == 0] = 1.0
     need = (linear.rows @ estimate - linear.right) / lengths
@@ -170,9 +158,7 @@ def _own_multipliers(program: Program, form: LeastSquaresStructure) -> dict[str,
         return None
     if weights is None:
         return None
-    if program.core is not None:
-        counts = {name: sum(len(one) for one in program.core.constraints() if one.name == name)
-                  for name in program.core.constraint_names}
-    else:
-        counts = {name: sum(member.size for member in group) for name, group in program.user_constraints.items()}
+    counts = {one.name: 0 for one in problem.constraints()}
+    for one in problem.constraints():
+        counts[one.name] += len(one)
     return dict(zip(counts, np.split(2.0 * size * weights / lengths, np.cumsum([*counts.values()])[:-1])))

@@ -8,29 +8,32 @@ point of a solver is scaled into that set, v and multipliers together, so that t
 import numpy as np
 
 from optid.arrays import Array
+from optid.core.group_sparse import GroupSparseForm
 from optid.core.judge import in_dual_cone
 from optid.core.problem import Problem
-from optid.program.program import Program, Values
+from optid.core.terms import Values
 from optid.program.solution import Bound, relative_gap
-from optid.structures.group_sparse import GroupProblem, GroupSparseStructure
+from optid.structures.group_sparse import GroupProblem
 
 PROVED = 1e-6
 """Relative gap below which a point is optimal."""
 
 
-def certify_groups(form: GroupSparseStructure, program: Program, values: Values, duals: Values) -> tuple[Bound, None]:
+def certify_groups(problem: Problem, values: Values, duals: Values) -> Bound:
     """Return the best bound from the residual at the point and from the multipliers that the solver gave."""
+    form = GroupSparseForm.of(problem)
+    assert form is not None
     numbers, a = form.problem, form.flat(values)
     candidates: list[Array] = [numbers.target - numbers.design @ a]
     if (given := form.dual_point(duals)) is not None:
         candidates.append(given)
-    slope, constant = _lagrangian(program.core, form, duals)
+    slope, constant = _lagrangian(problem, form, duals)
     bounds = [_bound(numbers, v, form.penalty, slope, constant) for v in candidates]
     bounds += [_bound(numbers, v, form.penalty, 0.0 * slope, 0.0) for v in candidates]
     value, point = max(bounds, key=lambda pair: pair[0])
-    gap = relative_gap(numbers.value(a, form.penalty), value, program.scale)
+    gap = relative_gap(numbers.value(a, form.penalty), value, problem.scale)
     return Bound(value, gap < PROVED, "group-sparse dual", f"feasible dual point, relative gap {gap:.1e}",
-                 multipliers=point), None
+                 multipliers=point)
 
 
 def _bound(numbers: GroupProblem, v: Array, penalty: float, slope: Array, constant: float) -> tuple[float, Array]:
@@ -46,7 +49,7 @@ def _bound(numbers: GroupProblem, v: Array, penalty: float, slope: Array, consta
     return scale * along - 0.5 * scale**2 * square, scale * v
 
 
-def _lagrangian(problem: Problem, form: GroupSparseStructure, duals: Values) -> tuple[Array, float]:
+def _lagrangian(problem: Problem, form: GroupSparseForm, duals: Values) -> tuple[Array, float]:
     """Return c (p,) and k of the user's constraints that are affine in a; others count with multiplier zero."""
     total, constant = np.zeros(problem.space.size), 0.0
     for one in problem.constraints():

@@ -5,23 +5,25 @@ from typing import Any
 
 import cvxpy as cp
 
-from optid.certificate.lifting import lift, places
+from optid.certificate.lifting import lift
+from optid.core.least_squares import RankOneForm
+from optid.core.leaves import Affine
+from optid.core.problem import Problem
+from optid.core.program import Program
 from optid.program.expressions import flat, flat_value, jacobians, solve_quietly
 from optid.program.limits import EQUALITIES
-from optid.program.program import Program
-from optid.structures.least_squares import rank_one_of
 
 
 def explain(program: Program) -> str:
     """Return a sentence that lists a conflicting subset of the user's constraints.
 
     The subset is irreducible: without any one of its members the rest can be satisfied (deletion filter, Chinneck
-    and Dravnieks 1991). Constraints that are neither convex nor linear in ``mu bᵀ`` take part through their
-    linearisation at the start, and the sentence says so.
+    and Dravnieks 1991). Constraints that are not convex in the leaves take part through their linearisation at the
+    start, and the sentence says so.
     """
     conflict = conflicting_subset(program)
     if conflict is None:
-        names = ", ".join(program.user_constraints) or "none"
+        names = ", ".join(program.core.constraint_names) or "none"
         return (f"{program.name!r} was reported infeasible, but its constraints ({names}) can be "
                 "satisfied together; try another solver (optid solvers)")
     if len(conflict) == 1:
@@ -29,10 +31,8 @@ def explain(program: Program) -> str:
     else:
         text = (f"constraints {' and '.join(repr(n) for n in conflict)} contradict each other; "
                 "relax or drop one of them (each subset without one of them can be satisfied)")
-    form = rank_one_of(program)
-    stand_in = {} if form is None else places(program, form).stand_in
-    used = [name for name in conflict
-            if not all(c.is_dcp() or c.tree_copy(stand_in).is_dcp() for c in program.constraints[name])]
+    bent = {one.name for one in program.core.constraints() if not one.limit.member.is_dcp()}
+    used = [name for name in conflict if name in bent]
     return text + (f" (judged on the linearisation of {', '.join(used)})" if used else "")
 
 
@@ -40,9 +40,9 @@ def conflicting_subset(program: Program) -> list[str] | None:
     """Return the names of an irreducible infeasible subset, or None where all can be satisfied together.
 
     What can be satisfied is judged on a convex outer approximation, so that a subset returned is a contradiction
-    indeed: bilinear constraints are read as constraints on the matrices ``mu bᵀ``.
+    indeed: every leaf is free, constraints about ``mu bᵀ`` are read as those of a matrix.
     """
-    kept = list(program.user_constraints)
+    kept = list(program.core.constraint_names)
     if satisfiable(program, kept):
         return None
     for name in list(kept):
@@ -54,28 +54,31 @@ def conflicting_subset(program: Program) -> list[str] | None:
 
 def satisfiable(program: Program, names: Sequence[str]) -> bool:
     """Whether the named constraints can hold together, as far as a convex outer approximation tells."""
-    form = rank_one_of(program)
-    # a structural constraint that is not convex (the norm of b) only fixes a scale: it cannot cause a conflict
-    structural = [c for name, group in program.constraints.items() if name in program.structural for c in group]
-    found = [c for c in structural if c.is_dcp()]
-    where = None if form is None else places(program, form)
-    if program.start:
-        program.assign(program.start)
-    for member in (c for name in names for c in program.constraints[name]):
-        copy = member if where is None else member.tree_copy(where.stand_in)
-        found.append(member if member.is_dcp() else copy if copy.is_dcp() else _linearised(member))
-    if form is not None and where is not None:
-        lifted = lift(program.without(*(set(program.user_constraints) - set(names))), form)
+    problem: Problem = program.core
+    form, space = RankOneForm.of(problem), problem.space
+    if not problem.constraints():
+        return True
+    space.assign(problem.leaf_values(problem.start))
+    found: list[Any] = [flat(space.variables[leaf.name]) == flat(leaf.express(space.variables))
+                        for leaf in problem.leaves if isinstance(leaf, Affine)]  # other leaves are free
+    for one in problem.constraints():
+        member = one.limit.member
+        if one.name in names:
+            found.append(member if member.is_dcp() else _linearised(member))
+        elif one.name in problem.structural and member.is_dcp():  # one that is not convex cannot cause a conflict
+            found.append(member)
+    if form is not None:
+        lifted = lift(problem, form, names)
         count = len(lifted.linear.right)  # these are there already
         lifted.add_products(form.problem)
         rows = lifted.linear.rows[count:]
         if len(rows):
-            thetas = [flat(theta) for theta in where.stand_in.values()]
+            thetas = [flat(space.variables["Theta" + mu[len("mu"):]]) for mu, _ in form.blocks]
             found.append(rows[:, form.problem.linear :] @ cp.hstack(thetas) <= lifted.linear.right[count:])
     if not found:
         return True
-    bs = [program.variables[b] for _, b in form.blocks] if form is not None and form.gauge == "norm" else []
-    used = {v.id for name in names for c in program.constraints[name] for v in c.variables()}
+    bs = [space.variables[b] for _, b in form.blocks] if form is not None and form.gauge == "norm" else []
+    used = {v.id for one in problem.constraints() if one.name in names for v in one.limit.member.variables()}
     return _feasible(found) and all(_has_length(b, found) for b in bs if b.id in used)
 
 

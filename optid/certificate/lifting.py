@@ -4,22 +4,17 @@ A certificate needs every constraint in one of two forms: linear in z, or a cone
 carries. Anything else leaves the fit without a proof, and the reason names the constraint.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
-import cvxpy as cp
 import numpy as np
-from cvxpy.constraints.constraint import Constraint
 
 from optid.certificate.ladder import certify
 from optid.certificate.shape_duals import Linear
+from optid.core.least_squares import LeastSquaresForm, RankOneForm
 from optid.core.problem import Problem
-from optid.core.terms import NuclearNorms, Squares
-from optid.program.expressions import affine_parts, side_by_side
-from optid.program.limits import EQUALITIES, INEQUALITIES
-from optid.program.program import Program, Values
+from optid.core.terms import Squares, Values
 from optid.program.solution import Bound, relative_gap
-from optid.structures.least_squares import LeastSquaresStructure, rank_one_of
 from optid.structures.rank_one import Point, RankOne
 
 MAX_SIZE = 700  # multipliers up to which the semidefinite relaxation is tried
@@ -57,24 +52,22 @@ class Lifted:
         return alone
 
 
-def certify_rank_one(program: Program, values: Values, duals: Values, max_size: int = MAX_SIZE
-                     ) -> tuple[Bound, Values | None]:
+def certify_rank_one(problem: Problem, values: Values, max_size: int = MAX_SIZE) -> tuple[Bound, Values | None]:
     """Return the bound at a point under user constraints, and values to restart from where it proposes a better point.
 
     The multipliers are the certificate's own; the semidefinite relaxation is not attempted above ``max_size`` of them.
     """
-    form = rank_one_of(program)
-    if form is None:
-        return Bound.none(f"no proof: {program.name!r} has no rank-one structure left"), None
-    lifted = lift(program, form)
+    form = RankOneForm.of(problem)
+    assert form is not None
+    lifted = lift(problem, form)
     if lifted.refused:
         return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear in (a, Theta, offset) and not a cone "
                           "on mu"), None
-    problem, point, swapped = _oriented(form.problem, form.point(values), lifted)
-    found = certify(problem, point, cones=lifted.cones, linear=lifted.linear, max_size=max_size)
+    numbers, point, swapped = _oriented(form.problem, form.point(values), lifted)
+    found = certify(numbers, point, cones=lifted.cones, linear=lifted.linear, max_size=max_size)
     if not found.better or swapped:
         return found.bound, None
-    return found.bound, form.named(found.better[0], program.shapes)
+    return found.bound, form.named(found.better[0], {name: np.shape(one) for name, one in problem.start.items()})
 
 
 def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, Point, bool]:
@@ -96,63 +89,17 @@ def _oriented(problem: RankOne, point: Point, lifted: Lifted) -> tuple[RankOne, 
     return turned, Point(point.w, tuple(mus), tuple(bs)), True
 
 
-@dataclass(frozen=True)
-class Places:
-    """The places of the variables of a programme, and of products of bilinear ones, in the lifted vector z."""
-
-    size: int  # length of z
-    columns: dict[int, int]  # {id of a variable: its first column}
-    stand_in: dict[int, cp.Variable]  # {id of the expression mu bᵀ: the variable that stands for it}
-
-    def rows(self, member: Constraint) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return (E, f) of a constraint that reads ``E z <= f`` or ``E z = f``, or None where it does not."""
-        return _rows(member.tree_copy(self.stand_in) if self.stand_in else member, self.columns, self.size)
-
-
-def places(program: Program, form: LeastSquaresStructure) -> Places:
-    """Lay the linear variables and the matrices ``mu bᵀ`` of a programme out in z."""
-    variables, stand_in = [program.variables[name] for name in form.linear], {}
-    columns = dict(zip((v.id for v in variables), np.cumsum([0, *(v.size for v in variables)]).tolist()))
-    for i, (mu, _) in enumerate(form.blocks):
-        theta = cp.Variable(form.problem.blocks[i])
-        stand_in[id(program.view.inner["Theta" + mu[len("mu"):]])] = theta
-        columns[theta.id] = form.problem.slices[i].start
-    return Places(len(form.problem.target), columns, stand_in)
-
-
-def lift(program: Program, form: LeastSquaresStructure) -> Lifted:
-    """Bring the user constraints of a programme into lifted form."""
-    if not program.user_constraints:
+def lift(problem: Problem, form: LeastSquaresForm, names: Collection[str] | None = None) -> Lifted:
+    """Bring the constraints of a problem into lifted form, all of them or the named ones."""
+    held = [one for one in problem.constraints() if names is None or one.name in names]
+    if not held:
         return Lifted(Linear.none(len(form.problem.target)))
-    if program.core is not None:
-        return lift_rows(program.core, form)
-    where = places(program, form)
-    lifted = Lifted(Linear.none(where.size))
-    factors = {program.variables[name].id: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
-    for name, group in program.user_constraints.items():
-        for member in group:
-            fits, equal = False, isinstance(member, EQUALITIES)
-            if isinstance(member, EQUALITIES | INEQUALITIES):
-                variables = member.variables()
-                if len(variables) == 1 and variables[0].id in factors and member.expr.is_affine():
-                    found = _rows(member, {variables[0].id: 0}, variables[0].size)
-                    fits = found is not None and _lift_factor(lifted, form, *factors[variables[0].id], *found, equal)
-                elif (found := where.rows(member)) is not None:
-                    lifted.add(*found, equal)
-                    fits = True
-            if not fits:
-                lifted.refused = lifted.refused or name
-    return lifted
-
-
-def lift_rows(problem: Problem, form: LeastSquaresStructure) -> Lifted:
-    """Bring the constraints of a problem of the core into lifted form."""
     (squares,) = (term for term in problem.terms if isinstance(term, Squares))
     space, names = problem.space, set(squares.z)
     where = np.concatenate([np.arange(space.places[name].start, space.places[name].stop) for name in squares.z])
     factors = {name: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
     lifted = Lifted(Linear.none(len(form.problem.target)))
-    for one in problem.constraints():
+    for one in held:
         used = {name for name, place in space.places.items() if one.rows[:, place].any()}
         equal, fits = one.cone == "zero", False
         if one.cone in ("zero", "below") and used <= names:
@@ -165,18 +112,7 @@ def lift_rows(problem: Problem, form: LeastSquaresStructure) -> Lifted:
     return lifted
 
 
-def _rows(member: Constraint, columns: Mapping[int, int], size: int) -> tuple[np.ndarray, np.ndarray] | None:
-    found = affine_parts(member.expr)
-    if found is None or any(v.id not in columns for v in found[0]):
-        return None
-    slopes, constant = found
-    rows = np.zeros((constant.size, size))
-    for v in slopes:
-        rows[:, columns[v.id] : columns[v.id] + v.size] = side_by_side(slopes, [v], constant.size)
-    return rows, -constant
-
-
-def _lift_factor(lifted: Lifted, form: LeastSquaresStructure, i: int, of_mu: bool, rows: np.ndarray, right: np.ndarray,
+def _lift_factor(lifted: Lifted, form: LeastSquaresForm, i: int, of_mu: bool, rows: np.ndarray, right: np.ndarray,
                  equal: bool) -> bool:
     """Lift rows on one factor of a block, mu or b; False where they have no lifted form."""
     p, q = form.problem.blocks[i]
@@ -195,25 +131,26 @@ def _lift_factor(lifted: Lifted, form: LeastSquaresStructure, i: int, of_mu: boo
     return True
 
 
-def certify_nuclear(problem: RankOne, z: tuple[str, ...], norms: NuclearNorms, program: Program, values: Values,
-                    duals: Values) -> tuple[Bound, None]:
+def certify_nuclear(posed: Problem, values: Values, duals: Values) -> Bound:
     """Bound ``‖R z - s‖² + remainder + 2 sum tau_c ‖Theta_c‖_*`` under linear constraints by its own dual.
 
-    z names the variables, the last ones Theta; the norms have the weights 2 tau_c. For any nu with
+    z names the unknowns, the last ones Theta; the norms have the weights 2 tau_c. For any nu with
     ``R_wᵀ nu + E_wᵀ lambda = 0`` and ``‖mat(R_cᵀ nu + E_cᵀ lambda)‖_2 <= 2 tau_c`` the value
     ``remainder - nuᵀ s - ‖nu‖²/4 - lambdaᵀ f`` is a lower bound; nu is the residual at the point, projected and scaled.
     """
+    squares, norms = posed.terms
+    problem, z = squares.lifted, squares.z
     taus = np.array([norms.weights[name] for name in z[-len(problem.blocks) :]]) / 2
-    form = LeastSquaresStructure(problem, z)
-    lifted = lift(program, form)
+    form = LeastSquaresForm(problem, z)
+    lifted = lift(posed, form)
     if lifted.refused:
-        return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear"), None
-    for name in program.user_constraints:
+        return Bound.none(f"no proof: constraint {lifted.refused!r} is not linear")
+    for name in posed.constraint_names:
         if name not in duals:
-            return Bound.none(f"no proof: the solver gave no multiplier of {name!r}"), None
+            return Bound.none(f"no proof: the solver gave no multiplier of {name!r}")
     point = form.flat(values)
     nu = 2.0 * (problem.root @ point - problem.target)
-    lam = np.concatenate([np.zeros(0), *(duals[name] for name in program.user_constraints)])
+    lam = np.concatenate([np.zeros(0), *(duals[name] for name in posed.constraint_names)])
     lam = np.where(lifted.linear.equality, lam, np.maximum(lam, 0.0))
     pull, cost = lifted.linear.rows.T @ lam, float(lam @ lifted.linear.right)
     free = len(point) if not np.any(taus) else problem.linear
@@ -228,4 +165,4 @@ def certify_nuclear(problem: RankOne, z: tuple[str, ...], norms: NuclearNorms, p
     proved = gap <= 1e-6
     kind = "the penalised convex problem, not the rank-one problem behind it"
     reason = f"optimal for {kind}: relative gap {gap:.1e}" if proved else f"not proved for {kind}: gap {gap:.1e}"
-    return Bound(bound, proved, "nuclear dual", reason, multipliers=(shrink * nu, shrink * lam)), None
+    return Bound(bound, proved, "nuclear dual", reason, multipliers=(shrink * nu, shrink * lam))

@@ -19,9 +19,9 @@ import numpy as np
 
 from optid.backends.back_end import BackEnd
 from optid.conformance.zoo import SOLVED, Case, cases
+from optid.core.program import Program, as_program
 from optid.data.record import Data
 from optid.errors import DataWarning, OptidError
-from optid.program.program import Program
 from optid.program.solution import Solution, Status
 from optid.solving.solve import solve
 
@@ -48,13 +48,13 @@ class Row:
 
 def accepted_cases(back_end: BackEnd, zoo: Sequence[Case] | None = None) -> list[Case]:
     """Return the cases whose class the back end says it solves."""
-    return [case for case in (cases() if zoo is None else zoo) if not back_end.refuses(case.build())]
+    return [case for case in (cases() if zoo is None else zoo) if not back_end.refuses(as_program(case.build()))]
 
 
 def run_case(back_end: BackEnd, case: Case, **settings) -> Row:
     """Solve a case of the zoo, with settings of `optid.solve`, and compare the outcome with what is known."""
     clock = time.perf_counter()
-    program = case.build()
+    program = as_program(case.build())
     solution = solve(program, back_end, **settings)
     seconds = time.perf_counter() - clock
     return Row(case, back_end.name, solution, seconds, tuple(_complaints(back_end, case, program, solution)))

@@ -1,10 +1,10 @@
-"""A zoo of small programmes with known value, point and multipliers, on which every back end is tried.
+"""A zoo of small problems with known value, point and multipliers, on which every back end is tried.
 
 Each entry is known in closed form or by a route that shares nothing with a solver (eigenvalues, a one-dimensional
 search, the literature). Multipliers follow ``L = f + dual (lhs - rhs)``; they are given where they are unique.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -15,12 +15,8 @@ import numpy as np
 from optid.core.leaves import Product
 from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
-from optid.core.terms import GroupNorms, Squares
-from optid.program.program import Program
-from optid.program.view import View
-from optid.solving.express import as_program
+from optid.core.terms import Expressed, GroupNorms, Squares
 from optid.structures.group_sparse import GroupProblem
-from optid.structures.least_squares import LinearStructure
 from optid.structures.nuclear_norm import NuclearProblem
 from optid.structures.rank_one import RankOne
 
@@ -29,10 +25,10 @@ SOLVED, INFEASIBLE, UNBOUNDED = "solved", "infeasible", "unbounded"
 
 @dataclass(frozen=True)
 class Case:
-    """One programme and what is known about it."""
+    """One problem and what is known about it."""
 
-    name: str  # name of the case and of its programme
-    build: Callable[[], Program]  # makes a fresh programme
+    name: str  # name of the case and of its problem
+    build: Callable[[], Problem]  # makes a fresh problem
     value: float = float("nan")  # optimal value (``nan`` unless solved)
     point: Mapping[str, Any] = field(default_factory=dict)  # {variable: array}, the unique minimiser or parts of it
     duals: Mapping[str, Any] = field(default_factory=dict)  # {constraint: flat multipliers}, where unique
@@ -48,32 +44,35 @@ def cases() -> tuple[Case, ...]:
             _group_sparse())
 
 
-def pose(name: str, objective: Any, constraints: Mapping[str, Any], variables: Sequence[cp.Variable],
-         start: Mapping[str, Any] | None = None, expressions: Mapping[str, cp.Expression] | None = None,
-         **parts: Any) -> Program:
-    """Make a programme of plain parts: named constraints (or lists of them), variables under their own names.
+def pose(name: str, shapes: Mapping[str, Any], statement: Callable[..., tuple[Any, Mapping[str, Any]]],
+         start: Mapping[str, Any] | None = None, expressions: Callable[..., Mapping[str, Any]] | None = None,
+         **parts: Any) -> Problem:
+    """Make a problem of plain parts.
 
-    Constraints may use further named expressions; the other parts are attributes of `Program`.
+    Args:
+        name: of the problem.
+        shapes: of the unknowns by name; "symmetric" or "nonneg" beside a shape, as {"shape": 4, "nonneg": True}.
+        statement: unknowns -> objective and named constraints.
+        start: values to begin with, zero where none are given.
+        expressions: unknowns -> further named expressions, which constraints may use.
+        parts: other attributes of `Problem`.
     """
-    groups = {key: tuple(group) if isinstance(group, list | tuple) else (group,) for key, group in constraints.items()}
-    named = {variable.name(): variable for variable in variables}
-    view = View({**named, **(expressions or {})})
-    return Program(name, cp.Minimize(objective), groups, named, dict(start or {}), dict, view, **parts)
+    full = {key: shape if isinstance(shape, dict) else {"shape": shape} for key, shape in shapes.items()}
+    begin = {key: np.zeros(one["shape"]) for key, one in full.items()}
+    begin |= {key: np.asarray(value, dtype=float) for key, value in (start or {}).items()}
+    return Problem(
+        name, begin, (Expressed(lambda v: statement(*(v[key] for key in full))[0]),),
+        restrictions=(lambda v: statement(*(v[key] for key in full))[1],),
+        further=None if expressions is None else lambda v, _: expressions(*(v[key] for key in full)),
+        bounds={key: (np.zeros_like(begin[key]), np.full_like(begin[key], np.inf))
+                for key, one in full.items() if one.get("nonneg")},
+        symmetric=frozenset(key for key, one in full.items() if one.get("symmetric")), **parts)
 
 
 def _case(name: str, shapes: Mapping[str, Any], statement: Callable[..., tuple], start: Mapping[str, Any] | None = None,
           **known: Any) -> Case:
-    """State a case: variables by name and shape (or arguments of `cp.Variable`), and what is known, as in `Case`.
-
-    The statement makes objective and constraints of the variables, and further arguments of `pose` where there are any.
-    """
-    def build() -> Program:
-        variables = [cp.Variable(name=key, **(shape if isinstance(shape, dict) else {"shape": shape}))
-                     for key, shape in shapes.items()]
-        objective, constraints, *more = statement(*variables)
-        return pose(name, objective, constraints, variables, start, **(more[0] if more else {}))
-
-    return Case(name, build, **known)
+    """State a case: unknowns by name and shape, objective and constraints as in `pose`, and what is known of it."""
+    return Case(name, lambda: pose(name, shapes, statement, start), **known)
 
 
 def _linear() -> list[Case]:
@@ -109,8 +108,7 @@ def _quadratic() -> list[Case]:
         _case("qp_equality", {"x": 3}, lambda x: (cp.sum_squares(x), {"plane": normal @ x == 1}),
               value=1 / 9, point={"x": normal / 9}, duals={"plane": [-2 / 9]}),
         _case("qp_monotone_with_residuals", {"x": 4, "r": 4}, lambda x, r: (cp.sum_squares(r) + 10.0, {
-            "residual": r == x - data, "monotone": x[:-1] - x[1:] <= 0},
-            {"structural": frozenset({"residual"}), "derived": {"r": x - data}}),
+            "residual": r == x - data, "monotone": x[:-1] - x[1:] <= 0}),
               value=10.5, point={"x": [1.0, 2.5, 2.5, 4.0]},
               duals={"residual": [0.0, 1.0, -1.0, 0.0], "monotone": [0.0, 1.0, 0.0]}),
         _case("qp_badly_scaled", {"x": 2}, lambda x: (
@@ -205,26 +203,22 @@ def _least_squares() -> Case:
     (matrix, y), fit = planted_fit(), _compressed_fit()
     best = np.linalg.solve(matrix.T @ matrix, matrix.T @ y)
 
-    def statement(z: Any, r: Any) -> tuple:
-        residual = fit.root @ z - fit.target
-        return cp.sum_squares(r) + fit.remainder, {"residual": r == residual}, {
-            "structural": frozenset({"residual"}), "derived": {"r": residual}, "scale": fit.scale,
-            "structure": LinearStructure(fit, ("z",))}
+    def build() -> Problem:
+        return Problem("qp_compressed_fit", {"z": np.zeros(9)}, (Squares.of(fit, ("z",)),), scale=fit.scale)
 
-    return _case("qp_compressed_fit", {"z": 9, "r": 9}, statement, {"z": np.zeros(9)},
-                 value=float(np.sum((y - matrix @ best) ** 2)), point={"z": best})
+    return Case("qp_compressed_fit", build, value=float(np.sum((y - matrix @ best) ** 2)), point={"z": best})
 
 
 def _rank_one() -> list[Case]:
     rising = {"mu": np.array([-1.0, 0.0, 0.0, 1.0]), "b": np.array([0.7, 0.7])}
 
     def bilinear(name: str, sign: float, convex: bool, value: float) -> Case:
-        def build() -> Program:
+        def build() -> Problem:
             problem = _compressed_fit()
             start = {"a": np.zeros(1), **{key: sign * value for key, value in rising.items()}}
             rules = (lambda v: {"convex": cp.diff(v["mu"], 2) >= 0},) if convex else ()
-            return as_program(Problem(name, start, (Squares.of(problem, ("a", "Theta")),), (Product("mu", "b"),),
-                                      builders=rules, scale=problem.scale))
+            return Problem(name, start, (Squares.of(problem, ("a", "Theta")),), (Product("mu", "b"),),
+                           builders=rules, scale=problem.scale)
         return Case(name, build, value=value)
 
     # digits by least squares for every direction of b, a single angle
@@ -240,10 +234,10 @@ def _nuclear() -> Case:
     kept = np.maximum(values - 0.5 / weight, 0.0)
     best = (left * kept) @ right
 
-    def build() -> Program:
+    def build() -> Problem:
         matrix = LowRank(NuclearProblem(y, np.arange(9), 1))
-        return as_program(Problem("nuclear_shrinkage", matrix.start(), (matrix, matrix.misfit(weight)),
-                                  scale=weight * float(np.sum(y**2)), weights={"weight": weight}))
+        return Problem("nuclear_shrinkage", matrix.start(), (matrix, matrix.misfit(weight)),
+                       scale=weight * float(np.sum(y**2)), weights={"weight": weight})
 
     return Case("nuclear_shrinkage", build, value=float(np.sum(kept) + weight * np.sum((best - y) ** 2)),
                 point={"yhat": best}, duals={"structure": np.ravel(-2 * weight * (y - best).T, order="F")})
@@ -260,13 +254,13 @@ def _group_sparse() -> Case:
     value = 0.5 * float(rest @ rest) + penalty * sum(w * float(np.linalg.norm(z)) for w, z in zip(weights, shrunk))
     shapes = {f"a{i + 1}": z.shape for i, z in enumerate(groups)}
 
-    def build() -> Program:
+    def build() -> Problem:
         half = np.sqrt(0.5)
         misfit = Squares(half * design, half * target, 0.0, tuple(shapes), GroupProblem(design, target, edges, weights))
         norms = GroupNorms({name: np.array(penalty * w) for name, w in zip(shapes, weights)})
         start = {name: np.zeros(shape) for name, shape in shapes.items()}
-        return as_program(Problem("group_shrinkage", start, (misfit, norms), scale=0.5 * float(target @ target),
-                                  weights={"lambda": penalty}))
+        return Problem("group_shrinkage", start, (misfit, norms), scale=0.5 * float(target @ target),
+                       weights={"lambda": penalty})
 
     return Case("group_shrinkage", build, value=value, point=dict(zip(shapes, shrunk)),
                 duals={"residual": np.sqrt(2.0) * rest})

@@ -20,9 +20,8 @@ from optid.arrays import Array
 from optid.core.leaves import LeafSpace
 from optid.core.terms import Values
 from optid.errors import StructureError
-from optid.program.expressions import KINKS, affine_parts, flat_value, jacobians, row_sizes
-from optid.program.limits import EQUALITIES, Limit, rows_of
-from optid.program.program import named
+from optid.program.expressions import affine_parts, flat_value, has_kinks, jacobians, row_sizes
+from optid.program.limits import EQUALITIES, Limit, named, rows_of
 from optid.program.view import View
 
 NEGLIGIBLE = 64 * float(np.finfo(float).eps)  # share of its constant beneath which a row has no size of its own
@@ -36,8 +35,8 @@ class Constraint:
         name: of the group.
         limit: the constraint as the user wrote it, its bound, and what its rows were divided by.
         cone: "zero", "below", "psd", or "other" where CVXPY alone measures it.
-        rows: (m, leaves), but for a matrix divided by their sizes; sparse where there are many, without entries where
-            the cone is "other".
+        rows: (m, leaves), those of the user but for a matrix divided by their sizes; sparse where there are many,
+            without entries where the cone is "other".
         right: (m,).
         expression: of an "other" one what it holds at zero or not above it; None for a cone that is not read.
         moving: whether its builder looked at values of an iterate.
@@ -68,8 +67,7 @@ class Constraint:
     @cached_property
     def is_smooth(self) -> bool:
         """Whether it has a slope everywhere: no cone that is not read, no atom with a kink."""
-        return self.cone != "other" or self.expression is not None and not (
-            {atom.__name__ for atom in self.expression.atoms()} & KINKS)
+        return self.cone != "other" or self.expression is not None and not has_kinks(self.expression)
 
     @property
     def span(self) -> slice:
@@ -217,7 +215,8 @@ class ConstraintReader:
                 first = 0
                 # a straight line has no curvature
                 for position, limit in enumerate(limit for limit in limits if limit.member.size):
-                    one = replace(self._rows(view, name, limit, moving, number, number < len(own)), position=position, first=first)
+                    read = self._rows(view, name, limit, moving, number, number < len(own))
+                    one = replace(read, position=position, first=first)
                     if number < len(own):
                         convex = convex and (one.cone != "other" or limit.member.is_dcp())
                     elif convex:
@@ -229,7 +228,7 @@ class ConstraintReader:
     def _rows(self, view: View, name: str, limit: Limit, moving: bool, number: int, own: bool) -> Constraint:
         """Return one member as rows on the leaves, where it is affine in them.
 
-        Rows are divided by their sizes, but for those of the formulation itself that are not affine.
+        Those of the user are divided by their sizes; those of the formulation stay as it has written them.
         """
         member, leaves = limit.member, {variable.id: leaf for leaf, variable in self.space.variables.items()}
         foreign = sorted({v.name() for v in member.variables() if v.id not in leaves and not view.owns(v)})
@@ -247,7 +246,7 @@ class ConstraintReader:
                               expression=expression if cone != "psd" else None)
         rows, right = self.space.rows({leaves[variable.id]: part for variable, part in parts[0].items()},
                                       parts[1].size), -parts[1]
-        if cone == "psd":
+        if cone == "psd" or own:
             return Constraint(name, limit, cone, rows, right, moving, number)
         sizes = abs(rows) @ self.space.entry_sizes  # no solver sees the units in which a row was written
         sizes = np.where(sizes > NEGLIGIBLE * np.abs(right), sizes, 1.0)

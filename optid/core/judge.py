@@ -7,6 +7,7 @@ follows from the objective not depending on the scale between its factors.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -118,7 +119,8 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
         best = lagrangian.measure(rows, given)
     else:
         best = (np.inf, np.inf) if _size(problem, rows) <= LARGEST else (np.nan, np.nan)
-    if rows and not np.isnan(best[0]) and not best[0] <= UNCONFIRMED and (own := _fitted(problem, x, rows, lagrangian)) is not None:
+    unsure = rows and not np.isnan(best[0]) and not best[0] <= UNCONFIRMED
+    if unsure and (own := _fitted(problem, x, rows, lagrangian)) is not None:
         again = lagrangian.measure(rows, own)
         if not again[0] >= best[0]:
             given, best, fitted = own, again, True
@@ -143,7 +145,8 @@ def rows_at(problem: Problem, x: Values) -> list[RowsAtPoint]:
         return []
     y, slope, found = problem.leaf_values(x), problem.slope(x), []
     for one in held:
-        rows, g = one.slope(problem.space, y), one.residual(problem.space, y)
+        g = one.residual(problem.space, y)
+        rows = one.slope(problem.space, y)
         found.append(RowsAtPoint(one, g, rows @ slope, *sizes_of_terms(one, rows, g, problem.space, y)))
     return found
 
@@ -163,7 +166,9 @@ def largest_excess(problem: Problem, x: Values, unknowns: frozenset[str] = froze
 
 
 def _excess(one: Constraint, g: Array) -> float:
-    """Return the largest violation of a row, in its own units, or of a matrix."""
+    """Return the largest violation of a row, in its own units, or of a matrix; infinite where it is not finite."""
+    if not np.all(np.isfinite(g)):
+        return float("inf")
     if one.cone == "psd":
         return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
     return float(np.max(np.abs(g) if one.is_equality else np.maximum(g, 0.0), initial=0.0))
@@ -204,6 +209,11 @@ class LagrangianAtPoint:
         """Return that of the objective alone."""
         return cls(problem, x, *problem.pull(x))
 
+    @cached_property
+    def gauges(self) -> list[tuple[Array, Array]]:
+        """The slope of every gauge, and the direction in which the scale of its product changes."""
+        return gauges(self.problem, self.x)
+
     @property
     def yardstick(self) -> float:
         """The objective, or that of the zero model where it is larger."""
@@ -219,11 +229,13 @@ class LagrangianAtPoint:
                 products += abs(float(dual @ row.residual))
             elif not row.constraint.is_equality:
                 products += float(np.sum(np.abs(dual * row.residual)))
-        for weight, (gauge, _) in zip(self.gauge_multipliers(rows, duals), gauges(problem, self.x)):
+        for weight, (gauge, _) in zip(self.gauge_multipliers(rows, duals), self.gauges):
             total += weight * gauge
             terms += abs(weight) * np.abs(gauge)
-        total = self._symmetric(total)
-        total = total + self._eased(total)
+        if problem.symmetric:
+            total = self._symmetric(total)
+        if any(isinstance(term, Length) for term in problem.terms):
+            total = total + self._eased(total)
         worst = 0.0
         for name, place in problem.slices.items():
             part, effort = self._free_part(name, total[place], terms[place])
@@ -244,7 +256,7 @@ class LagrangianAtPoint:
     def gauge_multipliers(self, rows: Sequence[RowsAtPoint], duals: Sequence[Array]) -> Array:
         """Return those with which nothing changes along the scale of a product, on which the objective rests."""
         total = self.gradient + sum((dual @ row.slope for row, dual in zip(rows, duals)), np.zeros(self.problem.size))
-        rates = [(float(total @ along), float(gauge @ along)) for gauge, along in gauges(self.problem, self.x)]
+        rates = [(float(total @ along), float(gauge @ along)) for gauge, along in self.gauges]
         return np.array([-pull / rate if rate else 0.0 for pull, rate in rates])
 
     def _eased(self, total: Array) -> Array:
@@ -273,7 +285,8 @@ class LagrangianAtPoint:
         if name in self.problem.bounds:
             low, high = self.problem.bounds[name]
             margin = INSIDE * variable_size(self.x[name], self.problem.space.usual_sizes.get(name))
-            down, up = flat(self.x[name] <= low + margin), flat(self.x[name] >= high - margin)
+            value = flat(self.x[name])
+            down, up = value <= flat(low) + margin, value >= flat(high) - margin
             part = np.where(down & (part > 0) | up & (part < 0), 0.0, part)
         for term in self.problem.terms:
             if isinstance(term, NuclearNorms | GroupNorms) and name in term.weights:
@@ -330,7 +343,7 @@ def _fitted(problem: Problem, x: Values, rows: Sequence[RowsAtPoint], lagrangian
         np.full(len(slope), row.constraint.is_equality) for row, (slope, _) in zip(rows, parts))])
     try:
         weights, _ = fit_multipliers(slopes * units, -lagrangian.gradient * units, equal)
-    except RuntimeError:
+    except (RuntimeError, ValueError):  # the iterations did not suffice, or products left the range of numbers
         return None
     counts = np.cumsum([len(held), *(len(slope) for slope, _ in parts)])
     return [weights[a:b] @ stands for a, b, (_, stands) in zip(counts, counts[1:], parts)]

@@ -1,13 +1,14 @@
-"""The nuclear norm of a block Hankel matrix of outputs, as a term."""
+"""The nuclear norm of a block Hankel matrix of outputs, as a term, and the form of problems with it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import cvxpy as cp
 import numpy as np
 import scipy.sparse as sp
 
+from optid.core.form import Form
 from optid.core.terms import Squares, Values
 from optid.structures.nuclear_norm import NuclearProblem
 
@@ -60,3 +61,28 @@ class LowRank:
         flat = cp.vec(regressors @ theta, order="C")  # by block row, window, output
         where = (np.arange(rows)[:, None, None] * j + np.arange(j)[None, None, :]) * l + np.arange(l)[None, :, None]
         return cp.reshape(flat[where.reshape(rows * l, j).ravel(order="F")], (rows * l, j), order="F")
+
+
+@dataclass(frozen=True, eq=False)
+class LowRankForm(Form):
+    """``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²`` in ``yhat`` = v and ``T`` = theta.
+
+    ``T`` is there with a predictor only. The multipliers ``structure`` are those of the equation for the matrix.
+    """
+
+    word: ClassVar[str] = "nuclear"
+    problem: NuclearProblem
+    weight: float
+
+    @classmethod
+    def of(cls, problem: Any) -> "LowRankForm | None":
+        """Return the form of a low-rank matrix and the misfit of its outputs."""
+        match problem.terms:
+            case (LowRank(numbers=numbers), Squares()) if not problem.restrictions:
+                return cls(numbers, problem.weights["weight"])
+        return None
+
+    @property
+    def about(self) -> str:
+        """What the problem is and how large."""
+        return f"nuclear norm of a Hankel matrix, {self.problem.shape} entries"

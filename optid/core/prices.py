@@ -26,8 +26,9 @@ def price_constraints(problem: Problem, x: Values, duals: Mapping[str, Array], o
         return ()
     y = problem.leaf_values(x)
     problem.space.assign(y)  # steps and shifts of bounds may be expressions of the leaves
-    rows, worth = rows_at(problem, x), points_per_multiplier(problem.unit * objective, problem.energy)
-    exchange, found = least_multipliers(problem, x, rows, duals), []
+    energy = problem.energy if np.isfinite(problem.energy) else problem.unit * problem.scale
+    rows, worth = rows_at(problem, x), points_per_multiplier(problem.unit * objective, energy)
+    exchange, found = least_multipliers(problem, x, rows, duals) if problem.is_measured else None, []
     for name in problem.constraint_names:
         group = [row for row in rows if row.constraint.name == name]
         gaps = [_slacks(row) for row in group]

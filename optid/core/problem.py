@@ -1,6 +1,6 @@
 """A problem: unknowns with a start, terms of the objective, leaves and constraints; values and slopes without CVXPY."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,9 +12,11 @@ import scipy.sparse as sp
 from optid.arrays import Array
 from optid.core.constraint import Constraint, ConstraintReader
 from optid.core.leaves import DENSE, Affine, Leaf, LeafSpace, Product, slices_of
-from optid.core.terms import Errors, Squares, Term, Values, flat
+from optid.core.terms import Errors, Expressed, Squares, Term, Values, flat
+from optid.errors import StructureError, nearest
 from optid.program.solution import Bound
 from optid.program.structure import GAUGE
+from optid.program.view import View
 
 TRIALS = 5  # random points at which constraints are compared with those of the opposite signs
 
@@ -32,7 +34,7 @@ class Problem:
         facts: keyword arguments of the `View` that builders get: channels, bases, outputs, units, reference, ....
         further: (variables of the leaves, values of the unknowns) -> more expressions for it, such as Q = A P, or None
             for a leaf that it does not show.
-        restrictions: builders of constraints that belong to the formulation: they have no price, and need not be convex.
+        restrictions: builders of constraints that belong to the formulation, have no price, and need not be convex.
         builders: of the user's constraints.
         scale: objective of the zero model, the yardstick of gaps.
         unit: what one unit of the objective is in units of the record.
@@ -42,8 +44,8 @@ class Problem:
         bounds: of unknowns, each (least, largest) in the shape of the unknown.
         courses: unknowns that the restrictions determine from the others, such as states at every sample.
         settled: whether the start is close to an optimum, from which a solver should not wander.
-        proof: (problem, values, multipliers) -> bound on the objective, where no term implies one; or the reason why
-            there can be none.
+        proof: (problem, values, multipliers) -> bound on the objective and a better start or None, where the terms
+            imply none; or the reason why there can be none.
         about: names of further expressions that depend on the values of the unknowns.
         weights: of penalties, which `under_weights` changes.
         posed: states the problem with given weights, as keywords.
@@ -67,7 +69,7 @@ class Problem:
     bounds: Mapping[str, tuple[Array, Array]] = field(default_factory=dict)
     courses: frozenset[str] = frozenset()
     settled: bool = False
-    proof: Callable[["Problem", Values, Values], Bound] | str = ""
+    proof: Callable[["Problem", Values, Values], tuple[Bound, Values | None]] | str = ""
     about: frozenset[str] = frozenset()
     weights: Mapping[str, float] = field(default_factory=dict)
     posed: Callable[..., "Problem"] | None = field(default=None, repr=False)
@@ -99,6 +101,8 @@ class Problem:
         leaves is a `StructureError`.
         """
         gauges = tuple(product.level(x) for product in self.gauged)
+        if gauges and GAUGE in self.constraint_names:
+            raise StructureError(f"there are two constraints named {GAUGE!r}; give each its own name")
 
         def gauge(view: Any) -> dict[str, Any]:
             return {GAUGE: [level + sum(part @ (cp.vec(view.inner[name], order="F") - flat(x[name]))
@@ -113,6 +117,39 @@ class Problem:
             one.refuse_nonconvex(self.name)
         vars(step)["_at_start"] = (*(step._read(x, {0}) if gauges else ()), *held)
         return step
+
+    def holding(self, x: Values, names: Collection[str], *more: Any) -> "Problem":
+        """Return the problem in the other unknowns, with some held at their values in a point, and more restrictions.
+
+        Its terms must be squares. Its constraints are those of this problem, as they were read.
+        """
+        for name in names:
+            if name not in self.start:
+                raise StructureError(f"cannot hold {name!r}. {nearest(name, self.start)}")
+            if np.shape(x[name]) != np.shape(self.start[name]):
+                raise StructureError(f"{name!r} has shape {np.shape(self.start[name])}, the value given has "
+                                     f"{np.shape(x[name])}")
+        leaves = []
+        for leaf in self.leaves:
+            slopes = {name: part for name, part in leaf.slope(x).items() if name not in names}
+            leaves.append(Affine(leaf.name, leaf.value(x), slopes, x))
+        held = [Affine(name, np.asarray(x[name], dtype=float), {}, x) for name in names]
+        part = replace(self, start={name: x[name] for name in self.start if name not in names},
+                       leaves=(*held, *leaves), restrictions=(*more, *self.restrictions),
+                       model=lambda values: self.model({**x, **values}), proof="one factor is held")
+        vars(part)["space"] = self.space
+        left, slope = part.pack(part.start), part.slope(part.start)
+        terms = []
+        for term in self.terms:
+            root = term.root @ slope[np.concatenate([np.arange(self.space.size)[self.space.places[n]] for n in term.z])]
+            terms.append(Squares(root, root @ left - term.residual(self.leaf_values(x)), term.remainder,
+                                 tuple(part.start)))
+        part = replace(part, terms=tuple(terms))
+        vars(part)["space"] = self.space
+        own = part._read(x, set(range(len(more)))) if more else []
+        vars(part)["_at_start"] = (
+            *own, *(replace(one, builder=one.builder + len(more)) for one in self.constraints(x)))
+        return part
 
     # -- what it is made of
 
@@ -135,7 +172,9 @@ class Problem:
     @property
     def has_convex_terms(self) -> bool:
         """Whether all terms are convex in the unknowns."""
-        return not self.bilinear_terms and not any(isinstance(term, Errors) for term in self.terms)
+        return not self.bilinear_terms and not any(
+            isinstance(term, Errors) or isinstance(term, Expressed) and not term.build(self.space.variables).is_convex()
+            for term in self.terms)
 
     @property
     def is_convex(self) -> bool:
@@ -180,6 +219,15 @@ class Problem:
             found = product.in_gauge(found)
         return found
 
+    def shown(self, x: Values) -> dict[str, Array]:
+        """Return the values at a point of everything that constraints may use, in the units of the record."""
+        variables = self.space.variables
+        self.space.assign(self.leaf_values(x))
+        further = {} if self.further is None else self.further(variables, x)
+        inner = {name: one for name, one in {**variables, **further}.items() if one is not None}
+        view = View(inner, **{"reference": x, **self.facts})
+        return {name: np.asarray(expression.value, dtype=float) for name, expression in view.items()}
+
     # -- values and slopes
 
     def value(self, x: Values) -> float:
@@ -221,7 +269,7 @@ class Problem:
             sizes = {name: place.stop - place.start for name, place in self.slices.items()}
             return sp.csr_array(sp.vstack([sp.hstack([
                 parts.get(name, sp.csr_array((self.space.places[leaf].stop - self.space.places[leaf].start, size)))
-                for name, size in sizes.items()]) for leaf, parts in blocks.items()]))
+                for name, size in sizes.items()]) for leaf in self.space.places for parts in [blocks.get(leaf, {})]]))
         found = np.zeros((self.space.size, self.size))
         for name, place in self.slices.items():
             found[self.space.places[name], place] = np.eye(place.stop - place.start)
@@ -256,6 +304,16 @@ class Problem:
             self._read_about.clear()
             self._read_about[point] = tuple(sorted([*kept, *self._read(x, moving)], key=lambda one: one.builder))
         return self._read_about[point]
+
+    @cached_property
+    def complete(self) -> "Problem":
+        """The problem with what constraints need for themselves, such as the matrix of an inequality, as unknowns."""
+        known = {variable.id for variable in self.space.variables.values()} if self._at_start else set()
+        used = [one for held in self._at_start for one in held.limit.member.variables()]
+        own = {one.name(): one for one in used if one.id not in known}
+        return self if not own else replace(
+            self, start={**self.start, **{name: np.zeros(one.shape) for name, one in own.items()}},
+            symmetric=self.symmetric | {name for name, one in own.items() if one.attributes["symmetric"]})
 
     @property
     def constraint_names(self) -> tuple[str, ...]:
@@ -322,13 +380,6 @@ class Problem:
     def is_in_rows(self) -> bool:
         """Whether every constraint is read into rows or a matrix."""
         return all(one.cone != "other" for one in self._at_start)
-
-    def as_written(self, duals: Mapping[str, Array]) -> dict[str, Array]:
-        """Return flat multipliers by constraint for its rows as they were written, not divided by their sizes."""
-        sizes: dict[str, list[Array]] = {}
-        for one in self.constraints():
-            sizes.setdefault(one.name, []).append(one.sizes)
-        return {name: np.ravel(duals[name]) / np.concatenate(parts) for name, parts in sizes.items() if name in duals}
 
     def violation(self, x: Values, constraints: tuple[Constraint, ...] | None = None) -> float:
         """Return the sum of the violations at a point, of rows divided by their sizes."""

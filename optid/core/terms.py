@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 
 import cvxpy as cp
 import numpy as np
+import scipy.sparse as sp
 
 from optid.arrays import Array
+from optid.program.expressions import has_kinks, jacobians
 from optid.structures.rank_one import RankOne
 
 Values = Mapping[str, Array]
@@ -253,6 +255,42 @@ class Errors:
     def tangent(self, y: Values) -> Squares:
         """Return the errors to first order about a point."""
         return self.linearise(y)
+
+
+@dataclass(frozen=True, eq=False)
+class Expressed:
+    """Any scalar expression of CVXPY's atoms, smooth or with kinks.
+
+    Attributes:
+        build: leaves by name, as expressions -> the expression.
+    """
+
+    build: Callable[[Mapping[str, Any]], cp.Expression]
+
+    def value(self, y: Values) -> float:
+        """Return the value at values of the leaves."""
+        return float(np.asarray(self._at(y)[0].value))
+
+    def pull(self, y: Values) -> Pull:
+        """Return value and gradient; NaN where CVXPY knows none, or it would say nothing."""
+        expression, variables = self._at(y)
+        slopes = None if has_kinks(expression) else jacobians(expression)
+        parts = {} if slopes is None else {one.name(): flat(part.toarray() if sp.issparse(part) else part)
+                                           for one, part in slopes.items()}
+        missing = np.nan if slopes is None else 0.0
+        gradient = {name: parts.get(name, np.full(one.size, missing)) for name, one in variables.items()}
+        return Pull(float(np.asarray(expression.value)), gradient, {name: abs(one) for name, one in gradient.items()})
+
+    def express(self, v: Mapping[str, cp.Expression]) -> cp.Expression:
+        """Return the term in CVXPY expressions of the leaves."""
+        return self.build(v)
+
+    def _at(self, y: Values) -> tuple[cp.Expression, dict[str, cp.Variable]]:
+        """Return the expression in variables of its own, which hold the values of the leaves."""
+        variables = {name: cp.Variable(np.shape(value), name=name) for name, value in y.items()}
+        for name, variable in variables.items():
+            variable.save_value(np.asarray(y[name], dtype=float))
+        return self.build(variables), variables
 
 
 Term = Any  # any of these, or one of its own: what it implements decides who can use it

@@ -13,9 +13,9 @@ import numpy as np
 
 from optid.annotations import check_values
 from optid.bases import Linear, fitted_bases
-from optid.certificate.multipliers import least_multipliers
-from optid.core import prices as core_prices
+from optid.core.prices import price_constraints
 from optid.core.problem import Problem
+from optid.core.program import Program
 from optid.data.record import Data, not_a_record
 from optid.data.streams import Stream
 from optid.errors import (
@@ -33,8 +33,7 @@ from optid.identify.dynamics import dynamics, input_levels
 from optid.identify.parameters import Parameters, criteria, parameters, uncertainty_or_reason
 from optid.identify.record_checks import examine, examine_figures
 from optid.models.functions import has_feedback
-from optid.program.prices import Price, price_constraints, price_earlier_steps
-from optid.program.program import Program
+from optid.program.prices import Price
 from optid.program.solution import Bound, Solution, Status
 from optid.progress import log
 from optid.registry import Rendered, annotations, check_arguments, defaults, formulation, named_constraint
@@ -119,8 +118,8 @@ class Fit(Rendered):
         """Values at the solution of everything a constraint may refer to, by name, in the units of ``data``."""
         if not self.solution.has_point:
             return {}
-        self.program.assign(self.solution.values)
-        return {name: np.asarray(expression.value, dtype=float) for name, expression in self.program.view.items()}
+        problem: Problem = self.program.core
+        return problem.shown({name: self.solution.values[name] for name in problem.start})
 
     @cached_property
     def one_step_fit(self) -> np.ndarray:
@@ -362,9 +361,9 @@ def resolve(fit: Fit, weights: Mapping[str, float], *, solver: Any = "auto", acc
     An unknown weight is a `StructureError`. The other arguments are as in `fit`.
     """
     started = time.perf_counter()
-    problem: Problem | None = fit.program.core
-    if problem is None:
-        raise StructureError(f"{fit.program.name!r} has no penalties with weights")
+    problem: Problem = fit.program.core
+    if not problem.weights:
+        raise StructureError(f"{problem.name!r} has no penalties with weights")
     for name in weights:
         if name not in problem.weights:
             raise StructureError(f"problem {problem.name!r} has no weight {name!r}. {nearest(name, problem.weights)}")
@@ -397,7 +396,10 @@ def _finished(outcome: Outcome, data: Data | Stream, name: str, arguments: Mappi
     figures = {**told, **outcome.figures}
     findings = findings + examine_figures(figures)
     prices = _prices(outcome.program, outcome.solution)
-    earlier = price_earlier_steps(outcome.constrained, outcome.program)
+    here = outcome.program.user_constraints
+    # multipliers of an earlier step are in units of its own objective, which have no price in points of fit
+    earlier = [replace(one, fit_points=np.nan) for name, (program, solution) in outcome.constrained.items()
+               if name not in here for one in _prices(program, solution) if one.name == name]
     log.debug("fit %s: %s by %s in %.3g s", name, outcome.solution.status, outcome.solution.solver,
               time.perf_counter() - started)
     return Fit(replace(outcome, figures=figures), name, arguments, data, (*prices, *earlier), tuple(findings),
@@ -405,11 +407,11 @@ def _finished(outcome: Outcome, data: Data | Stream, name: str, arguments: Mappi
 
 
 def _prices(program: Program, solution: Solution) -> tuple[Price, ...]:
-    problem: Problem | None = program.core
-    if problem is None or not problem.is_measured:
-        return price_constraints(program, solution, least_multipliers)
-    return core_prices.price_constraints(problem, solution.values, solution.duals, solution.objective / program.unit
-                                         ) if solution.has_point else ()
+    if not solution.has_point:
+        return ()
+    problem: Problem = program.core
+    x = {name: solution.values[name] for name in problem.start}
+    return price_constraints(problem, x, solution.duals, solution.objective / problem.unit)
 
 
 def _examined(data: Data | Stream, arguments: Mapping[str, Any]) -> list[str]:

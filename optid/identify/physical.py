@@ -334,8 +334,8 @@ class CompressedPhysical(CompressedStates):
         scale = np.where(sizes > NO_EFFECT * sizes.max(), sizes, sizes.max())
         lengths = np.linalg.norm(rows / scale, axis=1, keepdims=True)
         stacked = np.vstack([matrix / scale, rows / scale / np.where(lengths > 0, lengths, 1.0)])
-        values, vectors = np.linalg.svd(stacked)[1:]
-        still = vectors[: len(scale)][values[: len(scale)] <= NO_EFFECT * values[0]]
+        sizes, vectors = np.linalg.svd(stacked)[1:]
+        still = vectors[: len(scale)][sizes[: len(scale)] <= NO_EFFECT * sizes[0]]
         if not len(still):
             return
         part = np.abs(still).max(axis=0)

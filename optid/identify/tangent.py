@@ -247,7 +247,8 @@ def constraint_rows(problem: Problem, x: Values, names: tuple[str, ...]) -> tupl
             continue
         rows = one.slope(problem.space, y) @ slope
         if not np.all(np.isfinite(rows)):
-            raise StructureError(f"constraint {one.name!r} has no gradient at the solution: use optid.bootstrap instead")
+            raise StructureError(f"constraint {one.name!r} has no gradient at the solution: use optid.bootstrap "
+                                 "instead")
         if one.is_equality:
             equal.append(rows)
         else:

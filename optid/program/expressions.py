@@ -31,6 +31,11 @@ KINKS = {"abs", "max", "maximum", "min", "minimum", "norm1", "norm_inf", "normNu
 PROBES = 3  # random points at which the size of an expression is tried
 
 
+def has_kinks(expression: cp.Expression) -> bool:
+    """Whether an expression has atoms whose gradient says nothing at some points."""
+    return not expression.is_affine() and bool({atom.__name__ for atom in expression.atoms()} & KINKS)
+
+
 def flat(expression: cp.Expression) -> cp.Expression:
     """Stack the columns of an expression."""
     return expression if expression.ndim == 1 else cp.vec(expression, order="F")

@@ -1,16 +1,18 @@
 """The bound of a user's constraint: the rows that move with it, their rates, and a small step of it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.nonpos import Inequality, NonNeg, NonPos
+from cvxpy.constraints.second_order import SOC
 from cvxpy.constraints.zero import Equality, Zero
 
-from optid.program.expressions import flat_value, row_sizes
+from optid.errors import StructureError
+from optid.program.expressions import flat_value
 
 EQUALITIES = Equality | Zero
 INEQUALITIES = Inequality | NonPos
@@ -52,31 +54,48 @@ class Limit:
         shared = isinstance(member, EQUALITIES | INEQUALITIES) and any(side.size == 1 for side in sides)
         return cls(member, bound="" if shared else None)
 
-    def posed(self, usual: Mapping[int, float], known: np.ndarray | None = None) -> tuple[Constraint, "Limit"]:
-        """Divide the rows by their size, so that no solver sees the units in which the constraint was written.
-
-        The sizes follow from those of the variables where they are not known.
-        """
-        if not isinstance(self.member, EQUALITIES | INEQUALITIES):
-            return self.member, self
-        sizes = row_sizes(self.member.expr, usual) if known is None else known
-        expression = self.member.expr
-        if sizes.size > 1:
-            scaled = cp.multiply(np.reshape(1 / sizes, expression.shape, order="F"), expression)
+    def posed(self, sizes: np.ndarray) -> Constraint:
+        """Return the constraint with its rows divided by sizes; a cone as it is."""
+        rows = rows_of(self.member)
+        if rows is None or np.all(sizes == 1.0):
+            return self.member
+        if rows.size > 1:
+            scaled = cp.multiply(np.reshape(1 / np.broadcast_to(sizes, (rows.size,)), rows.shape, order="F"), rows)
         else:
-            scaled = expression if sizes.item() == 1.0 else 1 / sizes.item() * expression
-        posed = scaled == 0 if isinstance(self.member, EQUALITIES) else scaled <= 0
-        return posed, replace(self, sizes=sizes)
-
-    def substituted(self, swap: dict[int, Any]) -> "Limit":
-        """Return the same with variables replaced, as by `Program.freeze`."""
-        shift = self.shift.tree_copy(swap) if isinstance(self.shift, cp.Expression) else self.shift
-        return replace(self, member=self.member.tree_copy(swap), shift=shift)
+            scaled = 1 / sizes.item() * rows
+        return scaled == 0 if isinstance(self.member, EQUALITIES) else scaled <= 0
 
     def speeds(self) -> np.ndarray:
         """Return the shift of every row at the assigned point, flat."""
         shift = flat_value(self.shift) if isinstance(self.shift, cp.Expression) else np.atleast_1d(self.shift)
         return np.broadcast_to(shift, (self.member.size,))
+
+
+def named(built: Any, default: str) -> dict[str, tuple[Limit, ...]]:
+    """Bring what a builder returned, CVXPY constraints or `Limit` objects, into the form {name: (limit, ...)}.
+
+    It returns one of them, a list, or a dictionary of either; the default is the name where it gave none.
+
+    Raises:
+        StructureError: when something in it is not a CVXPY constraint.
+    """
+    if isinstance(built, Mapping):
+        groups = {str(name): item for name, item in built.items()}
+    elif isinstance(built, list | tuple):
+        groups = {default if len(built) == 1 else f"{default}[{i}]": item for i, item in enumerate(built)}
+    else:
+        groups = {default: built}
+    return {name: tuple(_limit(name, one) for one in (item if isinstance(item, list | tuple) else [item]))
+            for name, item in groups.items()}
+
+
+def _limit(name: str, member: Any) -> Limit:
+    if not isinstance(member, Constraint | Limit):
+        raise StructureError(
+            f"constraint {name!r} is a {type(member).__name__}, not a CVXPY constraint such as v['a'][0] <= -1")
+    if isinstance(member, SOC):  # in rows, with one multiplier each
+        member = cp.norm(member.args[1], 2, axis=None if member.args[1].ndim < 2 else member.axis) <= member.args[0]
+    return member if isinstance(member, Limit) else Limit.of(member)
 
 
 def spans(group: Sequence[Constraint]) -> list[slice]:

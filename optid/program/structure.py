@@ -1,7 +1,6 @@
 """Structure: what special methods and proofs may use of a programme beyond its statement in CVXPY."""
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -31,21 +30,6 @@ class Structure:
     def about(self) -> str:
         """What the programme is and how large, for the reason of a choice."""
         return self.word
-
-    def measure(self, program: Any, values: Mapping[str, Array]) -> tuple[float, float] | None:
-        """Return objective and relative stationarity at a point of a programme without user constraints.
-
-        None where the numbers tell no more than the CVXPY expressions do.
-        """
-        return None
-
-    def complete(self, program: Any, values: Mapping[str, Array]) -> tuple[dict[str, Array], float, str]:
-        """Return values in the shapes of the variables, derived ones computed from the others, and what they violate.
-
-        That is the largest relative violation of a structural constraint, and its name. Only a programme that is
-        `deferred` uses it.
-        """
-        raise NotImplementedError
 
 
 def relative_gradient(gradient: Array, terms: Array, yardstick: float, size: float) -> float:

@@ -76,11 +76,14 @@ class View(Mapping[str, cp.Expression]):
     def __len__(self) -> int:
         return len(self.inner)
 
-    def auxiliary(self, name: str, shape: tuple[int, ...] = (), **attributes: Any) -> cp.Variable:
+    def auxiliary(self, name: str, shape: tuple[int, ...] = (), **attributes: Any) -> Any:
         """Return a new variable that a constraint needs for itself, such as the matrix of a Lyapunov inequality.
 
-        It becomes a variable of every programme in which the constraint stands; the attributes are CVXPY's.
+        It becomes an unknown of every problem in which the constraint stands, where its name is its own; the attributes
+        are CVXPY's.
         """
+        if name in self.inner:
+            return self.inner[name]
         variable = cp.Variable(shape, name=name, **attributes)
         self._auxiliaries.add(variable.id)
         return variable

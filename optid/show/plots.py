@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from matplotlib.figure import Figure
 
+from optid.core.least_squares import RankOneForm
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.dynamics import input_levels
@@ -19,7 +20,6 @@ from optid.show import charts, frequency, panels, responses
 from optid.show.estimates import uncertainty
 from optid.show.panels import CLOSEUP, MUTED, attempt_panels, liveliest, plain, shorten, styled
 from optid.show.sections import Chart
-from optid.structures.least_squares import rank_one_of
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -189,7 +189,7 @@ def noise(fit: "Fit") -> Figure:
 def certificate(fit: "Fit") -> Figure:
     """Draw the steps of the proof of global optimality and the remaining gap."""
     bound = fit.solution.bound
-    ladder = rank_one_of(fit.program) is not None and bound is not None and bound.method in RUNGS
+    ladder = RankOneForm.of(fit.program.core) is not None and bound is not None and bound.method in RUNGS
     figure = Figure(figsize=(9.0, 2.7 if ladder else 1.9), layout="constrained")
     axes = figure.subplots(2 if ladder else 1, 1, height_ratios=[1, 1.35] if ladder else None, squeeze=False)[:, 0]
     if ladder and bound is not None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optid.core.least_squares import RankOneForm
 from optid.data.record import Data
 from optid.errors import DataError
 from optid.identify.equation_error import EquationError
@@ -17,7 +18,6 @@ from optid.models.roots import in_words
 from optid.program.solution import Solution, Status
 from optid.show.sections import Facts
 from optid.show.wording import Table, gap_text, number, percent, seconds
-from optid.structures.least_squares import rank_one_of
 
 if TYPE_CHECKING:
     from optid.identify.fitting import Fit
@@ -168,10 +168,10 @@ def theta_singular_values(fit: "Fit") -> dict[str, np.ndarray]:
     Inputs whose Theta is a vector are left out.
     """
     compressed, found = fit.program.compressed, {}
-    heights = fit.program.view.units
+    heights = fit.program.core.facts.get("units")
     if not isinstance(compressed, EquationError) or not fit.solution.has_point:
         return found
-    if rank_one_of(fit.program) is not None:
+    if RankOneForm.of(fit.program.core) is not None:
         z, position = np.linalg.solve(compressed.problem.root, compressed.problem.target), compressed.problem.linear
         thetas = []
         for rows, columns in compressed.problem.blocks:

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from optid.backends.back_end import Answer, BackEnd, Settings
+from optid.core.program import Program
 from optid.errors import SolverRefused, StructureError
 from optid.packing import Unsendable
 from optid.processes import run_apart
 from optid.program.expressions import is_crash
-from optid.program.program import Program
 from optid.program.solution import Status
 
 GRACE = 0.5  # seconds after its time limit at which a solver is killed

@@ -8,18 +8,16 @@ import numpy as np
 from optid.arrays import LARGEST
 from optid.backends.back_end import Answer, BackEnd, Settings
 from optid.backends.choice import find
-from optid.certificate.convex import TANGENT, certify_convex
+from optid.certificate.convex import TANGENT
 from optid.certificate.infeasibility import satisfiable
-from optid.certificate.multipliers import fitted_multipliers
-from optid.core.judge import judge as judge_in_core
-from optid.core.low_rank import LowRank
-from optid.core.terms import Squares
-from optid.program.judging import judge, measure_violation
-from optid.program.program import Program, Values
+from optid.core.judge import judge
+from optid.core.least_squares import RankOneForm
+from optid.core.program import Program
+from optid.core.terms import Squares, Values
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
 from optid.program.structure import GAUGE
 from optid.solving.answers import answer_of
-from optid.structures.least_squares import rank_one_of
+from optid.solving.proofs import proof_of
 
 FALSE_CLAIM = 1e-3  # a claim of success at a point this far outside the constraints is false, not inaccurate
 REFERENCE = "clarabel"  # the solver that is asked where neither multipliers nor a bound confirm a point
@@ -58,10 +56,10 @@ def verdict(program: Program, back_end: BackEnd, answer: Answer, base: Solution,
 
     clock = time.perf_counter()
     try:
-        point = _judged(program, answer, base, settings.accuracy)
-    except ValueError as error:  # CVXPY takes no value of another shape, and none that overflowed
-        why = NOT_FINITE if _overflowed(program) else f"returned a point that cannot be judged: {error}"
-        return replace(base, status=Status.FAILED, reason=f"{back_end.name} {why}")
+        point = _judged(program, answer, base)
+    except ValueError as error:  # a value of another shape
+        return replace(base, status=Status.FAILED,
+                       reason=f"{back_end.name} returned a point that cannot be judged: {error}")
     judged = time.perf_counter()
     assert point.residuals is not None
     if not abs(point.objective) <= LARGEST:  # models refuse such numbers, since their squares overflow
@@ -93,43 +91,23 @@ def _conflict(base: Solution, reason: str) -> Solution:
     return replace(base, status=Status.INFEASIBLE, reason=f"{CONFLICT}; {reason}")
 
 
-def _judged(program: Program, answer: Answer, base: Solution, accuracy: float) -> Solution:
+def _judged(program: Program, answer: Answer, base: Solution) -> Solution:
     """Return a solution at the answer's point, with what we measured there.
 
     Where the solver's multipliers do not make it stationary, those count that come nearest to it.
     """
-    duals, problem = _usable(program, answer.duals), program.core
-    if problem is None:
-        return _judged_in_cvxpy(program, answer, duals, base, accuracy)
+    duals, problem = _usable(answer.duals), program.core
     x = {name: np.reshape(np.asarray(answer.values[name], dtype=float), np.shape(start), order="F")
          for name, start in problem.start.items()}
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite shows in the residuals
-        found = judge_in_core(problem, x, duals)
-        values, structural = dict(x), {GAUGE: found.gauge} if problem.gauged else {}
-        if "residual" in program.structural:  # then it is a variable of its own
-            squares = next(term for term in problem.terms if isinstance(term, Squares))
-            values["residual"] = squares.residual(problem.leaf_values(x))
+        found = judge(problem, x, duals)
+        values, structural = program.completed(x), {GAUGE: found.gauge} if problem.gauged else {}
+        if "residual" in values:
             structural["residual"] = duals.get("residual", -2.0 * values["residual"])
-        if "structure" in program.structural:
-            (matrix,) = (term for term in problem.terms if isinstance(term, LowRank))
-            values["X"] = matrix.matrix(x)
-            structural |= {"structure": duals["structure"]} if "structure" in duals else {}
+        if "structure" in duals:  # of a low-rank matrix
+            structural["structure"] = duals["structure"]
     return replace(base, values=values, duals={**structural, **found.duals},
                    objective=found.objective, residuals=found.residuals)
-
-
-def _judged_in_cvxpy(program: Program, answer: Answer, duals: Values, base: Solution, accuracy: float) -> Solution:
-    """Return a solution at a point of a programme without a problem."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        values, objective, residuals = judge(program, answer.values, duals)
-        claims = answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE)
-        unsure = program.user_constraints or np.isnan(residuals.stationarity)
-        if claims and unsure and not _stationary(residuals, accuracy) and residuals.violation <= tolerance(accuracy):
-            own = fitted_multipliers(program)
-            again = residuals if own is None else judge(program, answer.values, own)[2]
-            if own is not None and not again.stationarity >= residuals.stationarity:
-                duals, residuals = own, again
-    return replace(base, values=values, duals=duals, objective=objective, residuals=residuals)
 
 
 def _reference(program: Program, back_end: BackEnd) -> BackEnd | None:
@@ -147,22 +125,17 @@ def _confirmed(program: Program, back_end: BackEnd, settings: Settings, point: S
     answer = None if other is None else answer_of(program, other, replace(settings, options={}), separate)
     if answer is None or not answer.values:
         return True
-    best = _judged(program, answer, point, settings.accuracy)
-    program.assign(point.values)
+    best = _judged(program, answer, point)
     assert best.residuals is not None
     outside = best.residuals.violation > tolerance(settings.accuracy)
     return outside or relative_gap(point.objective, best.objective, program.scale) <= GRADIENT * tolerance(
         settings.accuracy)
 
 
-def _usable(program: Program, duals: Values) -> Values:
-    """Return the multipliers that are finite and as many as their constraint has."""
-    if not duals or not program.is_stated:  # without a statement nothing is measured by them
-        return dict(duals)
-    sizes = {name: sum(dual.size for member in group for dual in member.dual_variables)
-             for name, group in program.constraints.items() if name in duals}
-    return {name: np.ravel(np.asarray(duals[name], dtype=float)) for name, size in sizes.items()
-            if np.size(duals[name]) == size and np.all(np.isfinite(duals[name]))}
+def _usable(duals: Values) -> dict[str, np.ndarray]:
+    """Return the multipliers that are finite numbers."""
+    flat = {name: np.ravel(np.asarray(part, dtype=float)) for name, part in duals.items()}
+    return {name: part for name, part in flat.items() if np.all(np.isfinite(part))}
 
 
 def _stationary(residuals: Residuals, accuracy: float) -> bool:
@@ -171,17 +144,11 @@ def _stationary(residuals: Residuals, accuracy: float) -> bool:
     return residuals.stationarity <= GRADIENT * limit and residuals.complementarity <= limit
 
 
-def _overflowed(program: Program) -> bool:
-    """Whether quantities that follow from the assigned variables are not finite."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        values = [np.asarray(expression.value) for expression in program.derived.values()]
-    return any(value.dtype == object or not np.all(np.isfinite(value)) for value in values)
-
-
 def _contradictory(program: Program) -> bool:
     """Whether the constraints of a bilinear programme contradict each other: its descents cannot tell."""
-    return rank_one_of(program) is not None and bool(program.user_constraints) and not satisfiable(
-        program, list(program.user_constraints))
+    problem = program.core
+    return RankOneForm.of(problem) is not None and bool(problem.constraint_names) and not satisfiable(
+        program, list(problem.constraint_names))
 
 
 def _without_point(program: Program, answer: Answer, back_end: BackEnd, settings: Settings) -> tuple[Status, str]:
@@ -189,15 +156,14 @@ def _without_point(program: Program, answer: Answer, back_end: BackEnd, settings
     name = back_end.name
     if answer.status in (Status.OPTIMAL, Status.LOCAL, Status.INACCURATE):
         return Status.FAILED, f"{name} claims success, but returned no point"
-    if answer.status is Status.INFEASIBLE and program.start:
-        program.assign(program.start)
-        if all(v.value is not None for v in program.variables.values()) and measure_violation(program)[0] < 1e-9:
+    if answer.status is Status.INFEASIBLE:
+        if judge(program.core, program.core.start, {}).residuals.violation < 1e-9:
             return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
     if answer.status is Status.INFEASIBLE and _refutable(program) and satisfiable(
             program, list(program.user_constraints)):
         return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
     if answer.status is Status.UNBOUNDED:
-        if program.objective.expr.is_nonneg():
+        if all(isinstance(term, Squares) for term in program.core.terms) or program.objective.expr.is_nonneg():
             return Status.FAILED, f"{name} claims that there is no minimum, but the objective is never below zero"
         other = _reference(program, back_end)
         found = None if other is None else answer_of(program, other, replace(settings, options={}), False)
@@ -208,8 +174,7 @@ def _without_point(program: Program, answer: Answer, back_end: BackEnd, settings
 
 def _refutable(program: Program) -> bool:
     """Whether a point that satisfies a convex outer approximation of the constraints satisfies them all."""
-    return all(member.is_dcp() for name, group in program.constraints.items() for member in group
-               if name in program.user_constraints or rank_one_of(program) is None)
+    return all(one.limit.member.is_dcp() for one in program.core.constraints())
 
 
 def _status(answer: Answer, residuals: Residuals, accuracy: float, name: str) -> tuple[Status, str]:
@@ -248,14 +213,9 @@ def _refuted(program: Program, point: Solution, bound: Bound, accuracy: float) -
 def _proof(program: Program, back_end: BackEnd, settings: Settings, point: Solution, separate: bool
            ) -> tuple[Solution, Bound | None]:
     """Ask for a proof; what the attempt proposes as a better start, and a wider search, may lead to a better point."""
-    if program.certify is None:
-        if program.kind == "NLP":
-            return point, None
-        try:
-            return point, certify_convex(program, point.values, point.duals, point.objective)
-        except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
-            return point, None
-    bound, start = program.certify(program, point.values, point.duals)
+    bound, start = proof_of(program, point.values, point.duals)
+    if bound is None:
+        return point, None
     if start is not None and not bound.proved:
         point, bound = _lowered(program, start, back_end, settings, point, bound, separate)
     if not bound.proved and back_end.thorough and relative_gap(point.objective, bound.value, program.scale) > OPEN:
@@ -267,12 +227,11 @@ def _proof(program: Program, back_end: BackEnd, settings: Settings, point: Solut
 def _lowered(program: Program, start: Values, back_end: BackEnd, settings: Settings, point: Solution, bound: Bound,
              separate: bool) -> tuple[Solution, Bound]:
     """Solve again from a start, and certify the point found there where it lies lower."""
-    answer = answer_of(replace(program, start=start), back_end, settings, separate)
-    if answer.values and program.certify is not None:
-        again = _judged(program, answer, point, settings.accuracy)
+    answer = answer_of(program.beginning(start), back_end, settings, separate)
+    if answer.values:
+        again = _judged(program, answer, point)
         assert again.residuals is not None and point.residuals is not None
         lower = again.objective < point.objective - 1e-10 * abs(point.objective)
         if lower and again.residuals.violation <= max(point.residuals.violation, 1e-9):
-            point, bound = again, program.certify(program, again.values, again.duals)[0]
-    program.assign(point.values)
+            point, bound = again, proof_of(program, again.values, again.duals)[0] or bound
     return point, bound

@@ -8,13 +8,12 @@ from typing import Any
 from optid.backends.back_end import BackEnd, Settings
 from optid.backends.choice import AUTO, choose, fallbacks, find
 from optid.core.problem import Problem
+from optid.core.program import Program, programme_of
 from optid.errors import SolverRefused
 from optid.processes import LONGEST
-from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status, Times
 from optid.solving.answers import answer_of
 from optid.solving.claims import FALSE_CLAIM, verdict
-from optid.solving.express import programme_of
 from optid.solving.steps import Solvers
 from optid.threads import one_thread
 
@@ -209,7 +208,6 @@ def run(problem: Program | Problem | Procedure, solver: Any = "auto", *, options
             solution = replace(solution, objective=found.objective, bound=bound, status=found.status,
                                reason=found.reason)
             if found.values is not None:
-                program.assign(found.values)
-                solution = replace(solution, values=program.values())
+                solution = replace(solution, values=program.completed(found.values))
             figures = {**found.figures, **_substitutions(steps)}
             return Outcome(found.model, solution, program, tuple(steps), figures, constrained, found)

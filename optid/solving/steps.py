@@ -10,8 +10,8 @@ from typing import Any
 
 from optid.backends.back_end import BackEnd
 from optid.backends.choice import back_ends, find
+from optid.core.program import Program
 from optid.errors import LookupFailed, SolverRefused, nearest
-from optid.program.program import Program
 
 Solver = str | BackEnd | Callable[..., Any]
 Declaration = Callable[[Mapping[str, Any]], Mapping[str, str]]

@@ -7,16 +7,13 @@ D is strongly concave, so that the best v lies within sqrt(2 (P - D)) of any fea
 below lambda w_g on that whole ball is zero in every minimiser (the gap-safe sphere of Ndiaye et al. 2017).
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
 from optid.arrays import Array
 from optid.errors import StructureError
-from optid.program.structure import Structure
 
 SPREAD = 1e-8  # columns of a group may differ from an orthogonal set of one length by this much
 
@@ -89,37 +86,3 @@ class GroupProblem:
         rounding = 1e-14 * float(self.target @ self.target)
         radius = np.sqrt(2 * max(gap, 0.0) + rounding)
         return self.norms(self.design.T @ point) + radius * self.lengths < penalty * self.weights
-
-
-@dataclass(frozen=True, eq=False)
-class GroupSparseStructure(Structure):
-    """P(a); the multiplier of the constraint ``residual``, which defines (M a - r) / sqrt 2, is a point of the dual."""
-
-    word: ClassVar[str] = "group-sparse"
-    problem: GroupProblem  # the numbers
-    penalty: float  # lambda
-    # {variable: shape} in the order of a; a variable of shape (T, d) is T groups of d, row by row
-    blocks: Mapping[str, tuple[int, ...]]
-
-    @property
-    def about(self) -> str:
-        """What the programme is and how large."""
-        return f"{self.problem.weights.size} groups"
-
-    def flat(self, values: Mapping[str, Array]) -> Array:
-        """Return a from named values."""
-        return np.concatenate([np.ravel(np.asarray(values[name], dtype=float)) for name in self.blocks])
-
-    def shaped(self, a: Array) -> dict[str, Array]:
-        """Return named values from a."""
-        cuts = np.cumsum([int(np.prod(shape)) for shape in self.blocks.values()])[:-1]
-        return {name: part.reshape(shape) for (name, shape), part in zip(self.blocks.items(), np.split(a, cuts))}
-
-    def duals(self, v: Array) -> dict[str, Array]:
-        """Return the multipliers of the constraint that a point v (m,) of the dual stands for."""
-        return {"residual": np.sqrt(2.0) * v}
-
-    def dual_point(self, duals: Mapping[str, Array]) -> Array | None:
-        """Return v of the multipliers of a solver, None without them."""
-        given = np.ravel(np.asarray(duals.get("residual", ()), dtype=float))
-        return given / np.sqrt(2.0) if given.size == self.problem.target.size else None

@@ -9,13 +9,12 @@ decomposed once for all weights and step sizes.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from scipy.linalg import pinvh
 
 from optid.arrays import Array
-from optid.program.structure import Structure
 
 RANK = 1e-11  # eigenvalues below this part of the largest are none
 
@@ -287,20 +286,3 @@ def window_starts(lengths: Sequence[int], rows: int, usable: Sequence[np.ndarray
     whole = np.lib.stride_tricks.sliding_window_view(np.concatenate(usable), rows).all(axis=1)
     experiment = np.repeat(np.arange(len(lengths)), lengths)
     return np.flatnonzero(whole & (experiment[: whole.size] == experiment[rows - 1 :]))
-
-
-@dataclass(frozen=True, eq=False)
-class NuclearNormStructure(Structure):
-    """``F = ‖matrix(v, theta)‖_* + weight ‖v - y‖²`` in ``yhat`` = v and ``T`` = theta.
-
-    ``T`` is there with a predictor only. The constraint ``structure`` ties the matrix to them.
-    """
-
-    word: ClassVar[str] = "nuclear"
-    problem: NuclearProblem
-    weight: float
-
-    @property
-    def about(self) -> str:
-        """What the programme is and how large."""
-        return f"nuclear norm of a Hankel matrix, {self.problem.shape} entries"

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from optid.core.program import Program, programme_of
 from optid.errors import OptidError, StudyError
-from optid.program.program import Program
 from optid.program.solution import Solution, Status
-from optid.solving.express import programme_of
 from optid.solving.solve import solve
 from optid.studies.definition.description import Study
 from optid.studies.definition.trial import posed

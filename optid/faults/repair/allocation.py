@@ -112,7 +112,7 @@ class Allocation:
             posed = fault_formulation("allocation.target")(problem, reference=r)
             solution = self._solved(posed, posed.start)
             v = np.clip(solution.values["v"], problem.low, problem.high)
-            return self._target(r, self.inputs(v), v, solution, posed)
+            return self._target(r, self.inputs(v), v, solution)
         posed, third = fault_formulation("allocation.resting")(problem, reference=r), (self.high - self.low) / 3
         found, failure = [], None
         for u in (self.middle, self.middle + third, self.middle - third):
@@ -124,20 +124,19 @@ class Allocation:
                 failure = error
                 continue
             u = np.clip(solution.values["u"], self.low, self.high)
-            found.append(self._target(r, u, self.model.expanded(u[None, :])[0], solution, posed))
+            found.append(self._target(r, u, self.model.expanded(u[None, :])[0], solution))
         if failure is not None and not found:
             raise failure
         return min(found, key=lambda one: one.distance)
 
-    def _target(self, r: Array, u: Array, v: Array, solution: "Solution | None", posed: "Problem | None" = None
-                ) -> Target:
+    def _target(self, r: Array, u: Array, v: Array, solution: "Solution | None") -> Target:
         """The steady state of the plant, of several members the worst, at u and v."""
         weights, points = self.problem.weights, self._rests(u, v)
         distances = [float(np.linalg.norm(weights * (y - r))) for _, y in points]
         distance, (x, y) = max(distances), points[int(np.argmax(distances))]
         scale = self.problem.scale if self.moving else np.sum((weights * (np.abs(r) + np.abs(y))) ** 2)
         reachable = distance <= REACHED * (np.sqrt(scale) or 1.0)
-        limiting = {} if reachable else self._limiting(solution, posed, distance)
+        limiting = {} if reachable else self._limiting(solution, distance)
         return Target(r, y, u, v, x, distance, reachable, limiting, solution, self.idle)
 
     def _rests(self, u: Array, v: Array) -> list[tuple[Array, Array]]:
@@ -146,12 +145,12 @@ class Allocation:
             return [self.model.equilibrium(u)]
         return [(one.rest_state(v), one.rest_output(v)) for one in self.problem.members]
 
-    def _limiting(self, solution: "Solution | None", posed: "Problem | None", distance: float) -> dict[str, float]:
+    def _limiting(self, solution: "Solution | None", distance: float) -> dict[str, float]:
         """Actuators at a bound whose relaxation reduces the distance, with the multipliers of the distance."""
-        if solution is None or posed is None:
+        if solution is None:
             return {f"actuator:{name}": float("nan") for name in self.model.inputs}
         prices = {}
-        for name, dual in posed.as_written(solution.duals).items():  # of the square of the distance
+        for name, dual in solution.duals.items():  # of the square of the distance
             side, _, word = name.partition(" ")
             if side in ("held", "least", "most"):
                 prices[word] = prices.get(word, 0.0) + abs(float(dual[0])) / (2 * distance)
@@ -175,7 +174,7 @@ class Allocation:
     def _solved(self, posed: "Problem", start: Mapping[str, Array]) -> "Solution":
         """Return the solution of a problem from a start; `StructureError` where there is no point."""
         from optid.backends.choice import find
-        from optid.solving.express import as_program
+        from optid.core.program import as_program
         from optid.solving.solve import solve
 
         program, solver = as_program(posed.beginning(start)), self.solver
@@ -183,7 +182,8 @@ class Allocation:
             solver = "auto"
         solution = solve(program, solver)
         if not solution.has_point or solution.status.value not in ("optimal", "locally optimal", "inaccurate"):
-            raise StructureError(f"no steady state was found: {solution.status} ({solution.reason or solution.claimed})")
+            said = solution.reason or solution.claimed
+            raise StructureError(f"no steady state was found: {solution.status} ({said})")
         return solution
 
     def inputs(self, v: Array, near: Array | None = None) -> Array:

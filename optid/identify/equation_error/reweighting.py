@@ -17,6 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from optid.core.problem import Problem
+from optid.core.program import Program, as_program
+from optid.core.terms import Values
 from optid.data.levels import levelled
 from optid.data.record import Data
 from optid.data.streams import Stream
@@ -24,10 +27,8 @@ from optid.errors import StructureError, nearest
 from optid.identify.equation_error.compression import EquationError, compress
 from optid.identify.outliers import MOST, NORMAL_MEDIAN, find_additive_outliers, find_outliers
 from optid.identify.record_checks import BY_RESIDUALS, EXAMINED, list_samples
-from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status, relative_gap
 from optid.program.units import in_units
-from optid.solving.express import programme_of
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics import Layout, residuals
 
@@ -58,14 +59,14 @@ def parse_loss(loss: str) -> tuple[str, float]:
     return kind, threshold
 
 
-def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError], Any], *, convex: bool,
+def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError], Problem], *, convex: bool,
                    **structure: Any) -> Any:
     """Return the plain problem for squares, a procedure of reweighted programmes for the other losses.
 
     Args:
         loss: see `parse_loss`.
         data: the record.
-        pose: states the problem, or the programme, of a compressed record.
+        pose: states the problem of a compressed record.
         convex: whether a dual bound exists.
         structure: of `compress`.
     """
@@ -82,25 +83,25 @@ def pose_with_loss(loss: str, data: Data | Stream, pose: Callable[[EquationError
     return _reweighted(data, pose, structure, kind, threshold, convex)
 
 
-def _reweighted(data: Data, pose: Callable[[EquationError], Any], structure: dict[str, Any], kind: str,
+def _reweighted(data: Data, pose: Callable[[EquationError], Problem], structure: dict[str, Any], kind: str,
                 threshold: float, convex: bool) -> Procedure:
     whole = compress(data, **structure)
     record = data if whole.shifts is None else levelled(data)[0]
     used = _Rows(in_units(record, whole.units), whole.layout)
-    problem, base = whole, programme_of(pose(whole))
+    problem, base = whole, as_program(pose(whole), step=True)
     scale = base.scale  # the weights of a pass are no unit of the data
 
-    def weighted(sizes: list[np.ndarray], start: Any) -> tuple[Program, list[np.ndarray]]:
+    def weighted(sizes: list[np.ndarray], start: Values) -> tuple[Program, list[np.ndarray]]:
         """Return the programme and the weights of a pass, which starts from the solution of the pass before."""
         weights = used.only(_weights(r, kind, width) for r in sizes)
         compressed = replace(compress(data, weights=weights, **structure), unweighted=problem.statistics,
                              between=problem.between)
-        return replace(programme_of(pose(compressed)), start=start, certify=None, scale=scale), weights
+        return as_program(replace(pose(compressed), scale=scale), step=True).beginning(start), weights
 
     while True:
         if used.count:
             problem = compress(data, weights=used.only(np.ones(e.n_samples) for e in data.experiments), **structure)
-            base = programme_of(pose(problem))
+            base = as_program(pose(problem), step=True)
             scale = base.scale
         program, weights, spread, width = base, [], 0.0, 0.0
         for _ in range(SETTLING):  # the scale settles before the loss is fixed; afterwards the objective cannot rise

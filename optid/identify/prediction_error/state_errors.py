@@ -12,6 +12,7 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy.sparse as sp
 
 from optid.arrays import Array
 from optid.bases import Basis, Linear
@@ -143,6 +144,16 @@ class StateErrors(Criterion):
     def _job(self, model: HammersteinSS, index: int, within: bool = True) -> simulation.Run:
         e, limits = self.data.experiments[index], self.limits[index] if within and self.limits else None
         return simulation.prepared(model, SIMULATORS[self.unknowns.criterion], e.u, e.y, limits, "")
+
+    def output_weights(self, i: int) -> sp.csr_array:
+        """Return the matrix that weighs the outputs of an experiment, column by column, as far as they are present."""
+        here, covariance = np.isfinite(self.data.experiments[i].y), np.linalg.inv(self.weight)
+        blocks = []
+        for pattern in np.unique(here[here.any(axis=1)], axis=0):
+            there = np.flatnonzero(pattern)
+            picked = sp.eye_array(len(here)).tocsr()[np.flatnonzero((here == pattern).all(axis=1))]
+            blocks.append(sp.kron(weight_root(covariance, ~pattern)[there], picked))
+        return sp.csr_array(sp.vstack(blocks))
 
     def reweighted(self, x: Array, full: bool) -> "StateErrors":
         """Return the criterion weighted by the inverse (co)variance of the errors at x.

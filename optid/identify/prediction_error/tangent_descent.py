@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
+from optid.core.program import Program
 from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, slowed
 from optid.identify.prediction_error.curvature import Curvature
 from optid.identify.prediction_error.descent import STEPS, Descent
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
-from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
 from optid.statistics.linearised import Linearised

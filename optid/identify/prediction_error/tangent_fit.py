@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from optid.arrays import Array
 from optid.core.judge import largest_excess
 from optid.core.problem import Problem
+from optid.core.program import Program, as_program
 from optid.core.terms import Squares, Values, flat
 from optid.identify.prediction_error.descent import Criterion
-from optid.program.program import Program
-from optid.solving.express import as_program
 from optid.statistics.linearised import Linearised
 from optid.statistics.unknowns import Unknowns
 
@@ -70,12 +69,7 @@ class Places:
         root, errors = at.whole
         return Squares(root[:, self.columns], root @ z0 - errors, at.remainder, tuple(self.names))
 
-    def variables(self) -> dict[str, cp.Variable]:
-        """Return new CVXPY variables."""
-        return {name: cp.Variable(value.shape, name=name)
-                for name, value in self.values(np.zeros(self.unknowns.size)).items()}
-
-    def stacked(self, variables: Mapping[str, cp.Variable]) -> cp.Expression:
+    def stacked(self, variables: Mapping[str, cp.Expression]) -> cp.Expression:
         """Return the variables as the vector of the unknowns."""
         return cp.hstack([variables[name] if variables[name].ndim == 1 else
                           cp.vec(variables[name], order="F" if part == "x0" else "C")

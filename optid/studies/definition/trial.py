@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from optid.core.program import Program, programme_of
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError
 from optid.program.solution import Status
 from optid.registry import formulation as look_up
 from optid.registry import named_constraint
 from optid.show.wording import short
-from optid.solving.express import programme_of
 from optid.solving.solve import solve
 from optid.studies.definition.description import DataEntry, FormulationEntry, SolverEntry
 from optid.studies.definition.problems import Label, Problems
@@ -120,7 +120,7 @@ def _posed(entry: FormulationEntry, record: Data) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         problem = programme_of(posed(entry.formulation, record, entry.constraints, entry.options))
-        return problem if hasattr(problem, "view") else programme_of(next(problem))
+        return problem if isinstance(problem, Program) else programme_of(next(problem))
 
 
 def posed(formulation: str, record: Data, constraints: Sequence[str], options: Mapping[str, Any]) -> Any:

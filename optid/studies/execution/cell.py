@@ -9,7 +9,6 @@ import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -211,7 +210,7 @@ def _warm(cell: Cell, fitted: Fit, row: dict[str, Any], limit: float, given: flo
     if left < fitted.solution.times.solve:
         return without_warm(row, f"{max(left, 0.0):.1f} s of the time limit were left, less than the cold one took")
     keep(row)
-    program = replace(fitted.program, start=dict(fitted.solution.values))
+    program = fitted.program.beginning(fitted.solution.values)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

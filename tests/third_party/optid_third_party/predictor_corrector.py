@@ -13,7 +13,7 @@ from cvxpy.reductions.solvers import utilities
 from cvxpy.reductions.solvers.qp_solvers.qp_solver import QpSolver
 
 from optid.backends import Answer, BackEnd, Settings
-from optid.program.program import Program
+from optid.core.program import Program
 from optid.program.solution import Status
 
 STATUS = {cp.OPTIMAL: Status.OPTIMAL, cp.USER_LIMIT: Status.LIMIT}

@@ -2,19 +2,22 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import accumulate, chain, pairwise
+from itertools import chain
 from math import prod
 from typing import Any, ClassVar
 
 import numpy as np
 
 from optid.arrays import Array
-from optid.program.structure import Structure, relative_gradient, variable_size
+from optid.core.form import Form
+from optid.core.problem import Problem
+from optid.core.terms import Squares
+from optid.program.structure import GAUGE
 from optid.structures.rank_one import Point, RankOne
 
 
 @dataclass(frozen=True, eq=False)
-class LeastSquaresStructure(Structure):
+class LeastSquaresForm(Form):
     """``F = ‖R z - s‖² + remainder`` with ``z = [linear variables; vec(mu_i b_iᵀ)]``.
 
     The structural constraints of its programme only fix directions that do not change F.
@@ -39,23 +42,6 @@ class LeastSquaresStructure(Structure):
         return Point(self.flat(values), tuple(np.asarray(values[mu], dtype=float) for mu, _ in self.blocks),
                      tuple(np.ravel(values[b], order="F") for _, b in self.blocks))
 
-    def measure(self, program: Any, values: Mapping[str, Array]) -> tuple[float, float]:
-        """Return objective and stationarity; the gauge has multiplier zero, since F does not depend on it."""
-        problem, point = self.problem, self.point(values)
-        r = problem.root @ point.lift() - problem.target
-        value = float(r @ r) + problem.remainder
-        pull, effort = 2.0 * problem.root.T @ r, 2.0 * np.abs(problem.root.T) @ np.abs(r)
-        if self.blocks:
-            slope = point.tangent()
-            pull, effort = slope.T @ pull, np.abs(slope.T) @ effort
-        yardstick, worst = max(value, program.scale), 0.0
-        edges = accumulate((np.size(values[name]) for name in self.names), initial=0)
-        for name, (first, last) in zip(self.names, pairwise(edges)):
-            usual = float(np.max(np.abs(program.start.get(name, 0.0)), initial=0.0)) or None
-            size = variable_size(values[name], usual)
-            worst = max(worst, relative_gradient(np.abs(pull[first:last]), effort[first:last], yardstick, size))
-        return value, worst
-
     def named(self, point: Point, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
         """Name the parts of a point, in the shapes of the variables."""
         parts = np.split(point.w, np.cumsum([prod(shapes[name]) for name in self.linear])[:-1])
@@ -64,25 +50,21 @@ class LeastSquaresStructure(Structure):
             found |= zip((mu, b), pair)
         return {name: np.reshape(part, shapes[name], order="F") for name, part in found.items()}
 
-    def complete(self, program: Any, values: Mapping[str, Array]) -> tuple[dict[str, Array], float, str]:
-        """Return values in the shapes of the variables, the residual ``R z - s``, and the violation of the gauge."""
-        shapes, worst = program.shapes, 0.0
-        found = {name: np.array(values[name], dtype=float).reshape(shapes[name], order="F") for name in self.names}
-        a = found.get("a", np.zeros(0))
-        for b in (found[name] for _, name in self.blocks):
-            level = {"norm": np.sum(b**2), "b0": b.flat[0], "gain": np.sum(b) - np.sum(a)}[self.gauge]  # must be one
-            amount = abs(float(level) - 1.0) / (1.0 + float(np.sum(np.abs(b)) + np.sum(np.abs(a))))
-            worst = worst if amount <= worst else amount  # also nan
-        found["residual"] = self.problem.root @ self.point(found).lift() - self.problem.target
-        return found, worst, "gauge" if worst else ""
-
 
 @dataclass(frozen=True, eq=False)
-class LinearStructure(LeastSquaresStructure):
+class LinearForm(LeastSquaresForm):
     """Least squares without products, which a matrix factorisation solves."""
 
     word: ClassVar[str] = "linear"
-    kind: ClassVar[str] = "QP"
+
+    @classmethod
+    def of(cls, problem: Problem) -> "LinearForm | None":
+        """Return the form of one sum of squares of unknowns that nothing but gauges restricts."""
+        match problem.terms:
+            case (Squares(root=np.ndarray(), z=z) as squares,) if set(z) <= problem.start.keys() and not problem.bounds:
+                if problem.structural <= {GAUGE}:
+                    return cls(squares.lifted or squares, z)
+        return None
 
     @property
     def about(self) -> str:
@@ -91,20 +73,25 @@ class LinearStructure(LeastSquaresStructure):
 
 
 @dataclass(frozen=True, eq=False)
-class RankOneStructure(LeastSquaresStructure):
+class RankOneForm(LeastSquaresForm):
     """Least squares with products ``mu_i b_iᵀ``: bilinear, for Gauss-Newton and the certificate."""
 
     word: ClassVar[str] = "rank-one"
-    kind: ClassVar[str] = "NLP"
     constrained: ClassVar[bool] = True
     problem: RankOne
+
+    @classmethod
+    def of(cls, problem: Problem) -> "RankOneForm | None":
+        """Return the form of one sum of squares of unknowns and products."""
+        match problem.terms:
+            case (Squares(lifted=RankOne() as numbers, z=z),) if problem.gauged and not problem.restrictions:
+                products = {product.name: product for product in problem.products}
+                linear = tuple(name for name in z if name not in products)
+                pairs = tuple((products[name].mu, products[name].b) for name in z[len(linear) :])
+                return cls(numbers, linear, pairs, problem.products[0].gauge)
+        return None
 
     @property
     def about(self) -> str:
         """What the programme is and how large."""
         return f"rank-one least squares with {self.problem.root.shape[0]} lifted unknowns"
-
-
-def rank_one_of(program: Any) -> RankOneStructure | None:
-    """Return the rank-one structure of a programme, None where it has another or none."""
-    return program.structure if isinstance(program.structure, RankOneStructure) else None

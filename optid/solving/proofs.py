@@ -1,0 +1,43 @@
+"""Which proof suits a problem: what it states itself, or what the form of its terms implies."""
+
+import numpy as np
+
+from optid.certificate.convex import certify_convex
+from optid.certificate.group_sparse import certify_groups
+from optid.certificate.lifting import certify_nuclear, certify_rank_one
+from optid.certificate.low_rank import certify_low_rank
+from optid.core.group_sparse import GroupSparseForm
+from optid.core.least_squares import RankOneForm
+from optid.core.low_rank import LowRankForm
+from optid.core.problem import Problem
+from optid.core.program import Program
+from optid.core.terms import NuclearNorms, Squares, Values
+from optid.program.solution import Bound
+from optid.structures.rank_one import RankOne
+
+
+def proof_of(program: Program, values: Values, duals: Values) -> tuple[Bound | None, Values | None]:
+    """Return a bound on the objective from a point and its multipliers, and a better start that the attempt proposes.
+
+    No bound where the problem is not convex and nothing is known of its terms, or where none can be formed.
+    """
+    problem: Problem = program.core
+    x = {name: np.asarray(values[name], dtype=float) for name in problem.start}
+    if isinstance(problem.proof, str) and problem.proof:
+        return Bound.none(problem.proof), None
+    if callable(problem.proof):
+        return problem.proof(problem, x, duals)
+    if RankOneForm.of(problem) is not None:
+        return certify_rank_one(problem, x, program.max_size)
+    if GroupSparseForm.of(problem) is not None:
+        return certify_groups(problem, x, duals), None
+    if LowRankForm.of(problem) is not None:
+        return certify_low_rank(problem, x, duals), None
+    match problem.terms:
+        case (Squares(lifted=RankOne(), z=z), NuclearNorms()) if z == tuple(problem.start):
+            return certify_nuclear(problem, x, duals), None
+    kind = program.kind
+    try:
+        return (None if kind == "NLP" else certify_convex(problem, x, duals, kind == "QP")), None
+    except (ValueError, NotImplementedError, TypeError):  # no gradient in CVXPY, or a multiplier of another shape
+        return None, None
