@@ -120,6 +120,13 @@ def test_a_transfer_function_in_small_units_keeps_its_numerator():
         assert np.max(np.abs(system.impulse(n=10)[1][0])) > 1e-102
 
 
+def test_a_quantity_that_a_move_takes_far_has_a_finite_error():
+    local = LocalEstimate(np.zeros(1), np.eye(1), 10.0, np.zeros((0, 1)), np.zeros(0), 100, 0)
+    tangent = Tangent(lambda values: values["c"][0], {"c": (1,)}, np.zeros(1), np.eye(1), local, np.eye(1), "",
+                      objective=lambda _: 0.0)
+    assert tangent.error_within_reach(lambda c: 1e200 * c) == pytest.approx(1e200)  # whose square is infinite
+
+
 def resting():
     """A state x + 0.1 (2 x - 2 - x^3): from zero, Newton steps go in a circle for ever."""
     basis, points = Polynomial(3, interval=(-3.0, 3.0)), np.linspace(-3, 3, 50)

@@ -144,7 +144,7 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
     groups = None if group is None else np.ravel(loaded[group])
     good = {name: known.is_good(loaded[name], goods[name], f"{label}, column {name!r}") for name in quality}
     findings += [known.unused_quality(unused, loaded)] if unused else []
-    loaded = {name: _numeric(loaded[name], name, table) for name in signals}
+    loaded = {name: _numeric(loaded, name, table) for name in signals}
     y_names, y = _stacked(outs, loaded, table, quality, good, kept=set(ins.values()))
     u_names, u = _stacked(ins, loaded, table, quality, good)
     if len(u) != len(y):
@@ -177,15 +177,17 @@ def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time:
         raise DataError(f"{error.cause} Pass {table.advice}.") from None
 
 
-def _numeric(values: Any, column: str, table: Table) -> Any:
+def _numeric(loaded: Mapping[str, Any], column: str, table: Table) -> Any:
     """Return the samples of a column, texts converted to numbers and marks of missing samples to NaN."""
+    values = loaded[column]
     array = np.asarray(values) if not isinstance(values, np.ma.MaskedArray) else values
     if array.dtype.kind in "UO" and array.ndim == 1 and all(isinstance(cell, str) for cell in array.tolist()):
         cells = array.tolist()
         array, row = known.to_numbers(cells, table.how)
         if row is not None:
+            beside = [str(part[row]) for part in map(np.ravel, loaded.values()) if part.size > row]
             raise known.cell_error(f"{table.label}: column {column!r}, row {row + 1}", cells[row], table.how, [cells],
-                                   table.advice)
+                                   table.advice, beside)
     return known.without_marks(array, table.how) if array.dtype.kind in "iuf" else values
 
 
