@@ -108,6 +108,12 @@ def test_without_a_clock_time_counts_samples_and_that_is_said_first(tmp_path):
     assert optid.Data(U, Y).time_unit == "" and optid.Data(U, Y, 2.0).time_unit == "s"
 
 
+def test_a_clock_that_is_read_as_a_signal_is_said():
+    source = {"log.time": 0.1 * np.arange(N), "y": Y}
+    assert "channel 'log.time' is named as a clock" in " ".join(optid.read(source, "log.time", "y").findings)
+    assert not [one for one in optid.read(source, "log.time", "y", time=False).findings if "named as a clock" in one]
+
+
 def test_two_clocks_must_agree():
     both = {"Timestamp": MINUTES.to_numpy(), "u": U, "y": Y}
     refuses(DataError, "two clocks disagree: 'Timestamp' steps by 300 s from .*, 't' steps by 0.1 s from 0.*time='t'",

@@ -12,7 +12,7 @@ from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading import columns as known
 from optid.data.reading import long_tables
-from optid.data.reading.clock import TimeColumn, UnreadStamps, clock_columns, clock_values, seconds
+from optid.data.reading.clock import TimeColumn, UnreadStamps, clock_columns, clock_values, is_time_name, seconds
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.rival_clocks import settle
@@ -151,8 +151,13 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
         raise DataError(f"{label}: u has {len(u)} samples and y has {len(y)}. Cut both to the common part.")
     if stamps is not None and len(stamps) != len(u):
         raise DataError(f"{label}: {clocks[0]!r} has {len(stamps)} stamps for {len(u)} samples; time=False ignores it.")
+    channels = {**dict(zip(u_names, u.T)), **dict(zip(y_names, y.T))}
+    if clock is None and time is None:
+        findings += [f"channel {name!r} is named as a clock and increases throughout, but is read as a signal"
+                     for name, samples in channels.items() if is_time_name((ins | outs).get(name, name).split(".")[-1])
+                     and len(samples) > 2 and (np.diff(samples) > 0).all()]
     if not how.numbers:
-        findings += known.likely_marks({**dict(zip(u_names, u.T)), **dict(zip(y_names, y.T))})
+        findings += known.likely_marks(channels)
     units = {name: table.units.get(column, "") for name, column in (ins | outs).items()}
     whole = RawRun(label, (u_names, y_names), u, y, stamps, clock, units, table.step, tuple(findings))
     runs = []
