@@ -29,13 +29,13 @@ MINUTES = pd.date_range("2024-05-01 06:00", periods=N, freq="5min")
     "t", "T", "time", "Time", "TIMESTAMP", "Timestamp", "time_stamp", "datetime", "DateTime", "Date", "Date/Time",
     "Zeit", "Zeitstempel", "Datum Uhrzeit", "Time (s)", "time [ms]", "t [s]", "t/s", "time_s", "time_us", "Time (UTC)",
     "Elapsed Time", "X_Value", "seconds", "Timestamp (Europe/Berlin)", "Zeit in min", "Čas", "Czas [s]", "Время, с",
-    "时间", "Messzeit [s]", "Temps (heures)", "Minutes"])
+    "时间", "Messzeit [s]", "Temps (heures)", "Fecha hora"])
 def test_names_of_clocks_are_recognised(name):
     assert is_time_name(name)
 
 
-@pytest.mark.parametrize("name", ["temp", "u", "y", "temperature (s)", "rate", "timer_value", "date_code_2", "status",
-                                  ""])
+@pytest.mark.parametrize("name", ["temp", "u", "y", "temperature (s)", "rate", "timer_value", "CAS", "Hours",
+                                  "date_code_2", "status", ""])
 def test_other_names_are_not(name):
     assert not is_time_name(name)
 
@@ -298,7 +298,8 @@ SECONDS = [f"06:07:{k:02d}" for k in range(9)]
     (lines([f"{k}" for k in range(9)], "Temps (heures),u,y"), {}, 3600.0, "in h, read as seconds"),
     (lines([f"{k}" for k in range(9)], "time [min.],u,y"), {}, 60.0, "in min, read as seconds"),
     (lines([f"{k}" for k in range(9)], "Tiempo segundos,u,y"), {}, 1.0, ""),
-    (lines([f"{k}" for k in range(9)], "Minutes,u,y"), {}, 60.0, "in min, read as seconds"),
+    (lines([f"{k}" for k in range(9)], "Minutes,u,y"), {"time": "Minutes"}, 60.0, "in min, read as seconds"),
+    (lines([f"{1709618828 + k}" for k in range(9)], "Fecha hora,u,y"), {}, 1.0, "seconds since 1970"),
     (lines([f"{k}" for k in range(9)], "ms,u,y"), {"time": "ms"}, 1e-3, "in ms, read as seconds"),
     (lines(["time,u,y", *range(9)]).replace("time,u,y,0,0", "time,u,y"), {}, 1.0, "1 row of descriptions skipped"),
     (lines(range(9)).replace(",2\n", ",-inf\n"), {"missing": "-inf"}, 1.0, ""),

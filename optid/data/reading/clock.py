@@ -21,9 +21,8 @@ NAMES = frozenset({
     "uptime", "runtime", "laufzeit", "secondselapsed", "mjd", "jd", "juliandate", "filetime", "ticks", "timems",
     "zeit", "zeitstempel", "datum", "uhrzeit", "datumuhrzeit", "datumzeit",
     "temps", "horodatage", "heure", "tiempo", "fecha", "fechahora", "hora", "tempo", "tijd", "tijdstip", "tid",
-    "messzeit", "zeitpunkt", "cas", "čas", "czas", "aika", "idő", "zaman", "timp", "χρόνος", "время", "час",
-    "时间", "時間", "時刻", "日時", "시간", "milliseconds", "minutes", "hours", "millisekunden", "sekunden", "minuten",
-    "stunden",
+    "messzeit", "zeitpunkt", "čas", "czas", "aika", "idő", "zaman", "timp", "χρόνος", "время", "час", "时间", "時間",
+    "時刻", "日時", "시간", "milliseconds", "millisekunden", "sekunden",
 })
 """Names of columns of time, in lower case, without unit, blanks and marks."""
 
@@ -38,8 +37,8 @@ _UNIT_WORDS = {word: unit for unit, words in {
     "ms": "ms msec msecs millis millisecond milliseconds millisekunde millisekunden milisegundos millisecondes мс",
     "us": "us µs μs usec usecs µsec μsec microsecond microseconds", "ns": "ns nsec nanosecond nanoseconds",
     "min": "min mins minute minutes minuten minuto minutos minuti minuuten minuter minutter minuty мин 分 분",
-    "h": "h hr hrs hour hours std stunde stunden hora horas heure heures ora ore uur uren timmar godziny ч 時間 时",
-    "d": "d day days tag tage día días dias jour jours giorni dagen dagar dager dage dni дни 日",
+    "h": "h hr hrs hour hours stunden horas heures ore uren timmar godziny ч",  # not hora, heure, ora: a time of day
+    "d": "d day days tage días dias jours giorni dagen dagar dager dage dni дни",
     "w": "week weeks wk wks woche wochen",
 }.items() for word in words.split()}
 

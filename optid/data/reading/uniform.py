@@ -114,7 +114,8 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
     if how.gaps is None or stamps.size < 2:
         said = []
         if repeated(stamps) > COARSE and _are_copies(stamps, u, y):
-            raise DataError(f"{label}: rows that share a time stamp are equal: pass gaps='missing' to count each once.")
+            raise DataError(f"{label}: rows that share a time stamp are equal: pass gaps='missing' to count each once, "
+                            "or dt= where they are samples of their own.")
         if stamps.size > 1 and stamps[1] < stamps[0] and (seconds(np.diff(stamps)) < 0).all():
             stamps, u, y = stamps[::-1], u[::-1].copy(), y[::-1].copy()
             said = ["the newest sample came first: the rows are turned round"]
