@@ -28,13 +28,14 @@ MINUTES = pd.date_range("2024-05-01 06:00", periods=N, freq="5min")
 @pytest.mark.parametrize("name", [
     "t", "T", "time", "Time", "TIMESTAMP", "Timestamp", "time_stamp", "datetime", "DateTime", "Date", "Date/Time",
     "Zeit", "Zeitstempel", "Datum Uhrzeit", "Time (s)", "time [ms]", "t [s]", "t/s", "time_s", "time_us", "Time (UTC)",
-    "Elapsed Time", "X_Value", "seconds", "Timestamp (Europe/Berlin)", "Zeit in min"])
+    "Elapsed Time", "X_Value", "seconds", "Timestamp (Europe/Berlin)", "Zeit in min", "Čas", "Czas [s]", "Время, с",
+    "时间", "Messzeit [s]", "Temps (heures)", "Fecha hora"])
 def test_names_of_clocks_are_recognised(name):
     assert is_time_name(name)
 
 
-@pytest.mark.parametrize("name", ["temp", "u", "y", "temperature (s)", "rate", "timer_value", "date_code_2", "status",
-                                  ""])
+@pytest.mark.parametrize("name", ["temp", "u", "y", "temperature (s)", "rate", "timer_value", "CAS", "Hours",
+                                  "date_code_2", "status", ""])
 def test_other_names_are_not(name):
     assert not is_time_name(name)
 
@@ -107,6 +108,12 @@ def test_without_a_clock_time_counts_samples_and_that_is_said_first(tmp_path):
     assert optid.Data(U, Y).time_unit == "" and optid.Data(U, Y, 2.0).time_unit == "s"
 
 
+def test_a_clock_that_is_read_as_a_signal_is_said():
+    source = {"log.time": 0.1 * np.arange(N), "y": Y}
+    assert "channel 'log.time' is named as a clock" in " ".join(optid.read(source, "log.time", "y").findings)
+    assert not [one for one in optid.read(source, "log.time", "y", time=False).findings if "named as a clock" in one]
+
+
 def test_two_clocks_must_agree():
     both = {"Timestamp": MINUTES.to_numpy(), "u": U, "y": Y}
     refuses(DataError, "two clocks disagree: 'Timestamp' steps by 300 s from .*, 't' steps by 0.1 s from 0.*time='t'",
@@ -116,6 +123,39 @@ def test_two_clocks_must_agree():
     assert optid.read({**both, "Date": np.full(N, "2024-05-01")}).dt == 300.0  # a constant is no clock
     found = optid.read({**both, "time": np.array(["a", "b"] * (N // 2), dtype=object)})
     assert found.dated and "column 'time' holds no time stamps" in found.findings[0]
+
+
+def test_a_stream_settles_its_clocks_as_a_reader_does(tmp_path):
+    """Rivals must agree, a date and a time of day are one clock, and midnight does not end it."""
+    moments = pd.date_range("2024-05-01 23:50", periods=N, freq="1min")
+    tables = {"rival": {"time": 0.1 * np.arange(N), "timestamp": moments},
+              "pairs": {"u Time": MINUTES, "y Time": moments},
+              "split": {"Date": moments.strftime("%Y-%m-%d"), "Time": moments.strftime("%H:%M:%S")},
+              "hours": {"Time": moments.strftime("%H:%M:%S")}, "agree": {"time": 60 * np.arange(N), "stamp": moments}}
+    for name, clocks in tables.items():
+        for kind in ("csv", "parquet"):
+            frame, path = pd.DataFrame({**clocks, "u": U, "y": Y}), tmp_path / f"{name}.{kind}"
+            frame.to_csv(path, index=False) if kind == "csv" else frame.to_parquet(path)
+            if name in ("rival", "pairs"):
+                for opened in (optid.read, optid.open_stream):
+                    refuses(DataError, "two clocks disagree", opened, path)
+                continue
+            for chunk in (7, 1, 1000):
+                stream = optid.open_stream(path, chunk=chunk)
+                assert stream.dt == optid.read(path).dt == 60.0
+                assert np.concatenate([u[:, 0] for u, _ in stream]) == pytest.approx(U)
+    coarse = tmp_path / "coarse.csv"
+    pd.DataFrame({"time": np.arange(N) // 4, "u": U, "y": Y}).to_csv(coarse, index=False)
+    refuses(DataError, "does not spread them: pass time=False with dt=0.25", optid.open_stream, coarse, dt=0.25)
+
+
+def test_a_frame_with_a_row_of_units_is_refused_with_that_row():
+    frame = pd.DataFrame({"time": ["s", *map(str, range(N))], "u": ["V", *map(str, U)], "y": ["rpm", *map(str, Y)]})
+    for source in (frame, pl.from_pandas(frame)):
+        refuses(DataError, "row 1 holds 's', no number like the others", optid.read, source)
+        refuses(DataError, r"row 1 holds 'V', not a number. The whole row is text \(V, rpm, s\)", optid.read,
+                source.rename(columns={"time": "k"}) if source is frame else source.rename({"time": "k"}), time=False,
+                quality={"k": "1"})
 
 
 def test_a_wrong_word_is_never_ignored_for_another_clock():
@@ -255,6 +295,14 @@ SECONDS = [f"06:07:{k:02d}" for k in range(9)]
     (lines([f'"Mar 05, 2024 {one} AM"' for one in SECONDS]), {}, 1.0, ""),
     (lines([f"{0.05 * k:.2f}" for k in range(9)], "x-axis,u,y"), {}, 1.0, "pass time='x-axis' if it is the clock"),
     ("t,u,y\n(ms),(V),(mV)\n\n0,1,2\n1,2,3\n2,3,4\n", {}, 0.001, "units t ms, u V, y mV"),
+    (lines([f"{k}" for k in range(9)], "Temps (heures),u,y"), {}, 3600.0, "in h, read as seconds"),
+    (lines([f"{k}" for k in range(9)], "time [min.],u,y"), {}, 60.0, "in min, read as seconds"),
+    (lines([f"{k}" for k in range(9)], "Tiempo segundos,u,y"), {}, 1.0, ""),
+    (lines([f"{k}" for k in range(9)], "Minutes,u,y"), {"time": "Minutes"}, 60.0, "in min, read as seconds"),
+    (lines([f"{1709618828 + k}" for k in range(9)], "Fecha hora,u,y"), {}, 1.0, "seconds since 1970"),
+    (lines([f"{k}" for k in range(9)], "ms,u,y"), {"time": "ms"}, 1e-3, "in ms, read as seconds"),
+    (lines(["time,u,y", *range(9)]).replace("time,u,y,0,0", "time,u,y"), {}, 1.0, "1 row of descriptions skipped"),
+    (lines(range(9)).replace(",2\n", ",-inf\n"), {"missing": "-inf"}, 1.0, ""),
     ('t,u,y\n0,"57,5",1\n1,"57,5",2\n', {"decimal": ","}, 1.0, ""),
     ("t,u,y,Status\n0,1,2,192\n1,2,3,216\n2,3,4,0\n", {}, 1.0, "Pass quality='Status:192|216'"),
 ])
@@ -283,6 +331,14 @@ def test_other_clocks_and_tables_are_read_and_said(tmp_path, text, words, dt, sa
     ("t,u,y\n0,12.5 V,1\n1,13 V,2\n", {}, "a number with its unit"),
     (lines(["24-03-05 06:07:08", "24-03-05 06:07:09"]), {}, "'%y-%m-%d %H:%M:%S'"),
     ("t;u;y\n0,0;57;1\n0,5;57;1\n1,0;57;1\n", {}, "Pass delimiter=';', decimal=','"),
+    ("t;u;y\n0;1,000;0.12\n1;2,500;0.25\n", {}, "pass delimiter=';', thousands=','"),
+    ("t;u;y\n0;1,000;120\n1;2,500;250\n", {}, "pass delimiter=';', decimal=','"),
+    ("t u y\n0 1D+00 2\n1 2.5D+00 3\n", {}, "Write E in place of D"),
+    ("t,u,y\n0,1,2\n1,-1.#IND,3\n", {}, "missing='-1.#IND'"),
+    ("time [0.1 s],u,y\n0,1,2\n1,2,3\n", {}, "counts steps of '0.1 s'"),
+    (lines([0, 1, "BAD", 3, 4]), {"missing": "x"}, "row 3 holds 'BAD', no number like the others"),
+    (lines([*SECONDS[:5], "05.03.2024 06:07:08"]), {}, "row 6 holds '05.03.2024 06:07:08', no date like the others"),
+    ("t,u,y\n0,1,5\n0,1,5\n1,2,6\n1,2,6\n2,1,7\n2,1,7\n", {}, "are equal: pass gaps='missing'"),
 ])
 def test_what_could_be_meant_otherwise_is_refused(tmp_path, text, words, said):
     (tmp_path / "r.csv").write_text(text)

@@ -27,7 +27,7 @@ from optid.show.printing import describe
 from optid.show.report import render
 
 
-@pytest.mark.parametrize("seed", [1, 20, 21, 77])
+@pytest.mark.parametrize("seed", [1, 20, 21, 77, 5431])
 def test_a_random_fit_can_be_used_in_every_way(seed, tmp_path):
     assert troubles(seed, tmp_path) == []
 
@@ -118,6 +118,13 @@ def test_a_transfer_function_in_small_units_keeps_its_numerator():
     assert system.impulse(n=10)[1][0][:, 0] == pytest.approx(fit.model.impulse_response(10)[:, 0, 0])
     with np.errstate(all="ignore"):
         assert np.max(np.abs(system.impulse(n=10)[1][0])) > 1e-102
+
+
+def test_a_quantity_that_a_move_takes_far_has_a_finite_error():
+    local = LocalEstimate(np.zeros(1), np.eye(1), 10.0, np.zeros((0, 1)), np.zeros(0), 100, 0)
+    tangent = Tangent(lambda values: values["c"][0], {"c": (1,)}, np.zeros(1), np.eye(1), local, np.eye(1), "",
+                      objective=lambda _: 0.0)
+    assert tangent.error_within_reach(lambda c: 1e200 * c) == pytest.approx(1e200)  # whose square is infinite
 
 
 def resting():

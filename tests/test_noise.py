@@ -1,5 +1,7 @@
 """Noise statistics: what the data determine is recovered on simulated systems with known covariances."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from refusals import refuses
@@ -21,6 +23,7 @@ from optid.identify.noise import (
 from optid.models.hammerstein_ss import HammersteinSS
 from optid.models.innovation_gain import Likelihood, _parts, _run, _slope, covariance_of, refined
 from optid.models.kalman import NoiseCovariances, kalman_gain
+from optid.show.summary import noise_table
 
 A = np.array([[0.7, 0.35, 0.0], [-0.35, 0.7, 0.1], [0.0, 0.0, 0.5]])
 B = np.array([[1.0, 0.2], [0.0, 0.8], [0.5, -0.6]])
@@ -158,6 +161,14 @@ def test_the_colour_test_names_the_output():
         e[k, 1] += 0.6 * e[k - 1, 1]
     tests = colour(model, Data(u, model.simulate(u) + e))
     assert tests["y1"].passed and not tests["y2"].passed
+
+
+def test_a_marginal_mode_that_no_output_sees_leaves_the_table_of_the_noise():
+    covariance = NoiseCovariances(*(np.zeros((1, 1)),) * 3, np.eye(1))
+    model = HammersteinSS([[1.0]], [[1.0]], [[0.0]], noise=covariance)
+    data = Data(np.ones(60), np.random.default_rng(0).standard_normal(60))
+    refuses(StructureError, "no stabilising solution", colour, model, data)
+    assert noise_table(SimpleNamespace(model=model, data=data)).rows[0][3] == "-"
 
 
 def test_the_spectrum_is_that_of_the_residuals():

@@ -346,6 +346,16 @@ def test_without_poles():
         assert model.theta() == pytest.approx(plant.theta(), abs=0.03) and model.c == pytest.approx([-0.5], abs=0.06)
 
 
+def test_a_plant_without_lags_predicts_by_its_noise_alone():
+    rng = np.random.default_rng(4)
+    u, v = rng.uniform(-1, 1, 200), lfilter([1.0, 0.5], [1.0, -0.8], 0.1 * rng.standard_normal(200))
+    fit = quiet(Data(u, 2 * u + v), "bj.exact", na=0, nb=1, nk=0, nc=1, nd=1)
+    model = fit.model
+    assert model.largest_lag == 0 and "The model on this record" in str(fit)
+    errors = lfilter(np.r_[1, model.d], np.r_[1, model.c], fit.data.y[:, 0] - model.simulate(fit.data)[:, 0])
+    assert model.predict(fit.data)[20:, 0] == pytest.approx((fit.data.y[:, 0] - errors)[20:], abs=1e-6)
+
+
 def test_gas_furnace_of_box_and_jenkins(real_data):
     """The transfer-function model of their book (1976, section 11.4), within its standard errors.
 

@@ -1,5 +1,6 @@
 """Excel, TDMS and MDF files, read by the libraries of the extra `plant`; without them a refusal has the pip line."""
 
+import gc
 import sys
 import warnings
 from datetime import datetime, timedelta
@@ -74,11 +75,16 @@ def test_tdms(tmp_path):
     assert optid.read(path).start == np.datetime64("2024-05-01T06:00")
     write("run 1", "run 2")
     assert optid.read(path).n_experiments == 2
+    with nptdms.TdmsWriter(str(path)) as writer:
+        writer.write_segment([nptdms.ChannelObject("log", "u", U, {"wf_increment": 0.1})])
+    path.write_bytes(path.read_bytes()[:-80])
+    found = optid.read(path, {"u": "u"}, {"y": "u"})
+    assert found.n_samples == N - 10 and "the file ends within a segment" in found.findings[0]
     path.write_bytes(b"nonsense" * 9)
     refuses(DataError, "r.tdms is damaged", optid.read, path)
 
 
-def test_mdf(tmp_path):
+def test_mdf(tmp_path, monkeypatch):
     mdf = pytest.importorskip("asammdf")
     path = tmp_path / "r.mf4"
     file = mdf.MDF(version="4.10")
@@ -88,5 +94,11 @@ def test_mdf(tmp_path):
     same(optid.read(path))
     assert optid.read(path).input_units == ("V",)
     refuses(DataError, "has no column 'slow'", optid.read, path, inputs="slow")
+    path.write_bytes(path.read_bytes()[:-99])
+    raised = []
+    monkeypatch.setattr(sys, "unraisablehook", raised.append)
+    refuses(DataError, "r.mf4 is damaged", optid.read, path)
+    gc.collect()
+    assert raised == []  # no finaliser of what was left half built prints a traceback
     path.write_bytes(b"nonsense" * 99)
     refuses(DataError, "r.mf4 is damaged", optid.read, path)

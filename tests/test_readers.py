@@ -479,6 +479,13 @@ def test_a_time_index_sets_the_sampling_time(index):
         assert read(frame.reset_index()).dt == 0.02  # the only column of dates
 
 
+def test_a_frame_with_half_a_character_in_a_name_is_refused():
+    pd = pytest.importorskip("pandas")
+    for names in (["u", "y", "\ud800"], ["u", "\ud800", 0]):  # pandas finds the type of names that are made texts
+        frame = pd.DataFrame(np.zeros((5, 3)), columns=pd.Index(names, dtype=object))
+        refuses(DataError, "holds half a character; rename it", read, frame, inputs="u", outputs=1)
+
+
 def test_an_index_without_time_is_ignored():
     frame = pd.DataFrame({"u": np.arange(5.0), "y": np.arange(5.0)}, index=[3, 1, 4, 1, 5])
     assert read(frame).dt == 1.0

@@ -12,7 +12,7 @@ from optid.arrays import as_samples, check_shape
 from optid.data.channels import sampling_time
 from optid.data.reading import columns as known
 from optid.data.reading import long_tables
-from optid.data.reading.clock import TimeColumn, UnreadStamps, clock_columns, clock_values, seconds
+from optid.data.reading.clock import TimeColumn, UnreadStamps, clock_columns, clock_values, is_time_name, seconds
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.rival_clocks import settle
@@ -144,15 +144,20 @@ def _runs(table: Table, inputs: Wanted, outputs: Wanted, time: Any, experiment: 
     groups = None if group is None else np.ravel(loaded[group])
     good = {name: known.is_good(loaded[name], goods[name], f"{label}, column {name!r}") for name in quality}
     findings += [known.unused_quality(unused, loaded)] if unused else []
-    loaded = {name: _numeric(loaded[name], name, table) for name in signals}
+    loaded = {name: _numeric(loaded, name, table) for name in signals}
     y_names, y = _stacked(outs, loaded, table, quality, good, kept=set(ins.values()))
     u_names, u = _stacked(ins, loaded, table, quality, good)
     if len(u) != len(y):
         raise DataError(f"{label}: u has {len(u)} samples and y has {len(y)}. Cut both to the common part.")
     if stamps is not None and len(stamps) != len(u):
         raise DataError(f"{label}: {clocks[0]!r} has {len(stamps)} stamps for {len(u)} samples; time=False ignores it.")
+    channels = {**dict(zip(u_names, u.T)), **dict(zip(y_names, y.T))}
+    if clock is None and time is None:
+        findings += [f"channel {name!r} is named as a clock and increases throughout, but is read as a signal"
+                     for name, samples in channels.items() if is_time_name((ins | outs).get(name, name).split(".")[-1])
+                     and len(samples) > 2 and (np.diff(samples) > 0).all()]
     if not how.numbers:
-        findings += known.likely_marks({**dict(zip(u_names, u.T)), **dict(zip(y_names, y.T))})
+        findings += known.likely_marks(channels)
     units = {name: table.units.get(column, "") for name, column in (ins | outs).items()}
     whole = RawRun(label, (u_names, y_names), u, y, stamps, clock, units, table.step, tuple(findings))
     runs = []
@@ -177,15 +182,17 @@ def _clock(table: Table, loaded: Mapping[str, Any], clocks: Sequence[str], time:
         raise DataError(f"{error.cause} Pass {table.advice}.") from None
 
 
-def _numeric(values: Any, column: str, table: Table) -> Any:
+def _numeric(loaded: Mapping[str, Any], column: str, table: Table) -> Any:
     """Return the samples of a column, texts converted to numbers and marks of missing samples to NaN."""
+    values = loaded[column]
     array = np.asarray(values) if not isinstance(values, np.ma.MaskedArray) else values
     if array.dtype.kind in "UO" and array.ndim == 1 and all(isinstance(cell, str) for cell in array.tolist()):
         cells = array.tolist()
         array, row = known.to_numbers(cells, table.how)
         if row is not None:
+            beside = [str(part[row]) for part in map(np.ravel, loaded.values()) if part.size > row]
             raise known.cell_error(f"{table.label}: column {column!r}, row {row + 1}", cells[row], table.how, [cells],
-                                   table.advice)
+                                   table.advice, beside)
     return known.without_marks(array, table.how) if array.dtype.kind in "iuf" else values
 
 

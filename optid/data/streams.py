@@ -1,6 +1,6 @@
 """Records larger than memory: files, folders and Dask collections, read in chunks on every pass."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -11,12 +11,13 @@ import numpy as np
 from optid.arrays import check_integer
 from optid.data.channels import Ports, Transform, channel_fields, interval_text, sampling_time
 from optid.data.reading.chunks import Channels, Chunk, End, Survey, joined, surveyed
-from optid.data.reading.clock import TimeColumn, clock_columns, recognise
+from optid.data.reading.clock import TimeColumn, clock_columns
 from optid.data.reading.columns import Wanted, choose
 from optid.data.reading.format import Format
 from optid.data.reading.parts import Part
+from optid.data.reading.rival_clocks import settle
 from optid.data.reading.sources import Source, open_source
-from optid.data.reading.uniform import agreed_step, uniform_step
+from optid.data.reading.uniform import COARSE, agreed_step, repeated, uniform_step
 from optid.data.reduction import available_cores, fetched, reduced
 from optid.errors import DataError
 
@@ -214,12 +215,12 @@ def open_stream(  # noqa: D417 - the others stand with `read`
         parts = [replace(part, experiment=i) for i, one in enumerate(opened) for part in one.parts(read)]
         if len({part.experiment for part in parts}) < len(opened):
             raise DataError("a source of the list has no rows.")
-    clock, step = None, dt
+    clock, step, said = None, dt, list[str]()
     if clocks:
         sources = (fetched(part, scheduler) for part in parts) if parts else (one.whole for one in opened)
-        clock, step = _clock_and_step(sources, clocks, how, units.get(clocks[0], ""), dt)
+        clock, step, said = _clock_and_step(sources, clocks, opened[0], dt, time is not None and time is not True)
     findings = [note for one in opened for note in one.findings]
-    findings += [clock.finding] if clock is not None and clock.finding else []
+    findings += said
     if step is None:
         findings.insert(0, "no time column: 1 sample = 1; pass dt= (seconds)")
     lengths = [one.n_samples for one in opened]
@@ -235,32 +236,45 @@ def open_stream(  # noqa: D417 - the others stand with `read`
 
 def _chosen(opened: Sequence[Source], inputs: Wanted, outputs: Wanted, time: str | int | bool | None
             ) -> tuple[dict[str, str], dict[str, str], list[str]]:
-    """Return {channel: column} of inputs and outputs and the columns of the clock, equal for all sources."""
+    """Return {channel: column} of inputs and outputs and the columns that may be the clock, equal for all sources."""
     found = []
     for one in opened:
         ins, outs = (choose(one.names, wanted, c, one.label) for wanted, c in ((inputs, "u"), (outputs, "y")))
         clocks = clock_columns(one.names, time, [*ins.values(), *outs.values()], one.label, dated=one.dates)
-        found.append((ins, outs, clocks[:1]))
-        if found[-1] != found[0]:
-            raise DataError(f"{one.label} has channels {found[-1][:2]} and clock {found[-1][2]!r}, {opened[0].label} "
-                            f"has {found[0][:2]} and {found[0][2]!r}: name the columns, or pass time=False.")
-    return found[0]
+        found.append((ins, outs, clocks))
+        if found[-1][:2] != found[0][:2] or clocks[:1] != found[0][2][:1]:
+            raise DataError(f"{one.label} has channels {found[-1][:2]} and clock {clocks[:1]!r}, {opened[0].label} "
+                            f"has {found[0][:2]} and {found[0][2][:1]!r}: name the columns, or pass time=False.")
+    return *found[0][:2], [name for name in found[0][2] if all(name in clocks for _, _, clocks in found)]
 
 
-def _clock_and_step(sources: Iterable[Any], columns: Sequence[str], how: Format, unit: str, dt: float | None
-                    ) -> tuple[TimeColumn | None, float | None]:
-    """Return the clock and the sampling time that the first source with two stamps shows; dt if given."""
-    clock = None
+def _clock_and_step(sources: Iterable[Any], columns: Sequence[str], table: Source, dt: float | None, asked: bool
+                    ) -> tuple[TimeColumn | None, float | None, list[str]]:
+    """Return the clock, the sampling time of the first source with two stamps, or dt, and what is to be said of it."""
+    clock, said = None, list[str]()
     for one in sources:
-        stamps = np.empty(0)
-        for block in one.blocks(columns, dict.fromkeys(columns, "clock")):
-            clock = clock or recognise(block[columns[0]], columns[0], how, one.label, unit)
-            more = clock.stamps(block, one.label)
-            stamps = np.concatenate([stamps, more]) if stamps.size else more
-            if stamps.size > 1:
-                found = uniform_step(stamps, how.time_tolerance, one.label)
-                return clock, agreed_step(found, dt, how.time_tolerance, one.label)
-    return clock, dt
+        table = replace(table, label=one.label)
+        block = _first_rows(one.blocks(columns, dict.fromkeys(columns, "clock")))
+        if not block:
+            continue
+        clock, stamps, said = settle(block, columns, table, asked)
+        if stamps.size > 1:
+            if dt is not None and repeated(stamps) > COARSE:
+                raise DataError(f"{one.label}: rows share each time stamp, and a stream does not spread them: pass "
+                                f"time=False with dt={dt:g}, or use read.")
+            found = uniform_step(stamps, table.how.time_tolerance, one.label)
+            return clock, agreed_step(found, dt, table.how.time_tolerance, one.label), said
+    return clock, dt, said
+
+
+def _first_rows(blocks: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the first blocks as one of at least two rows, where there are so many; {} where there are none."""
+    found: dict[str, Any] = {}
+    for block in blocks:
+        found = {name: np.concatenate([found[name], column]) if found else column for name, column in block.items()}
+        if len(next(iter(found.values()))) > 1:
+            break
+    return found if found and len(next(iter(found.values()))) else {}
 
 
 def _of_part(leaf: Callable[[Part, Iterable[Chunk]], Any], channels: Channels, part: Part) -> Any:

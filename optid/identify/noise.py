@@ -102,7 +102,12 @@ def noise_spectrum(model: HammersteinSS, w: ArrayLike) -> Array:
 
 
 def colour(model: HammersteinSS, data: Data, lags: int = 25) -> dict[str, Correlation]:
-    """Return {output: whiteness test} of the errors of the simulation with measured feedback, up to so many lags."""
+    """Return {output: whiteness test} of the errors of the simulation with measured feedback, up to so many lags.
+
+    Raises:
+        DataError: the simulation leaves the range of numbers.
+        StructureError: a mode on or outside the unit circle that no output sees.
+    """
     raw = data.raw()
     rest = residuals(replace(model, K=_observer(model), noise=None), raw)
     lags = max(1, min(lags, int(np.sum(~np.isnan(np.vstack(rest)), axis=0).min()) // 4))

@@ -88,7 +88,7 @@ class Tangent:
             return None
         u, s, vt = np.linalg.svd(self.slopes(quantity) @ self.local.scatter, full_matrices=False)
         leading = int(min(LEADING, np.sum(s > MINOR * s[0])))
-        squares = np.sum((u[:, leading:] * s[leading:]) ** 2, axis=1)
+        error = np.linalg.norm(u[:, leading:] * s[leading:], axis=1)
         before = self.objective(_unpacked(self.shapes, self.x))
         here = np.ravel(np.asarray(quantity(self.rebuild(_unpacked(self.shapes, self.x))), dtype=float))
         for turn in vt[:leading]:
@@ -97,8 +97,9 @@ class Tangent:
                     for sign in (1.0, -1.0)]
             if any(end is None for end in ends):
                 return None
-            squares = squares + np.mean(np.square(np.array(ends, dtype=float)), axis=0)
-        return np.sqrt(squares)
+            # without squares, which leave the range of numbers where an unstable model moves a quantity far
+            error = np.hypot(error, np.hypot(*np.sqrt(0.5) * np.array(ends, dtype=float)))
+        return error
 
     def _moved(self, quantity: Quantity, here: Array, step: Array, most: float) -> Array | None:
         """Return the change of a quantity by a step, halved until the objective is at most so large; None if never."""

@@ -207,9 +207,9 @@ def _uncertain(model: Any, data: Data, known: Any, told: Informativity) -> list[
     size = np.where(idle, size.max(axis=1, keepdims=True), size)
 
     def share_of(errors: Array) -> float:
-        error = np.sqrt(np.mean(errors.reshape(shape) ** 2, axis=0))
-        with np.errstate(all="ignore"):
-            return float(np.nanmax(np.where(size > 0, error / size, np.nan), initial=0.0))
+        with np.errstate(all="ignore"):  # squares of shares: those of errors of an unstable response may overflow
+            shares = np.sqrt(np.mean((errors.reshape(shape) / size) ** 2, axis=0))
+            return float(np.nanmax(np.where(size > 0, shares, np.nan), initial=0.0))
 
     share = share_of(found.error)
     if share > UNCERTAIN and hasattr(known.source, "error_within_reach"):  # the linear model may not hold so far

@@ -371,6 +371,8 @@ class HammersteinTF(Model):
         free run gives it. Directions that the record does not determine are set to zero.
         """
         (n, outputs), level = self._state_shape, self.levels is not None
+        if not n:  # without lags there is no state
+            return np.zeros((n, outputs))
         whitened = simulator == "predict" and self.d is not None
         radius = max(self.radius, roots.radius(self.c) if whitened else 0.0)
         forgotten = 10 * n + (int(2 * np.log(FORGOTTEN) / np.log(radius)) if 0 < radius < 1 else 0)

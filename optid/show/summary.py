@@ -8,7 +8,7 @@ import numpy as np
 
 from optid.core.least_squares import RankOneForm
 from optid.data.record import Data
-from optid.errors import DataError
+from optid.errors import DataError, StructureError
 from optid.identify.equation_error import EquationError
 from optid.identify.validation.predictions import predictors
 from optid.identify.verdict import GOOD, GOOD_BLOCK, GOOD_FIT
@@ -287,7 +287,7 @@ def noise_table(fit: "Fit") -> Table | None:
 
     tests: dict[str, Any] = {}
     if isinstance(fit.data, Data):
-        with suppress(DataError):  # a simulation that diverges has no colour
+        with suppress(DataError, StructureError):  # a simulation that diverges, a marginal mode that no output sees
             tests = colour(model, fit.data)
     spread = np.sqrt(np.diag(output_noise(model)))
     own = np.sqrt(np.diag(model.noise.innovation))

@@ -9,7 +9,7 @@ import numpy as np
 
 from optid.arrays import check_finite, check_integers
 from optid.data.channels import Transform
-from optid.data.reading.clock import TimeColumn, seconds
+from optid.data.reading.clock import TimeColumn, over_midnight, seconds
 from optid.data.reading.columns import cell_error, to_numbers, without_marks
 from optid.data.reading.format import Format
 from optid.data.reading.uniform import uniform_step
@@ -59,6 +59,8 @@ class Channels:
                 yield u, y, None
                 continue
             stamps = self.clock.stamps(block, part.label)
+            if self.clock.kind == "times of day":
+                stamps = over_midnight(stamps)
             if last is not None and self.clock.kind == "times of day":
                 day = np.timedelta64(86400 * 10**9, "ns")
                 stamps = stamps + day * np.round(seconds(last - stamps[:1])[0] / 86400 + 0.49)

@@ -21,6 +21,8 @@ NAMES = frozenset({
     "uptime", "runtime", "laufzeit", "secondselapsed", "mjd", "jd", "juliandate", "filetime", "ticks", "timems",
     "zeit", "zeitstempel", "datum", "uhrzeit", "datumuhrzeit", "datumzeit",
     "temps", "horodatage", "heure", "tiempo", "fecha", "fechahora", "hora", "tempo", "tijd", "tijdstip", "tid",
+    "messzeit", "zeitpunkt", "čas", "czas", "aika", "idő", "zaman", "timp", "χρόνος", "время", "час", "时间", "時間",
+    "時刻", "日時", "시간", "milliseconds", "millisekunden", "sekunden",
 })
 """Names of columns of time, in lower case, without unit, blanks and marks."""
 
@@ -30,9 +32,14 @@ _RATES = ("fs", "samplerate", "samplingrate", "samplingfrequency", "samplefreque
 """Names of a single number beside the samples: the sampling time, and the sampling rate."""
 
 _UNIT_WORDS = {word: unit for unit, words in {
-    "s": "s sec secs second seconds sek sekunden", "ms": "ms msec msecs millis millisecond milliseconds",
+    "s": "s sec secs second seconds sek sekunde sekunden segundo segundos seconde secondes secondi seconden sekunder "
+         "sekundy сек с 秒 초",
+    "ms": "ms msec msecs millis millisecond milliseconds millisekunde millisekunden milisegundos millisecondes мс",
     "us": "us µs μs usec usecs µsec μsec microsecond microseconds", "ns": "ns nsec nanosecond nanoseconds",
-    "min": "min mins minute minutes minuten", "h": "h hr hrs hour hours stunden", "d": "d day days tage",
+    "min": "min mins minute minutes minuten minuto minutos minuti minuuten minuter minutter minuty мин 分 분",
+    "h": "h hr hrs hour hours stunden horas heures ore uren timmar godziny ч",  # not hora, heure, ora: a time of day
+    "d": "d day days tage días dias jours giorni dagen dagar dager dage dni дни",
+    "w": "week weeks wk wks woche wochen",
 }.items() for word in words.split()}
 
 _ZONE_WORDS = ("utc", "gmt", "local", "lokal", "cet", "cest", "est", "edt", "pst", "pdt", "relative", "abs", "absolute")
@@ -43,7 +50,8 @@ _DATED = re.compile(r"\d[-/:. ]\d|\d\D+\d")
 FEWEST_HINTS = 5  # cells from which a column may be a clock
 
 _BRACKETS = re.compile(r"(.*?)[ _]*[\[({<]([^\])}>]*)[\])}>]\s*")
-_SUFFIX = re.compile(r"(.*?)(?:[ _.]*/[ _]*| in |[ _.,-]+)([a-zµμ]+)")
+_SUFFIX = re.compile(r"(.*?)(?:[ _.]*/[ _]*| in |[ _.,-]+)([^\W\d_]+)\.?")
+_MULTIPLE = re.compile(r"[\d.,/*×^e -]*\d[\d.,/*×^e -]*([^\W\d_]+)", re.IGNORECASE)
 
 
 class UnreadStamps(DataError):
@@ -177,6 +185,13 @@ def seconds(stamps: np.ndarray) -> np.ndarray:
     return stamps.astype(np.int64) / 1e9 if stamps.dtype.kind in "Mm" else stamps
 
 
+def over_midnight(of_day: np.ndarray) -> np.ndarray:
+    """Return times of day (N,) that go on after midnight."""
+    day = np.timedelta64(1, "D").astype("m8[ns]")
+    back = np.diff(of_day) < -day // 2
+    return of_day + np.concatenate([np.zeros(min(1, of_day.size), int), np.cumsum(back)]) * day
+
+
 def is_time_name(name: str) -> bool:
     """Whether a column is named as a clock, with or without a unit."""
     return _plain(_parts(name)[0]) in NAMES or _plain(name) in NAMES
@@ -253,7 +268,7 @@ def recognise(values: Any, name: str, how: Format, label: str, unit: str = "") -
     if head.dtype.kind in "UO":
         cells = ["" if cell is None else str(cell) for cell in head.tolist()]
         numbers, row = to_numbers(cells, how)
-        if row is not None and row > len(cells) // 2:
+        if row is not None and not dates.formats(cells[row]) and _are_numbers(cells, how) > len(cells) // 2:
             raise NoStamps(f"{where}: row {row + 1} holds {cells[row]!r}, no number like the others.",
                            "Remove the row, or pass time=False and dt=.")
         if row is not None or (how.date_format and how.date_format not in COUNTS):
@@ -263,6 +278,19 @@ def recognise(values: Any, name: str, how: Format, label: str, unit: str = "") -
     if numbers.dtype.kind not in "iuf":
         raise NoStamps(f"{where}: time stamps of type {numbers.dtype} cannot be read; convert them to seconds.")
     return _of_numbers(numbers, name, how, unit, where)
+
+
+def _are_numbers(cells: Sequence[str], how: Format) -> int:
+    """Return how many cells are numbers."""
+    return sum(to_numbers([cell], how)[1] is None for cell in cells)
+
+
+def _odd_date(cells: Sequence[str]) -> str | None:
+    """Return the first cell that is no date like the first one that is; None where most are no dates."""
+    first = next(filter(dates.formats, cells), None)
+    if first is None or 2 * sum(map(bool, map(dates.formats, cells))) <= len(cells):
+        return None
+    return next((cell for cell in cells if not dates.agreed_format([first, cell]) or not dates.formats(cell)), None)
 
 
 def _of_texts(cells: Sequence[str], name: str, how: Format, where: str) -> TimeColumn:
@@ -275,9 +303,11 @@ def _of_texts(cells: Sequence[str], name: str, how: Format, where: str) -> TimeC
         given = "%M:%S"
     found = [given] if given else dates.agreed_format(full)
     if not found:
-        odd = next((cell for cell in full if dates.formats(first) and not dates.formats(cell)), None)
-        what = f"(first: {first!r})" if odd is None else f"(first: {first!r}; then {odd!r})"
-        raise NoStamps(f"{where}: the stamps {what} are neither numbers nor ISO dates such as 2024-05-01T12:00:00.",
+        if (odd := _odd_date(full)) is not None:
+            raise NoStamps(f"{where}: row {cells.index(odd) + 1} holds {odd!r}, no date like the others.",
+                           "Remove the row, or write all dates alike.")
+        raise NoStamps(f"{where}: the stamps (first: {first!r}) are neither numbers nor ISO dates such as "
+                       "2024-05-01T12:00:00.",
                        "Name their format (date_format='%d.%m.%Y %H:%M:%S'), convert them to seconds, or pass "
                        "time=False and dt=.")
     if not given and not dates.is_unambiguous(found[0]):
@@ -308,6 +338,10 @@ def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str, where: st
         if start is not None:
             return TimeColumn((name,), "numbers", how, scale, -start / scale, finding=f"clock {name!r}: {unit}")
     unknown = _unknown_unit(name)
+    multiple = _MULTIPLE.fullmatch(unknown.lower())
+    if multiple and multiple[1] in _UNIT_WORDS:
+        raise DataError(f"{where}: its name says that it counts steps of {unknown!r}. Convert it to seconds, or pass "
+                        "time=False and dt=.")
     base = "mjd" if unknown.lower() == "mjd" else _plain(base)
     found = meaning(finite, name, base, word or stated, how.date_format, where)
     finding = found.finding
@@ -319,7 +353,7 @@ def _of_numbers(values: np.ndarray, name: str, how: Format, unit: str, where: st
 def _unknown_unit(name: str) -> str:
     """Return what stands in brackets behind a name, unless it is a unit of time or a time zone."""
     found = _BRACKETS.fullmatch(name.strip())
-    text = found[2].strip() if found else ""
+    text = found[2].strip(" .") if found else ""
     return "" if text.lower() in (*_UNIT_WORDS, *_ZONE_WORDS) or "/" in text else text
 
 
@@ -329,8 +363,8 @@ def _parts(name: str) -> tuple[str, str]:
     for pattern in (_BRACKETS, _SUFFIX):
         found = pattern.fullmatch(text)
         if found and (pattern is _BRACKETS or found[2] in _UNIT_WORDS):
-            return found[1], _UNIT_WORDS.get(found[2].strip(), "")
-    return text, "s" if text in ("seconds", "sec", "secs") else ""
+            return found[1], _UNIT_WORDS.get(found[2].strip(" ."), "")
+    return text, _UNIT_WORDS.get(text, "")
 
 
 def _plain(name: str) -> str:

@@ -172,7 +172,7 @@ def to_numbers(cells: Sequence[str], how: Format) -> tuple[np.ndarray, int | Non
 
 def without_marks(samples: np.ndarray, how: Format) -> np.ndarray:
     """Return samples with NaN in place of the numbers that mark missing ones."""
-    marks = [mark for mark in how.numbers if np.isfinite(mark)]
+    marks = [mark for mark in how.numbers if not np.isnan(mark)]
     if not marks:
         return samples
     lost = np.isin(samples, marks)
@@ -211,12 +211,15 @@ def cell_error(where: str, cell: str, how: Format, around: Sequence[Sequence[str
         return DataError(f"{where} holds {cell!r}, not a number. Write 0 and 1 in place of words for off and on.")
     if re.fullmatch(r"[+-]?[\d.,]+ *[A-Za-z%°µΩ/]+", text) and not re.fullmatch(r"[+-]?[\d.,]+ *[eEdD][+-]?\d*", text):
         return DataError(f"{where} holds {cell!r}, a number with its unit. Remove the unit from the cells.")
+    if re.fullmatch(r"[+-]?\d*\.?\d+[dD][+-]?\d+", text):
+        return DataError(f"{where} holds {cell!r}, an exponent of Fortran. Write E in place of D.")
     if row and all(one.strip() and not any(sign.isdigit() for sign in one) for one in row) and len(row) > 2:
         return DataError(f"{where} holds {cell!r}, not a number. The whole row is text ({', '.join(row)[:60]}): a row "
                          "of units or another header inside the table; remove it.")
-    if not any(sign.isdigit() for sign in text):
+    if "#" in text or not any(sign.isdigit() for sign in text):
         marks = dict.fromkeys(one.strip() for column in around for one in column
-                              if not any(sign.isdigit() for sign in one) and not how.is_missing(one))
+                              if ("#" in one or not any(sign.isdigit() for sign in one))
+                              and not how.is_missing(one))
         marks = [text] if not marks or len(marks) > 8 else list(marks)
         words["missing"] = ",".join([*how.missing, *marks])
         hint = "Leave the cell blank where a sample is missing, or name the words of missing samples"

@@ -18,7 +18,7 @@ TIME_TOLERANCE = 0.01  # a time step may deviate from the median step by this sh
 
 GAPS = ("missing", "experiments")
 
-UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0}
+UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
 """Seconds in a unit of time."""
 
 _DURATION = re.compile(r"([0-9.eE+-]+)\s*([a-zµ]*)")

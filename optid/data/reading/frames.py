@@ -34,6 +34,10 @@ def frame_names(label: str, frame: Any) -> tuple[list[str], Any]:
     if len(set(names)) < len(names):
         double = next(name for k, name in enumerate(names) if name in names[:k])
         raise DataError(f"{label} has two columns named {double!r}: rename one.")
+    half = [k for k, name in enumerate(names) if any("\ud800" <= sign <= "\udfff" for sign in name)]
+    if half:  # on which pandas fails wherever it infers the type of the names
+        raise DataError(f"{label}: the name of column {half[0]} is {names[half[0]]!r}, which holds half a character; "
+                        "rename it.")
     if names != list(table.columns):  # names that are no text
         frame = frame.rename(columns=dict(zip(table.columns, names)))
         table = nw.from_native(frame, eager_only=True)

@@ -30,9 +30,10 @@ LONGEST_UNIT = 10  # characters; a longer text describes the channel
 LONGEST_MARK = 20  # characters of a word that may mark a missing sample
 
 _NUMERIC = re.compile(r"[+-]?[\d.,' \u00a0]*\d[\d.,' \u00a0]*(?:[eEdD][+-]?\d+)?")
-_POINT = re.compile(r"[+-]?\d*\.\d*(?:[eE][+-]?\d+)?")
+_POINT = re.compile(r"[+-]?(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _GROUPED = re.compile(r"[+-]?\d{1,3}(?:[ '\u00a0]\d{3})+(?:[.,]\d*)?")
 _COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+_TRIPLES = re.compile(r"[+-]?\d{1,3}(?:\.\d{3})*")  # numbers with a decimal point, or points between thousands
 
 
 @dataclass(frozen=True)
@@ -260,7 +261,7 @@ def _text_rows(rows: Sequence[_Row], names: Sequence[str], how: Format) -> tuple
     texts = rows[:count] if any(map(_is_value, rows[count].cells if count < len(rows) else ())) else []
     for row in texts if how.units_row is None else texts[how.units_row - 1 : how.units_row] if how.units_row else []:
         cells = [cell.strip().strip("[]()") for cell in row.cells]
-        if how.units_row or max(map(len, cells)) <= LONGEST_UNIT:
+        if how.units_row or (max(map(len, cells)) <= LONGEST_UNIT and cells != list(names)):
             return texts, dict(zip(names, cells))
     return texts, {}
 
@@ -285,6 +286,8 @@ def _first(column: Sequence[str], how: Format) -> str:
 def _propose(columns: dict[str, tuple[str, ...]], dated: Sequence[str], how: Format, needed: dict[str, Any]) -> None:
     """Add the words to type: decimal mark, thousands, words of missing samples, format of dates."""
     words: list[str] = []
+    points = any(_POINT.fullmatch(cell.strip()) and not _TRIPLES.fullmatch(cell.strip())
+                 for name, column in columns.items() if name not in dated for cell in column)
     for name, column in columns.items():
         cells = [cell.strip() for cell in column if not how.is_missing(cell)]
         if name in dated:
@@ -304,7 +307,8 @@ def _propose(columns: dict[str, tuple[str, ...]], dated: Sequence[str], how: For
             elif any(re.fullmatch(r"[+-]?\d{1,3}(\.\d{3})+,\d*", cell) for cell in values):
                 needed |= {"decimal": ",", "thousands": "."}
             elif (commas := list(filter(_COMMA.fullmatch, values))) and not any(map(_POINT.fullmatch, values)):
-                if how.delimiter == "," and all(re.fullmatch(r"[+-]?[1-9]\d{0,2},\d{3}", cell) for cell in commas):
+                triples = all(re.fullmatch(r"[+-]?[1-9]\d{0,2}(,\d{3})+", cell) for cell in commas)
+                if triples and (points or how.delimiter == ","):
                     needed["thousands"] = ","
                 else:
                     needed["decimal"] = ","

@@ -1,9 +1,12 @@
 """Files of plants and test rigs that libraries of the extra `plant` read: Excel, LabVIEW TDMS and ASAM MDF."""
 
+import gc
+import sys
+import traceback
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,8 +18,17 @@ LIBRARIES = {".xlsx": "fastexcel", ".tdms": "npTDMS", ".mf4": "asammdf"}
 """The library that reads each kind of file."""
 
 
-def plant_tables(path: Path, kind: str) -> list[tuple[str, Any, Mapping[str, str] | None]]:
-    """Return the label, a frame and the units of the channels of each table of a file.
+class PlantTable(NamedTuple):
+    """A table of a file."""
+
+    label: str
+    frame: Any
+    units: Mapping[str, str] = {}
+    findings: tuple[str, ...] = ()  # what is worth saying of the file
+
+
+def plant_tables(path: Path, kind: str) -> list[PlantTable]:
+    """Return the tables of a file.
 
     An Excel file has one table for each sheet; a TDMS file one for each group; an MDF file one for each group of
     channels with a clock of its own.
@@ -34,28 +46,42 @@ def plant_tables(path: Path, kind: str) -> list[tuple[str, Any, Mapping[str, str
     except (DataError, MemoryError):
         raise
     except Exception as error:  # whatever a library raises on a damaged file
+        _dispose(error)
         raise DataError(f"{path.name} is damaged, or not a file of kind {kind}: {str(error)[:300]}") from error
     if not found:
         raise DataError(f"{path.name} holds no samples.")
     return found
 
 
-def _of_excel(path: Path) -> list[tuple[str, Any, None]]:
+def _dispose(error: Exception) -> None:
+    """Let go of what a reader left half built; what its finalisers then raise would be printed as a traceback."""
+    shown, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        while error is not None:
+            traceback.clear_frames(error.__traceback__)
+            error = error.__context__  # type: ignore[assignment]
+        gc.collect()  # they refer to one another
+    finally:
+        sys.unraisablehook = shown
+
+
+def _of_excel(path: Path) -> list[PlantTable]:
     import fastexcel  # noqa: F401 - the reader that polars uses
     import polars as pl
 
     sheets: dict[str, Any] = pl.read_excel(path, sheet_id=0, raise_if_empty=False)
     full = {name: frame for name, frame in sheets.items() if frame.width}
-    return [(path.name if len(full) == 1 else f"{path.name}, sheet {name!r}", frame, None)
+    return [PlantTable(path.name if len(full) == 1 else f"{path.name}, sheet {name!r}", frame)
             for name, frame in full.items()]
 
 
-def _of_tdms(path: Path) -> list[tuple[str, Any, Mapping[str, str]]]:
+def _of_tdms(path: Path) -> list[PlantTable]:
     import polars as pl
     from nptdms import TdmsFile
 
-    found = []
-    for group in TdmsFile.read(path).groups():
+    found, file = [], TdmsFile.read(path)
+    cut = ("the file ends within a segment: its last samples are lost",) * file.file_status.incomplete_final_segment
+    for group in file.groups():
         channels = {channel.name: channel for channel in group.channels() if len(channel)}
         if not channels:
             continue
@@ -67,8 +93,13 @@ def _of_tdms(path: Path) -> list[tuple[str, Any, Mapping[str, str]]]:
         if clock is not None:
             columns = {"time (s)": _waveform_time(clock)} | columns
         units = {name: str(channel.properties.get("unit_string", "")) for name, channel in channels.items()}
-        found.append((f"{path.name}, group {group.name!r}", pl.DataFrame(columns), units))
-    return [(path.name, *found[0][1:])] if len(found) == 1 else found
+        found.append(PlantTable(f"{path.name}, group {group.name!r}", pl.DataFrame(columns), units, cut))
+    return _named(path, found)
+
+
+def _named(path: Path, found: list[PlantTable]) -> list[PlantTable]:
+    """Name the only table of a file after the file."""
+    return [found[0]._replace(label=path.name)] if len(found) == 1 else found
 
 
 def _waveform_time(channel: Any) -> np.ndarray:
@@ -81,7 +112,7 @@ def _waveform_time(channel: Any) -> np.ndarray:
     return start.astype("M8[ns]") + np.round(seconds * 1e9).astype("m8[ns]")
 
 
-def _of_mdf(path: Path) -> list[tuple[str, Any, Mapping[str, str]]]:
+def _of_mdf(path: Path) -> list[PlantTable]:
     import polars as pl
     from asammdf import MDF
 
@@ -93,5 +124,5 @@ def _of_mdf(path: Path) -> list[tuple[str, Any, Mapping[str, str]]]:
             columns: dict[str, Any] = {"time (s)": group.index.to_numpy(dtype=float)}
             columns |= {str(name): group[name].to_numpy() for name in group.columns if group[name].dtype.kind in "iufb"}
             units = {channel.name: channel.unit or "" for channel in file.groups[number].channels}
-            found.append((f"{path.name}, group {number}", pl.DataFrame(columns), units))
-    return [(path.name, *found[0][1:])] if len(found) == 1 else found
+            found.append(PlantTable(f"{path.name}, group {number}", pl.DataFrame(columns), units))
+    return _named(path, found)

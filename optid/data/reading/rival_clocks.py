@@ -5,15 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from optid.data.reading.clock import NoStamps, TimeColumn, recognise, seconds
-from optid.data.reading.sources import Table
+from optid.data.reading.clock import NoStamps, TimeColumn, over_midnight, recognise, seconds
+from optid.data.reading.sources import Source, Table
 from optid.data.reading.uniform import COARSE, repeated
 from optid.errors import DataError
 
 AGREEMENT = 1e-3  # share of the span by which two clocks may differ, beyond one step of the coarser one
 
 
-def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: bool
+def settle(block: Mapping[str, Any], names: Sequence[str], table: Table | Source, asked: bool
            ) -> tuple[TimeColumn, np.ndarray, list[str]]:
     """Return the clock that some columns hold, its stamps (N,), and findings.
 
@@ -56,7 +56,7 @@ def settle(block: Mapping[str, Any], names: Sequence[str], table: Table, asked: 
     return clock, stamps, [clock.finding] * bool(clock.finding) + said
 
 
-def _paired(found: list[tuple[TimeColumn, np.ndarray]], block: Mapping[str, Any], table: Table
+def _paired(found: list[tuple[TimeColumn, np.ndarray]], block: Mapping[str, Any], table: Table | Source
             ) -> list[tuple[TimeColumn, np.ndarray]]:
     """Join a column of dates without a time of day, and one of times of day."""
     hours = [one for one in found if one[0].kind == "times of day" or (one[1].dtype.kind == "m" and (
@@ -64,7 +64,7 @@ def _paired(found: list[tuple[TimeColumn, np.ndarray]], block: Mapping[str, Any]
     days = [one for one in found if hours and one[1].dtype.kind == "M"
             and not (one[1] - one[1].astype("M8[D]")).any()]
     if not days:
-        return [(clock, _unwrapped(stamps) if clock.kind == "times of day" else stamps) for clock, stamps in found]
+        return [(clock, over_midnight(stamps) if clock.kind == "times of day" else stamps) for clock, stamps in found]
     (day, dates), (hour, of_day) = days[0], hours[0]
     if day.kind == "ready":
         clock = TimeColumn((day.columns[0],), "ready", table.how)
@@ -73,13 +73,6 @@ def _paired(found: list[tuple[TimeColumn, np.ndarray]], block: Mapping[str, Any]
         clock = TimeColumn((day.columns[0], hour.columns[0]), "dates", table.how, forms=(day.forms[0], hour.forms[0]))
         stamps = clock.stamps(block, table.label)
     return [(clock, stamps), *(one for one in found if one not in (days[0], hours[0]))]
-
-
-def _unwrapped(of_day: np.ndarray) -> np.ndarray:
-    """Return times of day that go on after midnight."""
-    day = np.timedelta64(1, "D").astype("m8[ns]")
-    back = np.diff(of_day) < -day // 2
-    return of_day + np.concatenate([[0], np.cumsum(back)]) * day
 
 
 def _agree(one: np.ndarray, other: np.ndarray) -> bool:

@@ -126,8 +126,8 @@ def _file_tables(path: Path, kind: str, how: Format) -> list[Table]:
     if kind in PLANT:
         from optid.data.reading.plant_files import plant_tables
 
-        return [_of_frame(label, frame, how) if units is None else replace(_of_frame(label, frame, how), units=units)
-                for label, frame, units in plant_tables(path, kind)]
+        return [replace(_of_frame(one.label, one.frame, how), units=one.units, findings=one.findings)
+                for one in plant_tables(path, kind)]
     return [_of_mat(path, how)]
 
 

@@ -113,6 +113,9 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
         return [Piece(stamps[0], u, y)], dt, [_check_spread(stamps, dt, label)]
     if how.gaps is None or stamps.size < 2:
         said = []
+        if repeated(stamps) > COARSE and _are_copies(stamps, u, y):
+            raise DataError(f"{label}: rows that share a time stamp are equal: pass gaps='missing' to count each once, "
+                            "or dt= where they are samples of their own.")
         if stamps.size > 1 and stamps[1] < stamps[0] and (seconds(np.diff(stamps)) < 0).all():
             stamps, u, y = stamps[::-1], u[::-1].copy(), y[::-1].copy()
             said = ["the newest sample came first: the rows are turned round"]
@@ -127,6 +130,15 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
 def repeated(stamps: np.ndarray) -> float:
     """Return the share of stamps that are equal to the one before."""
     return float(np.mean(stamps[1:] == stamps[:-1])) if stamps.size > 1 else 0.0
+
+
+def _are_copies(stamps: np.ndarray, u: np.ndarray, y: np.ndarray) -> bool:
+    """Whether all rows with the stamp of the row before are equal to it, on a record that is not constant."""
+    same = stamps[1:] == stamps[:-1]
+    equal = np.ones(same.size, dtype=bool)
+    for column in (*u.T, *y.T):
+        equal &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+    return bool(equal[same].all()) and not equal[~same].all()
 
 
 def _check_whole(stamps: np.ndarray, label: str, first: int) -> None:
