@@ -51,8 +51,8 @@ from optid.identify.prediction_error.tangent_fit import Places, with_signs
 from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.steps import subspace_steps
 from optid.models import HammersteinSS
+from optid.program.sizes import GAUGE
 from optid.program.solution import Bound, Status
-from optid.program.structure import GAUGE
 from optid.program.units import outer_bases
 from optid.program.view import View
 from optid.solving.solve import Evidence, Procedure

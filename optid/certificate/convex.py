@@ -22,8 +22,8 @@ from optid.core.least_squares import LeastSquaresForm, LinearForm
 from optid.core.problem import Problem
 from optid.core.terms import Values, flat
 from optid.program.expressions import differences
+from optid.program.sizes import variable_size
 from optid.program.solution import Bound, relative_gap
-from optid.program.structure import variable_size
 from optid.structures.multipliers import least_distance
 
 CLOSED = 1e-6  # relative gap up to which a convex programme counts as solved to its optimum

@@ -19,8 +19,8 @@ from optid.core.leaves import LeafSpace
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
 from optid.program.prices import ACTIVE
+from optid.program.sizes import relative_gradient, variable_size
 from optid.program.solution import Residuals
-from optid.program.structure import relative_gradient, variable_size
 from optid.structures.multipliers import fit_multipliers
 
 UNCONFIRMED = 1e-7  # stationarity above which multipliers fitted to the point are tried as well

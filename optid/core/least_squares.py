@@ -12,7 +12,7 @@ from optid.arrays import Array
 from optid.core.form import Form
 from optid.core.problem import Problem
 from optid.core.terms import Squares
-from optid.program.structure import GAUGE
+from optid.program.sizes import GAUGE
 from optid.structures.rank_one import Point, RankOne
 
 

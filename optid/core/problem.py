@@ -14,8 +14,8 @@ from optid.core.constraint import Constraint, ConstraintReader
 from optid.core.leaves import DENSE, Affine, Leaf, LeafSpace, Product, slices_of
 from optid.core.terms import Errors, Expressed, Squares, Term, Values, flat
 from optid.errors import StructureError, nearest
+from optid.program.sizes import GAUGE
 from optid.program.solution import Bound
-from optid.program.structure import GAUGE
 from optid.program.view import View
 
 TRIALS = 5  # random points at which constraints are compared with those of the opposite signs

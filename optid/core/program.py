@@ -15,7 +15,7 @@ from optid.core.low_rank import LowRank
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values, stacked_expression, sum_of
 from optid.errors import StructureError
-from optid.program.structure import GAUGE
+from optid.program.sizes import GAUGE
 from optid.program.view import View
 
 MAX_SIZE = 700  # multipliers up to which the semidefinite relaxation is tried
@@ -23,7 +23,7 @@ AFFINE = frozenset({"zero", "below"})  # cones of constraints that are rows
 
 
 @dataclass(frozen=True, eq=False)
-class Statement:
+class CvxpyStatement:
     """A problem in CVXPY.
 
     Attributes:
@@ -41,7 +41,7 @@ class Statement:
     view: View
 
     @classmethod
-    def of(cls, problem: Problem) -> "Statement":
+    def of(cls, problem: Problem) -> "CvxpyStatement":
         """State a problem.
 
         Raises:
@@ -136,9 +136,9 @@ class Program:
         vars(self).update(state)
 
     @cached_property
-    def statement(self) -> Statement:
+    def statement(self) -> CvxpyStatement:
         """The problem in CVXPY; it begins with the values that were assigned."""
-        made = Statement.of(self.core)
+        made = CvxpyStatement.of(self.core)
         if (held := vars(self).get("_held")) is not None:
             _assign(made, held)
         return made
@@ -272,7 +272,7 @@ class Program:
                     dual.value = None
 
 
-def _assign(statement: Statement, values: Values) -> None:
+def _assign(statement: CvxpyStatement, values: Values) -> None:
     for name, value in values.items():
         variable = statement.variables[name]  # a point just outside its own bounds is to be judged, not refused
         variable.save_value(np.asarray(value, dtype=float).reshape(variable.shape, order="F"))

@@ -18,8 +18,8 @@ from optid.core.leaves import Product
 from optid.core.problem import Problem
 from optid.core.program import Program
 from optid.core.terms import Values, flat
+from optid.program.sizes import GAUGE
 from optid.program.solution import Solution, Status
-from optid.program.structure import GAUGE
 from optid.solving.solve import solve
 
 STEPS = 1000

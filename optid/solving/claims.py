@@ -14,8 +14,8 @@ from optid.core.judge import judge
 from optid.core.least_squares import RankOneForm
 from optid.core.program import Program
 from optid.core.terms import Squares, Values
+from optid.program.sizes import GAUGE
 from optid.program.solution import GRADIENT, Bound, Residuals, Solution, Status, relative_gap, tolerance
-from optid.program.structure import GAUGE
 from optid.solving.answers import answer_of
 from optid.solving.proofs import proof_of
 
