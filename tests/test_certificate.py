@@ -10,7 +10,7 @@ from scripts import benchmark
 
 from optid.certificate.ladder import certify
 from optid.certificate.minors import basis_from, cholesky, free_mask, project_minors, tangent_minors
-from optid.certificate.shape_duals import Linear, sign_free_cut
+from optid.certificate.shape_duals import LinearRows, sign_free_cut
 from optid.errors import StructureError
 from optid.structures.bilinear import best_of, minimise
 from optid.structures.rank_one import Point, RankOne, reduce
@@ -263,7 +263,7 @@ def test_a_point_outside_its_constraints_is_never_proved():
         assert not bound.proved and "violates" in bound.reason
     row = np.ones((1, len(problem.target)))
     right = np.array([row[0] @ free.lift() - 1.0])
-    assert not certify(problem, free, linear=Linear(row, right, np.array([False]))).bound.proved
+    assert not certify(problem, free, linear=LinearRows(row, right, np.array([False]))).bound.proved
 
 
 def test_constrained_optimum_is_not_proved_without_its_cone_and_no_cone_is_needed_when_inactive():
@@ -289,7 +289,7 @@ def test_lifted_equality_agrees_with_elimination(seed):
     point = Point(np.r_[fixed, found.point.w], found.point.mus, found.point.bs)
     row = np.zeros((1, n + 1))
     row[0, 0] = 1.0
-    linear = Linear(row, np.array([fixed]), np.array([True]))
+    linear = LinearRows(row, np.array([fixed]), np.array([True]))
     lifted = certify(problem, point, linear=linear, effort="ascent").bound
     direct = certify(substituted, found.point, effort="ascent").bound
     assert lifted.proved == direct.proved
@@ -310,11 +310,11 @@ def test_lifted_inequality_is_used_only_in_its_direction():
     inner = minimise(RankOne(np.triu(triangle[:n, :n]), triangle[:n, n], problem.remainder + triangle[n, n] ** 2,
                              problem.blocks, 1)).point
     point = Point(np.r_[limit, inner.w], inner.mus, inner.bs)
-    at_limit = certify(shifted, point, linear=Linear(row, limit, np.array([False])))
+    at_limit = certify(shifted, point, linear=LinearRows(row, limit, np.array([False])))
     assert at_limit.bound.proved
     assert at_limit.bound.multipliers.linear[0] > 0
-    assert not certify(shifted, point, linear=Linear(-row, -limit, np.array([False]))).bound.proved
-    inactive = certify(shifted, free, linear=Linear(row, limit + 10.0, np.array([False])))
+    assert not certify(shifted, point, linear=LinearRows(-row, -limit, np.array([False]))).bound.proved
+    inactive = certify(shifted, free, linear=LinearRows(row, limit + 10.0, np.array([False])))
     assert inactive.bound.proved and inactive.bound.multipliers.linear[0] == 0
 
 
@@ -327,7 +327,7 @@ def test_sign_of_b_as_a_lifted_constraint_with_a_cone():
     value = float(row[0] @ found.point.lift())
     for effort in ("ascent", "sdp"):
         result = certify(problem, found.point, cones={0: increments}, effort=effort,
-                         linear=Linear(np.sign(value) * -row, np.zeros(1), np.array([False])))
+                         linear=LinearRows(np.sign(value) * -row, np.zeros(1), np.array([False])))
         assert result.bound.value <= found.value * (1 + 1e-9)
     assert result.bound.proved
 
@@ -337,5 +337,5 @@ def test_bad_arguments_are_named():
     point = minimise(problem).point
     refuses(StructureError, "cone 0", certify, problem, point, cones={0: np.ones((2, 3))})
     with pytest.raises(StructureError, match=r"E \(r, 14\)"):
-        certify(problem, point, linear=Linear(np.ones((1, 3)), np.ones(1), np.ones(1, bool)))
+        certify(problem, point, linear=LinearRows(np.ones((1, 3)), np.ones(1), np.ones(1, bool)))
     refuses(StructureError, "effort", certify, problem, point, effort="all")

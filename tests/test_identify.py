@@ -24,7 +24,7 @@ from optid.identify.search import trial as trying
 from optid.identify.search.cpu_limit import OutOfTime, cpu_limit
 from optid.identify.search.determined import determined_bases
 from optid.identify.search.ladder import RUNGS, Ladder
-from optid.identify.search.pool import Pool
+from optid.identify.search.pool import TrialPool
 from optid.identify.search.trial import (
     CLEAR,
     FEEDBACK,
@@ -517,7 +517,7 @@ def test_two_outputs():
 @pytest.mark.parametrize("count", [1, 3])
 def test_a_pool_returns_results_in_order_and_stops_at_its_deadline(count):
     told = []
-    pool = Pool(slow_square, count)
+    pool = TrialPool(slow_square, count)
     try:
         assert pool.run(range(7), lambda: FOREVER, told.append) == [x * x for x in range(7)]
         assert sorted(told) == [x * x for x in range(7)]
@@ -527,7 +527,7 @@ def test_a_pool_returns_results_in_order_and_stops_at_its_deadline(count):
 
 
 def test_a_pool_survives_the_death_of_a_process():
-    pool = Pool(die_of_one, 2)
+    pool = TrialPool(die_of_one, 2)
     try:
         found = pool.run([0, 1, 2, 3], lambda: FOREVER, lambda result: None)
         assert found[1] is None and [x for x in found if x is not None] == [0, 2, 3]
@@ -537,14 +537,14 @@ def test_a_pool_survives_the_death_of_a_process():
 
 def test_what_hangs_ends_with_the_time(monkeypatch):
     monkeypatch.setattr("optid.identify.search.pool.GRACE", 3.0)
-    pool = Pool(hang, 2)
+    pool = TrialPool(hang, 2)
     assert pool.run([0, 1], lambda: 1e-6, lambda result: None) == [0, None]
     pool.close()
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_a_trial_raises_in_a_process_is_raised_here(count):
-    pool = Pool(fail, count)
+    pool = TrialPool(fail, count)
     with pytest.raises(ZeroDivisionError, match="of 7"):
         pool.run([7], lambda: FOREVER, lambda result: None)
     pool.close()

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from optid.backends.admm import minimise
-from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
+from optid.structures.nuclear_norm import KnownSignals, NuclearProblem, window_starts
 
 FORMS = ("plain", "predictor", "projection", "weighted")
 
@@ -33,7 +33,7 @@ def made(form="predictor", *, samples=28, outputs=2, inputs=1, rows=4, missing=0
         return problem
     if form == "predictor":
         direct = np.array([True] * inputs + [False] * outputs)
-        return NuclearProblem(measured, starts, rows, predictor=Predictor(windows, direct, True))
+        return NuclearProblem(measured, starts, rows, predictor=KnownSignals(windows, direct, True))
     known = np.vstack([windows[:, :inputs].reshape(-1, len(starts)), np.ones(len(starts))])
     complement = np.linalg.svd(known.T)[0][:, len(known) :]
     if form == "projection":

@@ -14,7 +14,14 @@ import numpy as np
 
 from optid.certificate.minors import Block, Quadratic, ascend, free_mask, project_minors, rotation, tangent_minors
 from optid.certificate.sdp import relax, relaxation_size
-from optid.certificate.shape_duals import ACTIVE, Linear, align_cuts, check_constraints, kkt_multipliers, sign_free_cut
+from optid.certificate.shape_duals import (
+    ACTIVE,
+    LinearRows,
+    align_cuts,
+    check_constraints,
+    kkt_multipliers,
+    sign_free_cut,
+)
 from optid.errors import StructureError
 from optid.program.solution import Bound, relative_gap
 from optid.structures.rank_one import Array, Core, Point, RankOne, matrices, reduce
@@ -47,7 +54,7 @@ class Certification:
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class LadderCase:
     """What the stages share, in whitened coordinates around the point; block indices are those of the core."""
 
     core: Core
@@ -57,7 +64,7 @@ class Case:
     cones: dict[int, Array]
     nu: dict[int, Array]  # KKT multipliers (r_i,) of the cones
     lam: Array  # and (r,) of the linear constraints
-    linear: Linear
+    linear: LinearRows
 
     @cached_property
     def blocks(self) -> list[Block]:
@@ -104,8 +111,9 @@ class Case:
         return form
 
 
-def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None = None, linear: Linear | None = None,
-            effort: str = "sdp", steps: int = 100, max_size: int = 700) -> Certification:
+def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None = None,
+            linear: LinearRows | None = None, effort: str = "sdp", steps: int = 100, max_size: int = 700
+            ) -> Certification:
     """Bound the global optimum from below and try to prove that a local solution attains it.
 
     Args:
@@ -127,7 +135,7 @@ def certify(problem: RankOne, point: Point, *, cones: Mapping[int, Array] | None
         raise StructureError(f"effort must be one of {EFFORTS}, not {effort!r}")
     if not cones and (linear is None or not len(linear.right)):
         return _remembered(problem, point, effort, steps, max_size)
-    return _climb(problem, point, cones or {}, linear or Linear.none(len(problem.target)), effort, steps, max_size)
+    return _climb(problem, point, cones or {}, linear or LinearRows.none(len(problem.target)), effort, steps, max_size)
 
 
 def _remembered(problem: RankOne, point: Point, effort: str, steps: int, max_size: int) -> Certification:
@@ -136,13 +144,13 @@ def _remembered(problem: RankOne, point: Point, effort: str, steps: int, max_siz
     for reached, found in problem.proofs:
         if abs(value - reached) <= SAME * reached:
             return found
-    found = _climb(problem, point, {}, Linear.none(len(problem.target)), effort, steps, max_size)
+    found = _climb(problem, point, {}, LinearRows.none(len(problem.target)), effort, steps, max_size)
     if found.bound.proved:
         problem.proofs[:] = [(value, found)]
     return found
 
 
-def _climb(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: Linear, effort: str, steps: int,
+def _climb(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: LinearRows, effort: str, steps: int,
            max_size: int) -> Certification:
     """Certify rung by rung, up to the last one requested or the first that proves the point."""
     check_constraints(cones, linear, problem)
@@ -171,7 +179,7 @@ def _climb(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: L
     return relaxed(case, found, steps)
 
 
-def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: Linear) -> Case:
+def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: LinearRows) -> LadderCase:
     """Reduce, whiten, find the KKT multipliers and add the linear terms to the objective."""
     keep_linear = bool(linear.rows[:, :problem.linear].any())
     keep = tuple(range(len(problem.blocks)) if len(linear.right) else cones)
@@ -191,12 +199,12 @@ def prepare(problem: RankOne, point: Point, cones: Mapping[int, Array], linear: 
     if len(linear.right):
         linear = replace(linear, rows=core.whitening.columns(linear.rows[:, 0 if keep_linear else problem.linear:]))
     else:
-        linear = Linear.none(len(z))
+        linear = LinearRows.none(len(z))
     nu, lam = kkt_multipliers(slope, at, white, linear)
-    return Case(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear)
+    return LadderCase(core, mus, bs, Quadratic(core.gram, z, slope, value), white, nu, lam, linear)
 
 
-def tangent(case: Case, cuts: dict[int, Array]) -> Array:
+def tangent(case: LadderCase, cuts: dict[int, Array]) -> Array:
     """Minors that cancel the rest of the gradient at the point, block by block; none for a block that is zero."""
     slope = case.lagrangian().slope - case.cut_form(cuts) @ case.objective.z
     minors = np.zeros_like(case.objective.gram)
@@ -209,7 +217,7 @@ def tangent(case: Case, cuts: dict[int, Array]) -> Array:
     return minors
 
 
-def rise(case: Case, minors: Array, cuts: dict[int, Array], steps: int) -> tuple[Array | None, int]:
+def rise(case: LadderCase, minors: Array, cuts: dict[int, Array], steps: int) -> tuple[Array | None, int]:
     """Ascent from given multipliers that cancel the gradient; improved minors, or None, and the steps taken."""
     matrix = case.objective.gram + minors - case.cut_form(cuts)
     turn = rotation(case.core.linear, case.mus, case.bs)
@@ -217,7 +225,7 @@ def rise(case: Case, minors: Array, cuts: dict[int, Array], steps: int) -> tuple
     return (None if free is None else minors + onto_minors(case, turn @ free @ turn.T)), taken
 
 
-def onto_minors(case: Case, matrix: Array) -> Array:
+def onto_minors(case: LadderCase, matrix: Array) -> Array:
     """Remove the roundoff of a change of coordinates: exactly a combination of minors again."""
     clean = np.zeros_like(matrix)
     for where, shape in case.blocks:
@@ -225,7 +233,7 @@ def onto_minors(case: Case, matrix: Array) -> Array:
     return clean
 
 
-def relaxed(case: Case, found: Certification, steps: int) -> Certification:
+def relaxed(case: LadderCase, found: Certification, steps: int) -> Certification:
     """The SDP: its bound made valid by shrinking, then its multipliers aligned with the point for an exact proof."""
     method = "product cuts" if case.cones else "sdp"
     solved = relax(case.objective, case.blocks, case.cones, case.linear)
@@ -252,7 +260,7 @@ def relaxed(case: Case, found: Certification, steps: int) -> Certification:
     return found
 
 
-def free_part(case: Case, minors: Array) -> Array:
+def free_part(case: LadderCase, minors: Array) -> Array:
     """The part of a combination of minors that does not touch the gradient at the point."""
     turn = rotation(case.core.linear, case.mus, case.bs)
     turned = turn.T @ minors @ turn
@@ -261,7 +269,7 @@ def free_part(case: Case, minors: Array) -> Array:
     return onto_minors(case, turn @ turned @ turn.T)
 
 
-def _candidate(case: Case, moment: Array) -> Point:
+def _candidate(case: LadderCase, moment: Array) -> Point:
     """Rank-one point nearest to a vector, in the coordinates of the problem; w follows by back substitution."""
     linear = case.core.linear
     svds = [np.linalg.svd(theta, full_matrices=False) for theta in matrices(moment[linear:], case.core.shapes)]
@@ -269,7 +277,7 @@ def _candidate(case: Case, moment: Array) -> Point:
                            moment[:linear] if linear else None)
 
 
-def conclude(case: Case, method: str, how: str, minors: Array, cuts: dict[int, Array],
+def conclude(case: LadderCase, method: str, how: str, minors: Array, cuts: dict[int, Array],
              linear: Array | None = None, better: tuple[Point, ...] = ()) -> Certification:
     """Recompute the bound from its multipliers and say what it proves."""
     value = case.objective.value

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from optid.certificate.ladder import certify
-from optid.certificate.shape_duals import Linear
+from optid.certificate.shape_duals import LinearRows
 from optid.core.least_squares import LeastSquaresForm, RankOneForm
 from optid.core.problem import Problem
 from optid.core.terms import Squares, Values
@@ -24,7 +24,7 @@ MAX_SIZE = 700  # multipliers up to which the semidefinite relaxation is tried
 class Lifted:
     """Constraints in the two forms a certificate understands."""
 
-    linear: Linear  # the rows on z
+    linear: LinearRows  # the rows on z
     cones: dict[int, np.ndarray] = field(default_factory=dict)  # {block: rows C of ``C mu >= 0``}
     directions: dict[int, np.ndarray] = field(default_factory=dict)  # {block: rows B of ``B b >= 0``}
     refused: str = ""  # name of the first constraint that has neither form, "" where all have
@@ -32,7 +32,7 @@ class Lifted:
     def add(self, rows: np.ndarray, right: np.ndarray, equal: bool) -> None:
         """Append rows ``rows @ z <= right`` or ``=``."""
         old = self.linear
-        self.linear = Linear(np.vstack([old.rows, rows]), np.append(old.right, right),
+        self.linear = LinearRows(np.vstack([old.rows, rows]), np.append(old.right, right),
                              np.append(old.equality, np.full(len(rows), equal)))
 
     def add_products(self, problem: RankOne) -> list[int]:
@@ -93,12 +93,12 @@ def lift(problem: Problem, form: LeastSquaresForm, names: Collection[str] | None
     """Bring the constraints of a problem into lifted form, all of them or the named ones."""
     held = [one for one in problem.constraints() if names is None or one.name in names]
     if not held:
-        return Lifted(Linear.none(len(form.problem.target)))
+        return Lifted(LinearRows.none(len(form.problem.target)))
     (squares,) = (term for term in problem.terms if isinstance(term, Squares))
     space, names = problem.space, set(squares.z)
     where = np.concatenate([np.arange(space.places[name].start, space.places[name].stop) for name in squares.z])
     factors = {name: (i, name == pair[0]) for i, pair in enumerate(form.blocks) for name in pair}
-    lifted = Lifted(Linear.none(len(form.problem.target)))
+    lifted = Lifted(LinearRows.none(len(form.problem.target)))
     for one in held:
         used = {name for name, place in space.places.items() if one.rows[:, place].any()}
         equal, fits = one.cone == "zero", False

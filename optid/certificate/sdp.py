@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from optid.certificate.minors import Block, Quadratic
-from optid.certificate.shape_duals import Linear
+from optid.certificate.shape_duals import LinearRows
 from optid.structures.rank_one import Array
 
 
@@ -56,7 +56,7 @@ def cut_operator(block: Block, cone: Array, size: int) -> Any:
 
 
 def relax(objective: Quadratic, blocks: Sequence[Block], cones: Mapping[int, Array],
-          linear: Linear) -> tuple[Array, dict[int, Array], Array, Array] | None:
+          linear: LinearRows) -> tuple[Array, dict[int, Array], Array, Array] | None:
     """Solve the relaxation around a point, in whitened coordinates; None where the solver returns no multipliers.
 
     Returns:

@@ -20,7 +20,7 @@ ACTIVE = 1e-6  # a row counts as active when its slack is below this fraction of
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class LinearRows:
     """Constraints on the lifted vector: ``rows @ z <= right``, or ``=`` where ``equality``."""
 
     rows: Array  # (r, n)
@@ -32,12 +32,12 @@ class Linear:
         return self.right - self.rows @ z, np.abs(self.rows) @ np.abs(z) + np.abs(self.right)
 
     @classmethod
-    def none(cls, n: int) -> "Linear":
+    def none(cls, n: int) -> "LinearRows":
         """No constraints on n unknowns."""
         return cls(np.zeros((0, n)), np.zeros(0), np.zeros(0, dtype=bool))
 
 
-def check_constraints(cones: Mapping[int, Array], linear: Linear, problem: RankOne) -> None:
+def check_constraints(cones: Mapping[int, Array], linear: LinearRows, problem: RankOne) -> None:
     """Refuse constraints whose shapes do not fit the problem.
 
     Raises:
@@ -52,7 +52,7 @@ def check_constraints(cones: Mapping[int, Array], linear: Linear, problem: RankO
             raise StructureError(f"cone {i} has shape {cone.shape}; block {i} of {problem.blocks} needs (r, P)")
 
 
-def kkt_multipliers(slope: Array, point: Point, cones: Mapping[int, Array], linear: Linear
+def kkt_multipliers(slope: Array, point: Point, cones: Mapping[int, Array], linear: LinearRows
                     ) -> tuple[dict[int, Array], Array]:
     """Return the multipliers, of the cones and linear, that make the gradient along the manifold vanish.
 

@@ -18,7 +18,7 @@ APART = 0.5  # correlation of moves with themselves that must have been passed b
 SHARED = 0.25  # of the energy of moves that must lie in what is compared
 
 
-class Part(NamedTuple):
+class RepeatedPart(NamedTuple):
     """Samples first to last - 1 of one experiment."""
 
     experiment: int
@@ -26,7 +26,7 @@ class Part(NamedTuple):
     last: int
 
 
-def copies(inputs: Sequence[Array]) -> list[list[Part]]:
+def copies(inputs: Sequence[Array]) -> list[list[RepeatedPart]]:
     """Return the parts of experiments in which inputs (T, m), one array each, make the same moves.
 
     One list for every sequence of moves, the longest part of it first; together they are the whole record.
@@ -35,10 +35,10 @@ def copies(inputs: Sequence[Array]) -> list[list[Part]]:
         moves = [np.nan_to_num(np.diff(u, axis=0)) for u in inputs]
     spread = np.sqrt(sum((np.sum(one**2, axis=0) for one in moves), np.zeros(inputs[0].shape[1])))
     moves = [one / np.where(spread > 0, spread, 1.0) for one in moves]
-    found: list[list[Part]] = []
+    found: list[list[RepeatedPart]] = []
     for i in sorted(range(len(moves)), key=lambda i: -len(moves[i])):
         n, period = len(inputs[i]), _period(moves[i])
-        parts = [Part(i, first, min(first + period, n)) for first in range(0, n, period)]
+        parts = [RepeatedPart(i, first, min(first + period, n)) for first in range(0, n, period)]
         same = next((group for group in found if _alike(moves[i][: period - 1], moves[group[0].experiment])), None)
         if same is None:
             found.append(parts)

@@ -15,7 +15,7 @@ import numpy as np
 
 from optid.arrays import Array, as_list, check_integer
 from optid.data.record import Data
-from optid.data.repeats import Part, copies
+from optid.data.repeats import RepeatedPart, copies
 from optid.data.stretches import between_gaps
 from optid.errors import DataError, OptidError, RankError
 
@@ -40,7 +40,7 @@ class Blocks:
     """A record divided into blocks, each made of parts of experiments."""
 
     data: Data
-    parts: tuple[tuple[Part, ...], ...]
+    parts: tuple[tuple[RepeatedPart, ...], ...]
 
     @classmethod
     def of(cls, data: Data, count: int = 4) -> "Blocks":
@@ -59,7 +59,8 @@ class Blocks:
             cuts.append(border if abs(border - cut) <= NEAR * total / count else cut)
         parts = []
         for low, high in zip(cuts, [*cuts[1:], total]):
-            inside = [Part(one.experiment, one.first + max(low - s, 0), min(one.first + min(high, e) - s, one.last))
+            inside = [RepeatedPart(one.experiment, one.first + max(low - s, 0),
+                                   min(one.first + min(high, e) - s, one.last))
                       for group, s, e in zip(repeated, ends - lengths, ends) if s < high and e > low
                       for one in group if one.first + max(low - s, 0) < one.last]
             parts.append(tuple(p for p in inside if p.last - p.first >= SHORTEST) or tuple(inside))
@@ -71,7 +72,7 @@ class Blocks:
     @cached_property
     def moving(self) -> tuple[int, ...]:
         """The blocks in which an input moves: the others tell little about a model."""
-        def moves(part: Part) -> bool:
+        def moves(part: RepeatedPart) -> bool:
             u = self.data.experiments[part.experiment].u[part.first : part.last]
             return bool(np.any(np.nanmax(u, axis=0) > np.nanmin(u, axis=0)))
 
@@ -85,7 +86,7 @@ class Blocks:
         for i, e in enumerate(self.data.experiments):
             cut = [x for part in self.parts[block] if part.experiment == i for x in part[1:]]
             borders = [0, *cut, e.n_samples]
-            kept += [Part(i, int(a), int(b)) for a, b in zip(borders[::2], borders[1::2]) if b - a >= SHORTEST]
+            kept += [RepeatedPart(i, int(a), int(b)) for a, b in zip(borders[::2], borders[1::2]) if b - a >= SHORTEST]
         return joined(self.data, kept)
 
     @cached_property
@@ -137,12 +138,12 @@ class Blocks:
             raise DataError(f"block {block + 1} has no sample of an output that can be compared: use fewer blocks")
         return energy, variance * count
 
-    def _around(self, part: Part) -> Data:
+    def _around(self, part: RepeatedPart) -> Data:
         """Return a part and its surroundings, split where an input is missing: a simulation needs all inputs."""
         samples = self.data.experiments[part.experiment].n_samples
         length = min(WIDER * (part.last - part.first), samples)
         first = min(max((part.first + part.last - length) // 2, 0), samples - length)
-        return between_gaps(joined(self.data, [Part(part.experiment, first, first + length)]), 2).raw()
+        return between_gaps(joined(self.data, [RepeatedPart(part.experiment, first, first + length)]), 2).raw()
 
     def _diverges(self, model: Any, block: int) -> bool:
         """Whether a model with a state fitted to the first third of a block diverges in the rest of it.
@@ -191,10 +192,10 @@ def _leading_state(model: Any, data: Data, experiment: int) -> Array:
     return model.initial_state(data.select(experiments=experiment).window(0, min(max(round(LEAD * n), LEAST), n)))
 
 
-def _repeated(data: Data, count: int) -> list[list[Part]]:
+def _repeated(data: Data, count: int) -> list[list[RepeatedPart]]:
     """Return the experiments, one list each, or where long sequences of moves come again all copies of each."""
     u = [e.u for e in data.experiments]
-    whole = [[Part(i, 0, len(one))] for i, one in enumerate(u)]
+    whole = [[RepeatedPart(i, 0, len(one))] for i, one in enumerate(u)]
     if len(u) > SEVERAL:
         return whole
     groups = copies(u)
@@ -215,20 +216,20 @@ def stretches(data: Data, most: int, count: int = 5) -> Data:
     if total <= most and data.n_experiments <= PIECES:
         return data
     lengths = [e.n_samples for e in data.experiments]
-    ends, kept = np.cumsum(lengths), list[Part]()
+    ends, kept = np.cumsum(lengths), list[RepeatedPart]()
     count = min(max(count, round(most / float(np.median(lengths)))), PIECES)  # of short experiments there are more
     for middle in (np.arange(count) + 0.5) * total / count:
         i = int(np.searchsorted(ends, middle, side="right"))
         n = lengths[i]
         length = min(most // count, n)
         first = int(np.clip(middle - (ends[i] - n) - length / 2, 0, n - length))
-        part = Part(i, first, first + length)
+        part = RepeatedPart(i, first, first + length)
         if part not in kept:
             kept.append(part)
     return joined(data, kept)
 
 
-def joined(data: Data, parts: Iterable[Part]) -> Data:
+def joined(data: Data, parts: Iterable[RepeatedPart]) -> Data:
     """Return parts of a record as experiments."""
     return Data.join(*(data.select(experiments=p.experiment).window(p.first, p.last) for p in parts))
 

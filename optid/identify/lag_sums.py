@@ -13,7 +13,7 @@ from optid.arrays import Array
 from optid.bases import Linear
 from optid.bases.basis import Basis
 from optid.data.record import Data
-from optid.data.repeats import Part
+from optid.data.repeats import RepeatedPart
 from optid.errors import RankError
 from optid.identify.blocks import Blocks, joined
 from optid.statistics import Layout, Statistics, accumulate
@@ -44,15 +44,15 @@ class LagSums:
             na, lags = max(na - 1, 1), max(lags - 2, 2)
         self.data, self.layout = data, Layout(na, (lags,) * data.m, (0,) * data.m, bases, data.outputs, data.inputs)
         lengths, reach = [e.n_samples for e in data.experiments], self.layout.first_row
-        self.whole = self._of([Part(i, 0, n) for i, n in enumerate(lengths)])
-        self.blocks = [self._of([Part(i, max(first - reach, 0), min(last + reach, lengths[i]))
+        self.whole = self._of([RepeatedPart(i, 0, n) for i, n in enumerate(lengths)])
+        self.blocks = [self._of([RepeatedPart(i, max(first - reach, 0), min(last + reach, lengths[i]))
                                  for i, first, last in parts]) for parts in blocks.parts]
         self._y = self.layout.n_columns + np.arange(data.l, dtype=np.intp)
         gram, count = self.whole.gram, max(self.whole.rows, 1)
         variance = gram[self._y, self._y] / count - (gram[self.layout.offset, self._y] / count) ** 2
         self._variance = np.maximum(variance, 1e-300)
 
-    def _of(self, parts: list[Part]) -> Statistics:
+    def _of(self, parts: list[RepeatedPart]) -> Statistics:
         long = [p for p in parts if p.last - p.first > self.layout.first_row]
         if not long:
             raise RankError(f"no block is longer than {self.layout.first_row} lags")

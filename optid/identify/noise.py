@@ -24,7 +24,7 @@ from optid.identify.validation.correlations import Correlation, autocorrelation
 from optid.identify.validation.predictions import one_step
 from optid.lazy import public_names
 from optid.models.hammerstein_ss import HammersteinSS
-from optid.models.innovation_gain import Likelihood, Predictor, covariance_of, refined
+from optid.models.innovation_gain import Likelihood, OneStepPredictor, covariance_of, refined
 from optid.models.kalman import NoiseCovariances, kalman_gain
 from optid.models.roots import spectral_radius
 from optid.models.state_space import StateSpace
@@ -140,7 +140,7 @@ def _largest(signals: Sequence[Array]) -> float:
     return max(float(np.nanmax(np.abs(s), initial=0.0)) for s in signals)
 
 
-def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> Predictor:
+def _most_likely(A: Array, C: Array, rest: Sequence[Array]) -> OneStepPredictor:
     """Predictor of the largest likelihood; a long record is first searched in part."""
     part, whole = Likelihood(A, C, _part(rest, C.size)), Likelihood(A, C, rest)
     starts = _starts(part)[:TRIED]
@@ -164,7 +164,7 @@ def _part(rest: Sequence[Array], entries: int) -> Sequence[Array]:
     return part if total > 2 * wanted and shown else rest
 
 
-def _starts(likelihood: Likelihood) -> list[Predictor]:
+def _starts(likelihood: Likelihood) -> list[OneStepPredictor]:
     """Predictors to start from, the best first: observers, and the whitening of the errors of the best of them."""
     A, C = likelihood.A, likelihood.C
     observers: list[Array] = [np.zeros((len(A), len(C)))]

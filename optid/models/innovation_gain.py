@@ -29,7 +29,7 @@ TINY = np.finfo(float).tiny
 NO_FUNCTIONS = tabulated(())
 
 
-class Predictor(NamedTuple):
+class OneStepPredictor(NamedTuple):
     """A gain, and the innovations of a record under it from the initial states that fit best."""
 
     gain: Array  # (n, l)
@@ -54,7 +54,7 @@ class Likelihood:
         """Diagonal matrix (l, l) that divides every output by the size of its residuals."""
         return _whitening(np.diag(np.maximum(np.diag(covariance_of(self.rest)), TINY)))
 
-    def at(self, gain: Array, before: Predictor | None = None) -> Predictor:
+    def at(self, gain: Array, before: OneStepPredictor | None = None) -> OneStepPredictor:
         """Return the predictor of a gain (n, l); innovations beyond the range of numbers are a `DataError`.
 
         After a step from a predictor an unstable gain is replaced by the stable one of the same spectrum, and the unit
@@ -69,10 +69,10 @@ class Likelihood:
         errors = [r - _run(parts, r, x0.copy(), np.empty((0, x0.size))) for r, x0 in zip(self.rest, starts)]
         same, covariance = before is None or len(self.C) == 1, covariance_of(errors)  # the unit of one output cancels
         sign, value = np.linalg.slogdet(covariance)
-        return Predictor(gain, radius, parts, starts if same else None, errors, covariance,
+        return OneStepPredictor(gain, radius, parts, starts if same else None, errors, covariance,
                          float(value) if sign > 0 else -np.inf)
 
-    def equations(self, found: Predictor) -> tuple[Array, Array]:
+    def equations(self, found: OneStepPredictor) -> tuple[Array, Array]:
         """Return the normal equations of a step in the gain (row by row), states eliminated, errors whitened."""
         n, size, root = found.gain.shape[0], found.gain.size, _whitening(found.covariance)
         total = np.zeros((size + 1, size + 1))
@@ -83,8 +83,8 @@ class Likelihood:
         return total[:-1, :-1], -total[:-1, -1]
 
 
-def refined(likelihood: Likelihood, found: Predictor, part: Likelihood | None = None, arrived: float = ARRIVED
-            ) -> Predictor:
+def refined(likelihood: Likelihood, found: OneStepPredictor, part: Likelihood | None = None, arrived: float = ARRIVED
+            ) -> OneStepPredictor:
     """Return the predictor whose gain minimises the determinant of the covariance of its innovations.
 
     The search (Levenberg-Marquardt) starts from ``found``, near an optimum where a ``part`` of the record is given,

@@ -48,7 +48,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Signals:
+class BlockSignals:
     """Signals that enter the rows at the same lags: the outputs, or the functions of one input."""
 
     first: NDArray[np.int32]  # (T,) position of the first function that does not vanish
@@ -56,7 +56,7 @@ class Signals:
     size: int  # number of signals
 
     @classmethod
-    def dense(cls, values: Array) -> "Signals":
+    def dense(cls, values: Array) -> "BlockSignals":
         """Return signals that vanish nowhere in particular, (T, size)."""
         return cls(np.zeros(len(values), dtype=np.int32), values, values.shape[1])
 
@@ -71,14 +71,14 @@ class Block:
     """Samples of a stretch of time, with zeros before, behind and in place of missing ones."""
 
     frame: Frame  # the rows
-    groups: tuple[Signals, ...]  # the signals of every group
+    groups: tuple[BlockSignals, ...]  # the signals of every group
     # (R,) rows that touch neither a missing sample nor the zeros around; row r looks back from sample reach + r of the
     # signals
     valid: NDArray[np.bool_]
     weights: Array | None  # (R,) weights of the rows, or None for ones
     candidates: int  # rows that would be used, were no sample missing
 
-    def entries(self, rows: NDArray[np.intp]) -> Iterator[tuple[Signals, NDArray[np.int32], NDArray[np.intp]]]:
+    def entries(self, rows: NDArray[np.intp]) -> Iterator[tuple[BlockSignals, NDArray[np.int32], NDArray[np.intp]]]:
         """Yield every group at every lag: its signals, its columns (size,) and its samples (K,) in some rows."""
         for group, lags, columns in zip(self.groups, self.frame.lags, self.frame.columns):
             for lag, where in zip(lags, columns):
@@ -145,7 +145,7 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
     valid[reach : len(u)] = used_rows(u, y, layout)
     outputs = np.zeros((len(y) + 2 * reach, layout.l))
     outputs[reach : reach + len(y)] = np.where(np.isnan(y), 0.0, y)
-    groups = [Signals.dense(outputs)]
+    groups = [BlockSignals.dense(outputs)]
     for c, basis in enumerate(layout.bases):
         first, values = np.zeros(len(outputs), dtype=np.int32), np.zeros((0, 0))
         for start in range(0, len(u), PIECE):
@@ -155,7 +155,7 @@ def make_block(u: Array, y: Array, weights: Array | None, layout: Layout) -> Blo
             first[piece], values[piece] = found, weighted
         if first.min() < 0 or first.max() + values.shape[1] > basis.full_size:  # compiled loops do not look
             raise StructureError(f"{basis!r}: local() names functions outside the family of {basis.full_size}.")
-        groups.append(Signals(first, values, basis.full_size))
+        groups.append(BlockSignals(first, values, basis.full_size))
     candidates = len(u) - reach
     if weights is not None:
         candidates = int(np.count_nonzero(weights[reach:]))

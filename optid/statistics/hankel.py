@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from optid.arrays import Array, check_integer, one_of
 from optid.data.stretches import runs_of
 from optid.errors import DataError, RankError, StructureError
-from optid.statistics.blocks import Block, Frame, Signals, rows_present, stretches
+from optid.statistics.blocks import Block, BlockSignals, Frame, rows_present, stretches
 from optid.statistics.factors import CONDITION_LIMIT, add_to_root, conditioning, dependent_column, root_of_gram
 from optid.statistics.sums import Factor, Sums
 
@@ -193,7 +193,7 @@ def _block(raw: Array, frame: Frame, expand: Expand, centre: Array, chunk: int) 
             inner[part][~missing[part]] = expand(raw[part][~missing[part]]) - centre
     valid = np.zeros(len(raw) + frame.reach, dtype=bool)
     valid[frame.reach : len(raw)] = rows_present([missing], frame.lags, frame.reach)
-    return Block(frame, (Signals.dense(padded),), valid, None, 0)
+    return Block(frame, (BlockSignals.dense(padded),), valid, None, 0)
 
 
 def complete_runs(record: Array, rows: int) -> Iterator[Array]:

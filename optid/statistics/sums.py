@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from optid.arrays import Array
 from optid.models.layout import Layout
-from optid.statistics.blocks import Block, Frame, Signals, blocks_of, check_lengths, cut, make_block
+from optid.statistics.blocks import Block, BlockSignals, Frame, blocks_of, check_lengths, cut, make_block
 from optid.statistics.factors import add_to_root
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def windows_of(signals: Array, rows: int) -> Array:
     return np.lib.stride_tricks.sliding_window_view(signals, rows, axis=0).transpose(0, 2, 1)
 
 
-def lagged_products(g: Signals, h: Signals, lags: range, reach: int) -> Array:
+def lagged_products(g: BlockSignals, h: BlockSignals, lags: range, reach: int) -> Array:
     """Sum g(t) h(t - d)^T over the inner samples t for every d in lags: (g.size, lags, h.size)."""
     start, stop = reach, len(g.weights) - reach
     if h.local and not g.local:
@@ -203,7 +203,7 @@ class Sums(Total):
             return False
         for pair, products in found.items():
             self._products[pair] = self._products.get(pair, 0.0) + products
-        constant = Signals.dense(np.ones((block.valid.size + reach, 1)))
+        constant = BlockSignals.dense(np.ones((block.valid.size + reach, 1)))
         for total, group in zip(self._totals, block.groups):
             total += lagged_products(group, constant, range(1), reach)[:, 0, 0]
         self._stretched += block.valid.size
@@ -227,7 +227,7 @@ class Sums(Total):
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class SampleRun:
     """Neighbouring parts: the sums over the rows inside them, and their ends."""
 
     total: Total  # the sums
@@ -253,7 +253,8 @@ def total_of_parts(stream: Any, layout: Layout, start: Callable[[], Total], chun
     return whole.total
 
 
-def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: "Part", chunks: Iterable["Chunk"]) -> Run:
+def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: "Part", chunks: Iterable["Chunk"]
+            ) -> SampleRun:
     reach, total = layout.first_row, start()
     head = tail = np.empty((0, layout.m + layout.l))
 
@@ -266,15 +267,15 @@ def _run_of(layout: Layout, start: Callable[[], Total], chunk: int, part: "Part"
 
     for stretch in cut(watched(), f"{part.label}, ", layout, chunk):
         total.add_all(blocks_of(stretch, layout, chunk))
-    return Run(total, ((part.experiment, head, tail),))
+    return SampleRun(total, ((part.experiment, head, tail),))
 
 
-def _joined(start: Callable[[], Total], runs: Sequence[Run]) -> Run:
+def _joined(start: Callable[[], Total], runs: Sequence[SampleRun]) -> SampleRun:
     """Join runs into a new one: Dask may use those given again."""
     total = start()
     for run in runs:
         total.merge(run.total)
-    return Run(total, tuple(end for run in runs for end in run.ends))
+    return SampleRun(total, tuple(end for run in runs for end in run.ends))
 
 
 def _last(samples: Array, count: int) -> Array:

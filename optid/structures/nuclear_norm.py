@@ -20,7 +20,7 @@ RANK = 1e-11  # eigenvalues below this part of the largest are none
 
 
 @dataclass(frozen=True, eq=False)
-class Predictor:
+class KnownSignals:
     """Known signals that enter through lower block Toeplitz matrices, and a constant for every block row.
 
     ``(T Phi)_i = sum_k t_k phi(i - k) + c_i``, k from 0 for the direct signals, from 1 for the others.
@@ -110,7 +110,7 @@ class NuclearProblem:
     rows: int  # number alpha of block rows
     left: Array | None = None  # (r, alpha l) weight on the left, or None for none
     right: Array | None = None  # (j, q) weight on the right, or None for none
-    predictor: Predictor | None = None  # known signals, only without weights; None for none
+    predictor: KnownSignals | None = None  # known signals, only without weights; None for none
 
     @property
     def l(self) -> int:  # noqa: E743 - the field's letter

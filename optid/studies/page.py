@@ -18,7 +18,7 @@ from optid.studies.verdicts.model_advice import model_evidence
 from optid.studies.verdicts.outcomes import MEANINGS, SOLVED, TIMES, states_of_rows
 from optid.studies.verdicts.quality import FIGURES, DataSet, Quality
 from optid.studies.verdicts.statement import FAIR, GOOD, counting, plural
-from optid.studies.verdicts.verdict import Verdict, conclude
+from optid.studies.verdicts.verdict import StudyVerdict, conclude
 
 SCRIPTS = ("plot.js", "grid.js", "study.js")
 TIME_WORDS = {"solve": "compile and solve, cold", "fit": "the whole fit", "warm": "the second, warm solve"}
@@ -32,8 +32,8 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
                study: str | None = None, accuracy: float | None = None, time: str = "solve") -> Path:
     """Write the page of a study: verdict, tables, figures and all runs in one file that makes no request.
 
-    Rows, study, accuracy and time are those of `conclude`, whose errors are raised; a `Verdict` is taken as it is. The
-    title is by default that of the study; the command is for the section that says how to reproduce the page.
+    Rows, study, accuracy and time are those of `conclude`, whose errors are raised; a `StudyVerdict` is taken as it is.
+    The title is by default that of the study; the command is for the section that says how to reproduce the page.
 
     Returns:
         The path; the file is replaced when it exists.
@@ -41,14 +41,14 @@ def write_page(rows_or_db: Any, path: str | Path, *, title: str = "", command: s
     Raises:
         OSError: the file cannot be written.
     """
-    if not isinstance(rows_or_db, Verdict):
+    if not isinstance(rows_or_db, StudyVerdict):
         rows_or_db = conclude(rows_or_db, study=study, accuracy=accuracy, time=time)
     path = Path(path)
     path.write_text(render(rows_or_db, title=title, command=command), encoding="utf-8", errors="replace")
     return path
 
 
-def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
+def render(verdict: StudyVerdict, *, title: str = "", command: str = "") -> str:
     """Return the page that `write_page` writes."""
     head, style = verdict.headline, files("optid") / "show" / "templates" / "study.css"
     studies = [name for name in dict.fromkeys(verdict.table["study"]) if name]
@@ -85,7 +85,7 @@ def render(verdict: Verdict, *, title: str = "", command: str = "") -> str:
     return template("study.html.j2").render(content)
 
 
-def _lead(verdict: Verdict) -> str:
+def _lead(verdict: StudyVerdict) -> str:
     runs, found = len(verdict.table["solver"]), verdict.found
     parts = [(runs, "run"), (len(found.data), "problem"), (len(found.solvers), "solver"),
              (len(verdict.sections), "formulation"), (len(set(zip(found.study, found.data))), "data set")]
@@ -93,7 +93,7 @@ def _lead(verdict: Verdict) -> str:
     return " · ".join([*counts, f"accuracy {found.accuracy:.0e}: {counting(found.accuracy)}"])
 
 
-def _cards(verdict: Verdict) -> list[dict[str, str]]:
+def _cards(verdict: StudyVerdict) -> list[dict[str, str]]:
     section, table = verdict.overall, verdict.table
     runs, solved = (sum(getattr(s, name) for s in section.standings) for name in ("problems", "solved"))
     by_anyone = int(section.found.solved.any(axis=1).sum()) if len(section.found.data) else 0
@@ -107,7 +107,7 @@ def _cards(verdict: Verdict) -> list[dict[str, str]]:
     return [{"value": value, "label": label} for label, value in cards.items()]
 
 
-def _picks(verdict: Verdict) -> list[dict[str, Any]]:
+def _picks(verdict: StudyVerdict) -> list[dict[str, Any]]:
     """Return one line per formulation: the recommended solver, or of a single solver the quality of the models."""
     lines, quality = [], verdict.quality
     for section in verdict.sections:
@@ -130,7 +130,7 @@ def _picks(verdict: Verdict) -> list[dict[str, Any]]:
     return lines
 
 
-def _claims(verdict: Verdict) -> Table | None:
+def _claims(verdict: StudyVerdict) -> Table | None:
     claims = verdict.false_claims
     rows = [(short(c.solver), short(c.formulation), f"{c.count:,}", short(c.claimed) or "-",
              short(c.reason, REASON) or "verified otherwise") for c in claims[:LISTED]]
@@ -162,7 +162,7 @@ def _models(quality: Quality | DataSet, name: str) -> tuple[str, ...]:
     return (f"{quality.solved[name]:,} of {quality.records:,}", *fits, *errors)
 
 
-def _machines(verdict: Verdict) -> list[tuple[str, str]]:
+def _machines(verdict: StudyVerdict) -> list[tuple[str, str]]:
     names = [name for name in dict.fromkeys(verdict.table["machine"]) if name]
     shown = [short(name) for name in names[:5]] + ([f"{len(names) - 5} more"] if len(names) > 5 else [])
     runs = sorted(str(v)[:16].replace("T", " ") for v in verdict.table["started"] if v and v != "NaT")

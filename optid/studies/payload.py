@@ -7,17 +7,17 @@ import numpy as np
 from optid.program.solution import GRADIENT
 from optid.studies.storage.rows import BY_NAME, COLUMNS
 from optid.studies.verdicts.advice import carries_over, choice_of_solver
-from optid.studies.verdicts.averages import Profile
+from optid.studies.verdicts.averages import PerformanceProfile
 from optid.studies.verdicts.outcomes import TIMES, Table, seconds_of, states_of_rows, worst_residual
-from optid.studies.verdicts.standings import Section, Standing
-from optid.studies.verdicts.verdict import Verdict
+from optid.studies.verdicts.standings import Standing, StandingsSection
+from optid.studies.verdicts.verdict import StudyVerdict
 
 TEXT_BUDGET = 1_500_000  # characters of different texts that a column may bring to the page
 POINTS = 400  # steps of a profile on the page
 DIGITS = {"objective": 10, "bound": 10, "scale": 8}
 
 
-def page_payload(verdict: Verdict) -> dict[str, Any]:
+def page_payload(verdict: StudyVerdict) -> dict[str, Any]:
     """Return everything the scripts need as plain values for JSON, without numbers that are not finite.
 
     Texts keep their full length up to `TEXT_BUDGET` characters per column, beyond that their beginnings.
@@ -49,7 +49,7 @@ def _numbers(values: Any, digits: int = 5) -> list[float | None]:
     return [_number(value, digits) for value in values]
 
 
-def _section(section: Section) -> dict[str, Any]:
+def _section(section: StandingsSection) -> dict[str, Any]:
     ranking, said = section.ranking, [choice_of_solver(section)]
     if len(section.standings) > 1:
         said.append(carries_over(ranking))
@@ -70,7 +70,7 @@ def _section(section: Section) -> dict[str, Any]:
     }
 
 
-def _standing(s: Standing, section: Section) -> dict[str, Any]:
+def _standing(s: Standing, section: StandingsSection) -> dict[str, Any]:
     ranking, pair, growth = section.ranking, section.choice.against.get(s.solver), s.growth
     rank = ranking.ranks[ranking.names.index(s.solver)] if s.solver in ranking.names else np.nan
     return {
@@ -84,7 +84,7 @@ def _standing(s: Standing, section: Section) -> dict[str, Any]:
     }
 
 
-def _profile(profile: Profile) -> list[list[float | None]]:
+def _profile(profile: PerformanceProfile) -> list[list[float | None]]:
     """Return the steps of a profile; of many, `POINTS` of them with the first and the last."""
     most = len(profile.factors)
     at = np.unique(np.rint(np.linspace(0, most - 1, POINTS)).astype(int)) if most > POINTS else np.arange(most)

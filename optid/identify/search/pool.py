@@ -12,7 +12,7 @@ from optid.processes import Worker, start_workers
 PATIENCE, GRACE = 10.0, 60.0  # seconds on the clock for each CPU second that is left, and more, before work is ended
 
 
-class Pool:
+class TrialPool:
     """Runs a function in processes of their own, or here if one is enough or none can be used.
 
     Attributes:

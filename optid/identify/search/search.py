@@ -21,7 +21,7 @@ from optid.identify.search.determined import binary
 from optid.identify.search.effort import effort_of, units
 from optid.identify.search.kept import KeptTrials
 from optid.identify.search.ladder import RUNGS, Ladder
-from optid.identify.search.pool import Pool
+from optid.identify.search.pool import TrialPool
 from optid.identify.search.trial import (
     ASKED,
     CLEAR,
@@ -164,7 +164,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         horizon = 1  # a free run says nothing about the plant where the input answers the noise
     kept = KeptTrials(trials, data, {"blocks": blocks, "horizon": horizon, "constraints": [
         getattr(rule, "name", rule) for rule in rules], "solver": solver, "accuracy": accuracy})
-    pool = Pool(partial(_attempt, cut, {"solver": solver, "accuracy": accuracy}, rules, horizon),
+    pool = TrialPool(partial(_attempt, cut, {"solver": solver, "accuracy": accuracy}, rules, horizon),
                 available_cores(workers, "workers"))
     alone = pool.reason and (_unsendable(rules, solver) or pool.reason)
     if alone and workers is not None:
@@ -296,7 +296,7 @@ def _tried(ladder: Ladder, kind: str, batch: Sequence[Candidate], run: Runs, mos
         ladder.spent[kind] += units(candidate, ladder.data, trial.fits, trial.searches) if trial else 0.0
 
 
-def _run(pool: Pool, kept: KeptTrials, left: Callable[[], float], told: Callable[[Trial], None],
+def _run(pool: TrialPool, kept: KeptTrials, left: Callable[[], float], told: Callable[[Trial], None],
          batch: Sequence[Candidate], rival: Trial | None) -> list[Trial | None]:
     """Return the trials of candidates against a rival, kept ones or new; None where no time was left."""
     known = [kept.known(candidate, rival) for candidate in batch]

@@ -16,7 +16,7 @@ from optid.identify.subspace.plan import Plan
 from optid.identify.subspace.projection import realise
 from optid.identify.validation.predictions import MEASURED, SIMULATION, prediction_fit
 from optid.program.solution import Solution
-from optid.structures.nuclear_norm import NuclearProblem, Predictor, window_starts
+from optid.structures.nuclear_norm import KnownSignals, NuclearProblem, window_starts
 
 Values = Mapping[str, Array]
 
@@ -162,7 +162,7 @@ def structure(plan: Plan) -> Structured:
     problem = NuclearProblem(outputs, starts, alpha)
     if form == "predictor":
         direct = np.repeat([*plan.direct(), False], [*expansion.input_sizes, expansion.q + l])
-        problem = replace(problem, predictor=Predictor(known, direct, plan.offset))
+        problem = replace(problem, predictor=KnownSignals(known, direct, plan.offset))
     else:
         known = known.reshape(-1, len(starts))
         known = np.vstack([known, np.ones(len(starts))]) if plan.offset else known

@@ -7,8 +7,8 @@ from optid.studies.verdicts.averages import paired
 from optid.studies.verdicts.choice import CANNOT_TELL, FIRST, NOBODY, ONLY_ONE, TIE
 from optid.studies.verdicts.model_advice import choice_of_formulation
 from optid.studies.verdicts.quality import Quality
-from optid.studies.verdicts.ranks import Ranking
-from optid.studies.verdicts.standings import Section, Standing
+from optid.studies.verdicts.ranks import SolverRanking
+from optid.studies.verdicts.standings import Standing, StandingsSection
 from optid.studies.verdicts.statement import BAD, FAIR, GOOD, NO_DIFFERENCE, Statement, counting, listed, of, plural
 
 RARE = 0.01  # share of refused problems, or of false claims, up to which a solver is recommended
@@ -16,7 +16,7 @@ LONGEST = 90  # characters of a headline
 NO_SOLVER = "No solver can be recommended"
 
 
-def choice_of_solver(section: Section) -> Statement:
+def choice_of_solver(section: StandingsSection) -> Statement:
     """Recommend a solver for the problems of a section, or say why none can be recommended."""
     choice, n, at = section.choice, len(section.found.data), section.found.accuracy
     if not n:
@@ -56,7 +56,7 @@ def choice_of_solver(section: Section) -> Statement:
     return Statement(_tone(lead, n), word if section.recommended else NO_SOLVER, text, "solver")
 
 
-def evidence(section: Section) -> str:
+def evidence(section: StandingsSection) -> str:
     """Give the evidence for the choice: the distance of the others from the first, or the missing data."""
     choice, first = section.choice, section.choice.first
     if choice.kind != FIRST:
@@ -93,7 +93,7 @@ def evidence(section: Section) -> str:
     return text
 
 
-def no_solution(section: Section) -> str:
+def no_solution(section: StandingsSection) -> str:
     """State how many problems are infeasible, and how many solvers agree."""
     k, (said, asked) = section.infeasible, section.deniers
     return (f"{plural(k, 'problem')} {'has' if k == 1 else 'have'} no solution according to {said} of {asked} solvers; "
@@ -112,12 +112,12 @@ def _times_as(value: float) -> str:
     return f"{value:.3g} times the time" if value < 10 else f"{value:.0f} times the time"
 
 
-def _against(section: Section, name: str) -> str:
+def _against(section: StandingsSection, name: str) -> str:
     pair = section.choice.against[name]
     return f"takes {_times_as(pair.value)} (95 %: {pair.low:.3g} to {pair.high:.3g}, {pair.n:,} problems)"
 
 
-def _count(section: Section, name: str) -> str:
+def _count(section: StandingsSection, name: str) -> str:
     """State how many problems a candidate solved where the first solved more."""
     solved = section.choice.solved
     if solved[name] == solved[section.choice.first]:
@@ -125,7 +125,7 @@ def _count(section: Section, name: str) -> str:
     return f"solved {solved[name]:,}, no difference beyond chance or 1 %, and "
 
 
-def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
+def carries_over(ranking: SolverRanking, noun: str = "solver") -> Statement:
     """State whether the order of solvers or formulations (the noun) holds on other data sets."""
     if ranking.missing:
         text = f"Whether the order holds on other data sets is unknown: the test {ranking.missing}."
@@ -143,7 +143,7 @@ def carries_over(ranking: Ranking, noun: str = "solver") -> Statement:
     return Statement(GOOD, word, text, "data sets")
 
 
-def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) -> Statement:
+def headline(overall: StandingsSection, sections: tuple[StandingsSection, ...], quality: Quality) -> Statement:
     """Return the verdict in one line: one solver for everything, or one per formulation.
 
     A study of a single solver is about the formulations by their models.
@@ -178,7 +178,7 @@ def headline(overall: Section, sections: tuple[Section, ...], quality: Quality) 
     return Statement(tone, best, f"{depends}. {text}" if others or not all_told else text, "solver")
 
 
-def _used(overall: Section, decided: list[Section]) -> dict[str, list[Section]]:
+def _used(overall: StandingsSection, decided: list[StandingsSection]) -> dict[str, list[StandingsSection]]:
     """Return few solvers that lead all these sections: {solver: sections}, the one that leads most first.
 
     Of solvers that lead as many, the one with the better standing on all problems.

@@ -98,7 +98,7 @@ def means_of_groups(values: np.ndarray, groups: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Profile:
+class PerformanceProfile:
     """The share of problems solved within a factor of the fastest time: a right-continuous step function."""
 
     factors: np.ndarray  # where it steps, ascending, the first at least 1
@@ -117,12 +117,12 @@ def time_ratios(times: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(reached), reached / np.where(np.isfinite(fastest), fastest, 1.0), np.inf)
 
 
-def performance_profiles(times: np.ndarray) -> list[Profile]:
+def performance_profiles(times: np.ndarray) -> list[PerformanceProfile]:
     """Return a profile per solver for times (P, S), ``nan`` where not solved; unsolved problems count in the shares."""
     profiles = []
     for ratios in time_ratios(times).T:
         factors, counts = np.unique(ratios[np.isfinite(ratios)], return_counts=True)
-        profiles.append(Profile(factors, np.cumsum(counts) / max(len(ratios), 1)))
+        profiles.append(PerformanceProfile(factors, np.cumsum(counts) / max(len(ratios), 1)))
     return profiles
 
 

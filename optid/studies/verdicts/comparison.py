@@ -12,7 +12,7 @@ from optid.studies.storage.rows import ERROR, REFUSED, columns
 from optid.studies.verdicts.averages import MINOR
 from optid.studies.verdicts.outcomes import FALSE_CLAIM, SOLVED, WORSE_MINIMUM, tabulate
 from optid.studies.verdicts.statement import BAD, FAIR, GOOD, Statement, counting, grouped, listed
-from optid.studies.verdicts.verdict import Verdict, conclude
+from optid.studies.verdicts.verdict import StudyVerdict, conclude
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class SolverComparison:
     """All solvers on one record."""
 
     lines: tuple[Line, ...]  # those that were run, the recommended order first
@@ -86,7 +86,7 @@ class Comparison:
         return f"{self.headline.word}: {self.headline.text}"
 
 
-def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
+def compare(rows: Sequence[dict[str, Any]]) -> SolverComparison:
     """Set the rows of a study with one record, one formulation and one accuracy side by side.
 
     Raises:
@@ -110,10 +110,10 @@ def compare(rows: Sequence[dict[str, Any]]) -> Comparison:
             float((shown["objective"] - best) / found.size[0] if np.isfinite(best) else np.nan), float(residual),
             _median(cold), _median(table["warm_s"][mine]), float(shown["one_step_fit"]),
             float(shown["simulation_fit"]), str(shown["reason"])))
-    return Comparison(tuple(sorted(lines, key=_order)), refused, float(table["accuracy"][0]))
+    return SolverComparison(tuple(sorted(lines, key=_order)), refused, float(table["accuracy"][0]))
 
 
-def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> Verdict:
+def verdict_on_one_record(rows: Sequence[dict[str, Any]]) -> StudyVerdict:
     """Return the verdict on the rows of `compare`, with the headline of the comparison; it raises the same."""
     head, verdict = compare(rows).headline, conclude(rows)
     caveat = Statement(FAIR, "Other records: cannot tell", "This is one record. A study of at least 6 problems "

@@ -7,7 +7,7 @@ import numpy as np
 from optid.studies.verdicts.averages import MINIMUM_PAIRS, means_of_groups, paired
 from optid.studies.verdicts.choice import CANNOT_TELL, DEPENDS, FIRST, TIE, Choice, choose
 from optid.studies.verdicts.outcomes import NOT_RUN, Results, Table
-from optid.studies.verdicts.ranks import Ranking, rank
+from optid.studies.verdicts.ranks import SolverRanking, rank
 
 SMALLEST = 1e-12  # parameter errors below are roundoff
 WORST = -100.0  # %; a simulation that runs away must not decide a mean over all records
@@ -47,7 +47,7 @@ class Quality(DataSet):
     formulations: tuple[str, ...]
     measure: str  # column: the simulation fit, or the parameter error where more formulations have that on most records
     sets: tuple[DataSet, ...]  # the comparison on every data set
-    ranking: Ranking  # by the same over data sets
+    ranking: SolverRanking  # by the same over data sets
     truth: bool  # whether the truth is known for some model
 
     @property

@@ -18,7 +18,7 @@ LEVEL = 0.05  # of all tests
 
 
 @dataclass(frozen=True)
-class Ranking:
+class SolverRanking:
     """Mean ranks of k solvers over data sets, 1 the best, and those behind the best."""
 
     names: tuple[str, ...]  # the solvers, best mean rank first
@@ -48,12 +48,12 @@ def ranks_of_problems(costs: np.ndarray) -> np.ndarray:
 
 
 def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.ndarray, noun: str = "solver"
-         ) -> Ranking:
+         ) -> SolverRanking:
     """Rank those that were tried on every data set; a failure on a problem ranks last there, failures tied.
 
     Costs (lower is better, ``nan`` where not solved) and `tried` are (P, k), the labels of the data sets (P,). The
     probabilities are multiplied by the number of pairs, since the best is known only afterwards; with too few data sets
-    for a significant unanimous comparison, `Ranking.missing` says how many are needed.
+    for a significant unanimous comparison, `SolverRanking.missing` says how many are needed.
     """
     everywhere = [bool(len(data)) and all(column[data == label].any() for label in dict.fromkeys(data))
                   for column in tried.T]
@@ -72,5 +72,5 @@ def rank(costs: np.ndarray, tried: np.ndarray, names: tuple[str, ...], data: np.
     missing = [f"at least 2 {noun}s that ran on every data set; {there_are(k)}"] if k < 2 else []
     if n < needed:
         missing.append(f"at least {needed} data sets; {there_are(n)}")
-    return Ranking(tuple(kept[s] for s in order), means[order], n, found, out,
+    return SolverRanking(tuple(kept[s] for s in order), means[order], n, found, out,
                    f"needs {', and '.join(missing)}" if missing else "")

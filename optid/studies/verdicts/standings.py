@@ -7,7 +7,7 @@ import numpy as np
 from optid.studies.storage.rows import REFUSED
 from optid.studies.verdicts.averages import (
     Growth,
-    Profile,
+    PerformanceProfile,
     performance_profiles,
     shifted_geometric_mean,
     time_growth,
@@ -15,7 +15,7 @@ from optid.studies.verdicts.averages import (
 )
 from optid.studies.verdicts.choice import Choice, choose
 from optid.studies.verdicts.outcomes import INFEASIBLE, Results, agreed_infeasible
-from optid.studies.verdicts.ranks import Ranking, rank
+from optid.studies.verdicts.ranks import SolverRanking, rank
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Standing:
 
 
 @dataclass(frozen=True)
-class Section:
+class StandingsSection:
     """The comparison on one set of problems."""
 
     name: str  # label of the formulation, or "" for all problems
@@ -53,8 +53,8 @@ class Section:
     standings: tuple[Standing, ...]  # of the solvers that were run, best first
     idle: tuple[str, ...]  # solvers that were run on none of these problems
     choice: Choice  # the best solver
-    ranking: Ranking  # over data sets
-    profiles: dict[str, Profile]  # performance profiles
+    ranking: SolverRanking  # over data sets
+    profiles: dict[str, PerformanceProfile]  # performance profiles
 
     @property
     def recommended(self) -> tuple[str, ...]:
@@ -67,7 +67,7 @@ class Section:
         return next(s for s in self.standings if s.solver == solver)
 
 
-def compare_solvers(found: Results, name: str = "") -> Section:
+def compare_solvers(found: Results, name: str = "") -> StandingsSection:
     """Compare the solvers on the problems of a table; the name is that of the section."""
     gone: np.ndarray = agreed_infeasible(found)
     run: np.ndarray = np.any(found.ran, axis=0)
@@ -86,7 +86,7 @@ def compare_solvers(found: Results, name: str = "") -> Section:
                 standing.penalised if np.isfinite(standing.penalised) else np.inf, standing.solver)
 
     tried = kept.ran & kept.solved.any(axis=0)  # a solver without a solved problem is last without a test
-    return Section(
+    return StandingsSection(
         name, kept, int(gone.sum()), (int(says.any(axis=0).sum()), int(found.ran[gone].any(axis=0).sum())),
         tuple(sorted(_standings(found, counted), key=order)), idle, choice,
         rank(kept.time, tried, kept.solvers, kept.data_set),

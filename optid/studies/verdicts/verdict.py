@@ -25,7 +25,7 @@ from optid.studies.verdicts.outcomes import (
     tabulate,
 )
 from optid.studies.verdicts.quality import Quality, compare_formulations
-from optid.studies.verdicts.standings import Section, compare_solvers
+from optid.studies.verdicts.standings import StandingsSection, compare_solvers
 from optid.studies.verdicts.statement import BAD, FAIR, Statement, grouped, listed, plural
 
 
@@ -51,13 +51,13 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class StudyVerdict:
     """The verdict of a study."""
 
     table: Table  # the rows, one array per column
     found: Results  # problems and solvers, the accuracy and the measure of time
-    overall: Section  # comparison on all problems
-    sections: tuple[Section, ...]  # comparison on the problems of each formulation, in alphabetical order
+    overall: StandingsSection  # comparison on all problems
+    sections: tuple[StandingsSection, ...]  # comparison on the problems of each formulation, in alphabetical order
     quality: Quality  # the formulations by their models
     agreement: Agreement  # of the solvers
     false_claims: tuple[FalseClaim, ...]  # most frequent first
@@ -75,7 +75,8 @@ class Verdict:
         return "\n".join(f"{s.word}: {s.text}" for s in (self.headline, *self.statements))
 
 
-def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = None, time: str = "solve") -> Verdict:
+def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = None, time: str = "solve"
+             ) -> StudyVerdict:
     """Draw the conclusions from the rows of a study.
 
     Args:
@@ -104,13 +105,13 @@ def conclude(rows: Any, *, study: str | None = None, accuracy: float | None = No
     sections = tuple(compare_solvers(found.where(found.formulation == f), f) for f in sorted(set(found.formulation)))
     quality = compare_formulations(found, table)
     head = headline(overall, sections, quality)
-    return Verdict(table, found, overall, sections, quality, agreement_matrix(found, table),
+    return StudyVerdict(table, found, overall, sections, quality, agreement_matrix(found, table),
                    _false_claims(table, found), _failures(found), head,
                    tuple(_statements(overall, sections, quality, found, table, head)))
 
 
-def _statements(overall: Section, sections: tuple[Section, ...], quality: Quality, found: Results, table: Table,
-                head: Statement) -> list[Statement]:
+def _statements(overall: StandingsSection, sections: tuple[StandingsSection, ...], quality: Quality, found: Results,
+                table: Table, head: Statement) -> list[Statement]:
     if not len(found.data):
         return []
     models, solvers = choice_of_formulation(quality), choice_of_solver(overall)
@@ -148,7 +149,7 @@ def _failed_data(found: Results) -> Statement | None:
     return Statement(BAD, "Data that failed", text.rstrip(".") + ".", "data sets")
 
 
-def _never(overall: Section) -> Statement | None:
+def _never(overall: StandingsSection) -> Statement | None:
     never = [s for s in overall.standings if not s.solved]
     if not never or len(never) == len(overall.standings):
         return None
