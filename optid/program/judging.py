@@ -8,6 +8,7 @@ from cvxpy.constraints.constraint import Constraint
 from cvxpy.constraints.psd import PSD
 from cvxpy.constraints.second_order import SOC
 
+from optid.arrays import largest
 from optid.program.expressions import flat_value, jacobians
 from optid.program.limits import EQUALITIES, INEQUALITIES, rows_of, spans
 from optid.program.program import Program, Values
@@ -59,16 +60,14 @@ def measure_violation(program: Program) -> tuple[float, str]:
 
     Bounds that variables carry as attributes count as well, under the name of the variable.
     """
-    worst, name, usual = 0.0, "", program.usual_sizes
+    amounts, usual = [], program.usual_sizes
     for key, group in program.constraints.items():
         if key in program.derived:
             continue  # recomputed, hence exact
         for member in group:
             with np.errstate(divide="ignore", invalid="ignore"):  # CVXPY's projection on a cone at its axis
                 amount = float(np.max(np.asarray(member.violation()), initial=0.0))
-            amount = amount / term_size(member, usual) if amount else 0.0
-            if not amount <= worst:  # also true for nan
-                worst, name = amount, key
+            amounts.append((amount / term_size(member, usual) if amount else 0.0, key))
     for key, variable in program.variables.items():
         value, amount, size = np.asarray(variable.value, dtype=float), 0.0, _size(variable, usual)
         if (bounds := bounds_of(variable)) is not None:
@@ -77,9 +76,8 @@ def measure_violation(program: Program) -> tuple[float, str]:
         elif variable.attributes["PSD"] or variable.attributes["NSD"]:
             sign = 1.0 if variable.attributes["PSD"] else -1.0
             amount = max(0.0, -float(np.min(np.linalg.eigvalsh(sign * (value + value.T) / 2))))
-        amount /= size
-        if not amount <= worst:
-            worst, name = amount, key
+        amounts.append((amount / size, key))
+    worst, name = largest(amounts)
     return (worst if np.isfinite(worst) else float("inf")), name
 
 
@@ -189,15 +187,9 @@ class Lagrangian:
 
     def residual(self, yardstick: float) -> float:
         """Return the largest component relative to its terms plus the objective's size per size of the variable."""
-        worst = 0.0
-        for variable in self.variables:
-            part = self.free_part(variable)
-            if part is None:
-                return float("nan")
-            here = float(np.max(part / self.floor(variable, yardstick), initial=0.0))
-            if not here <= worst:  # also true for nan
-                worst = here
-        return worst
+        parts = [(variable, self.free_part(variable)) for variable in self.variables]
+        return largest((np.nan if part is None else float(np.max(part / self.floor(variable, yardstick), initial=0.0)),
+                        variable.name()) for variable, part in parts)[0]
 
     def floor(self, variable: cp.Variable, yardstick: float) -> np.ndarray:
         """Return what the components of the gradient by a variable are relative to, (size,)."""

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, largest
 from optid.program.structure import Structure, relative_gradient, variable_size
 from optid.structures.rank_one import Point, RankOne
 
@@ -48,13 +48,13 @@ class LeastSquaresStructure(Structure):
         if self.blocks:
             slope = point.tangent()
             pull, effort = slope.T @ pull, np.abs(slope.T) @ effort
-        yardstick, worst = max(value, program.scale), 0.0
+        yardstick, rates = max(value, program.scale), []
         edges = accumulate((np.size(values[name]) for name in self.names), initial=0)
         for name, (first, last) in zip(self.names, pairwise(edges)):
             usual = float(np.max(np.abs(program.start.get(name, 0.0)), initial=0.0)) or None
             size = variable_size(values[name], usual)
-            worst = max(worst, relative_gradient(np.abs(pull[first:last]), effort[first:last], yardstick, size))
-        return value, worst
+            rates.append((relative_gradient(np.abs(pull[first:last]), effort[first:last], yardstick, size), name))
+        return value, largest(rates)[0]
 
     def named(self, point: Point, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, Array]:
         """Name the parts of a point, in the shapes of the variables."""
@@ -66,15 +66,15 @@ class LeastSquaresStructure(Structure):
 
     def complete(self, program: Any, values: Mapping[str, Array]) -> tuple[dict[str, Array], float, str]:
         """Return values in the shapes of the variables, the residual ``R z - s``, and the violation of the gauge."""
-        shapes, worst = program.shapes, 0.0
+        shapes, amounts = program.shapes, []
         found = {name: np.array(values[name], dtype=float).reshape(shapes[name], order="F") for name in self.names}
         a = found.get("a", np.zeros(0))
         for b in (found[name] for _, name in self.blocks):
             level = {"norm": np.sum(b**2), "b0": b.flat[0], "gain": np.sum(b) - np.sum(a)}[self.gauge]  # must be one
-            amount = abs(float(level) - 1.0) / (1.0 + float(np.sum(np.abs(b)) + np.sum(np.abs(a))))
-            worst = worst if amount <= worst else amount  # also nan
+            size = 1.0 + float(np.sum(np.abs(b)) + np.sum(np.abs(a)))
+            amounts.append((abs(float(level) - 1.0) / size, "gauge"))
         found["residual"] = self.problem.root @ self.point(found).lift() - self.problem.target
-        return found, worst, "gauge" if worst else ""
+        return found, *largest(amounts)
 
 
 @dataclass(frozen=True, eq=False)
