@@ -35,15 +35,15 @@ PATIENCE = 5  # undamped programmes in all that may promise no more than `STALLE
 # from this damping on, with which it is nearly the shortest one, in any case
 TRUSTED, NEAR = 10.0, 1e-2
 CONFLICT = 0.1  # share of the errors above the free optimum from which descents from other signs are worth their time
-# programmes of a descent from other signs, and of one beside poles that were moved, after which it goes on only where it
-# is better; how often an end that has not arrived is gone on from, and the share of the errors that is worth it
-SIGNED, MOVED, GOING, WORTH = 60, 30, 4, 1e-4
+SIGNED = 60  # programmes of a descent from other signs, which goes on only where it is better
+MOVED = 30  # the same of one from poles that were moved
+GOING, WORTH = 4, 1e-4  # how often an end that has not arrived is gone on from, and the share of the errors that pays
 # moves of poles along a border; share of the errors that one must gain, and all of them for an end to be no optimum
 ROUNDS, ALONG, BETTER = 12, 1e-6, 1e-5
 ALL, VALLEYS = 20, 5  # steps along a flat valley with all curvature, and how often they are gone on with
 PARTS = 10  # halvings of an undamped step that are tried where no damped one descends
-CREEPS = ("the errors still fall as a pole nears the unit circle, where a static curve that the record contradicts costs "
-          "nothing; keep poles off it, by stable:0.99 for instance")
+CREEPS = ("the errors still fall as a pole nears the unit circle, where a static curve that the record contradicts "
+          "costs nothing; keep poles off it, by stable:0.99 for instance")
 NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
 
