@@ -188,9 +188,11 @@ def _without_point(program: Program, answer: Answer, back_end: BackEnd, settings
         program.assign(program.start)
         if all(v.value is not None for v in program.variables.values()) and measure_violation(program)[0] < 1e-9:
             return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
-    if answer.status is Status.INFEASIBLE and _refutable(program) and satisfiable(
-            program, list(program.user_constraints)):
-        return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
+    if answer.status is Status.INFEASIBLE and satisfiable(program, list(program.user_constraints)):
+        if _refutable(program):
+            return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
+        if program.kind == "NLP":  # descents end where they can't go on, and say this of any place
+            return Status.FAILED, f"{name} claims infeasibility, which no convex relaxation of the constraints confirms"
     if answer.status is Status.UNBOUNDED:
         if program.objective.expr.is_nonneg():
             return Status.FAILED, f"{name} claims that there is no minimum, but the objective is never below zero"
