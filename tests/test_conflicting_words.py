@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import optid
-from optid.identify.prediction_error.curvature import Curvature, measured
+from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.program.solution import Status
 from optid.statistics.linearised import linearised
 
@@ -60,7 +60,7 @@ def test_measured_curvature_is_that_of_the_sum_of_squares(seed):
             return linearised(lambda _: [(rows, 20)], 1, 0, 3, method="qr")
 
     plain = Bent.linearise(np.zeros(3))
-    found = measured(Bent, np.zeros(3), plain)
+    found = measure_curvature(Bent, np.zeros(3), plain)
     sizes = np.linalg.norm(matrix, axis=0)
     curved = (matrix.T @ matrix + np.einsum("k,kij->ij", errors, bends) / 10) / np.outer(sizes, sizes)
     values, vectors = np.linalg.eigh(curved)

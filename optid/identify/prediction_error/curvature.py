@@ -57,7 +57,7 @@ class Curvature:
         return replace(at, given=((vectors * roots) @ vectors.T @ factor, (vectors / roots) @ vectors.T @ errors))
 
 
-def measured(criterion: Any, x: Array, at: Linearised) -> Linearised:
+def measure_curvature(criterion: Any, x: Array, at: Linearised) -> Linearised:
     """Return the errors of a criterion at x (n,) with their whole curvature, by central differences of the gradient.
 
     Along a flat valley linear errors promise next to nothing, and a step that heeds their bends goes on. Directions in

@@ -16,7 +16,7 @@ import numpy as np
 from optid.arrays import Array
 from optid.errors import RankError, StructureError
 from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, poles_of, slowed
-from optid.identify.prediction_error.curvature import Curvature, measured
+from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.identify.prediction_error.descent import STEPS, Descent
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
 from optid.program.program import Program
@@ -137,7 +137,7 @@ def _along_valley(fit: TangentFit, x: Array) -> Generator[Program, Solution, Arr
     first = here = _Iterate.of(fit, x)
     damping = 0.0
     for _ in range(ALL):
-        at, new = measured(fit.criterion, here.x, here.at), None
+        at, new = measure_curvature(fit.criterion, here.x, here.at), None
         while new is None and damping <= 1.0:
             solution = yield fit.pose(here.x, at, damping)
             if solution.has_point:
