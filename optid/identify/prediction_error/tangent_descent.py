@@ -22,7 +22,7 @@ from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
 from optid.program.program import Program
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
-from optid.statistics.linearised import Linearised
+from optid.statistics.linearised import CONDITION_LIMIT, Linearised
 
 # share of the sum of squares that a full step may still gain, as measured through a back end, whose accuracy limits it
 CONFIRMED = 1e-8
@@ -40,8 +40,10 @@ MOVED = 30  # the same of one from poles that were moved
 GOING, WORTH = 4, 1e-4  # how often an end that has not arrived is gone on from, and the share of the errors that pays
 # moves of poles along a border; share of the errors that one must gain, and all of them for an end to be no optimum
 ROUNDS, ALONG, BETTER = 12, 1e-6, 1e-5
-ALL, VALLEYS = 20, 5  # steps along a flat valley with all curvature, and how often they are gone on with
+ALL = 20  # steps along a flat valley with all curvature, before programmes of linear errors go on
 PARTS = 10  # halvings of an undamped step that are tried where no damped one descends
+IN_VALLEY = "the errors still fall along a flat valley"
+MEETING = "where poles meet on the border of their region the programmes have no answer, or creep"
 CREEPS = ("the errors still fall as a pole nears the unit circle, where a static curve that the record contradicts "
           "costs nothing; keep poles off it, by stable:0.99 for instance")
 NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
@@ -66,10 +68,13 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
     if here.program.user_constraints:
         # how well the record tells the unknowns: a constraint that it contradicts may end where f is all but flat
         figures["condition"] = found.at.condition
-        best = yield from _best_signed(here, fit.criterion.unit * found.value, figures)
-        end = yield from _settled(fit, best, figures)
-        return end if end is None or end.status is not Status.LIMIT or not _creeps(fit, end) else replace(
-            end, reason=CREEPS)
+        free = fit.criterion.unit * found.value
+        best = yield from _best_signed(here, free, figures)
+        if best is None:
+            return None
+        easy = best.objective <= free * (1 + CONFLICT) and found.at.condition < CONDITION_LIMIT
+        end = yield from _settled(fit, best, figures, easy)
+        return replace(end, reason=CREEPS) if end.status is Status.LIMIT and _creeps(fit, end) else end
     solution = yield here.program
     if not solution.has_point:
         return None
@@ -77,26 +82,27 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
     return here.evidence(*verdict, {**figures, "programmes": 1})
 
 
-def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) -> Procedure:
-    """Go on from an end while another way lowers the errors: more programmes, flat valleys, poles along their border.
+def _settled(fit: TangentFit, end: Evidence, figures: Mapping[str, Any], easy: bool) -> Procedure:
+    """Go on from an end while another way lowers the errors: along flat valleys, or with poles along their border.
 
+    An easy end is near the free optimum, where the record tells all unknowns: only poles on a border make it flat.
     Where two poles all but meet there, programmes have no answer any more; the errors as a function of these two, with
     everything else fitted, then say that a point is the best one near it, if nothing else is constrained.
     """
-    depth, tried, valleys = about_poles(fit.constraints), False, 0
+    depth, tried = about_poles(fit.constraints), False
     alone = all("poles" in getattr(rule, "about", ()) for rule in fit.constraints)
     for _ in range(ROUNDS):
-        if end is None or end.status not in (Status.LOCAL, Status.LIMIT, Status.INACCURATE):
+        if end.status not in (Status.LOCAL, Status.LIMIT, Status.INACCURATE):
             break
         best = before = fit.places.pack(end.values or {})
-        if end.status is Status.LOCAL and valleys < VALLEYS:
-            best, tried = (yield from _along_valley(fit, before)), True
-            valleys += best is not before
-        if best is before and depth is not None:
+        if depth is not None:
             best = along_border(fit.criterion, depth, before, ALONG, alone)
             if not alone:
                 best = yield from _beside_others(fit, before, (doubled(fit.criterion, depth, before), best), figures)
                 tried = True
+        on_border = best is not before
+        if not on_border and end.status is Status.LOCAL and not (easy and depth is None):
+            best, tried = (yield from _along_valley(fit, before)), True
         if best is before and (end.status is Status.LOCAL or depth is None):
             break
         there, tried = _Iterate.of(fit, best), True
@@ -108,18 +114,17 @@ def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) 
             end = again  # on the way, if not there
             continue
         two = alone and depth is not None and meet(fit.criterion, best)
+        two = two and (yield from _along_valley(fit, best)) is best
         gains = fit.criterion.unit * there.at.value < end.objective * (1 - BETTER)
         if end.status is Status.LOCAL and not gains and not two:
             break
         status = (Status.LOCAL, NO_BOUND.format(fit.criterion.errors)) if two else (
-            Status.LIMIT, "where poles meet on the border of their region the programmes have no answer, or creep")
+            Status.LIMIT, MEETING if on_border or end.status is not Status.LOCAL else IN_VALLEY)
         end = there.evidence(*status, end.figures)
         break
     else:
-        if end is not None:
-            reason = f"the errors still fall along a flat valley, or a border, after {ROUNDS} moves"
-            end = replace(end, status=Status.LIMIT, reason=reason)
-    if end is not None and tried:  # prices are those of the last programme
+        end = replace(end, status=Status.LIMIT, reason=f"{IN_VALLEY}, or a border, after {ROUNDS} moves")
+    if tried:  # prices are those of the last programme
         yield _end_of(fit, end).program
     return end
 
