@@ -1,7 +1,7 @@
 """Intake of arrays: what the caller passes becomes a read-only, time-first float64 copy, or a named error."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -84,6 +84,20 @@ def one_or_all(arrays: list[np.ndarray]) -> Any:
 def as_list(arrays: Any) -> list[np.ndarray]:
     """Return one array for each experiment, from what `one_or_all` made of them."""
     return list(arrays) if isinstance(arrays, tuple) else [arrays]
+
+
+def largest(amounts: Iterable[tuple[float, str]]) -> tuple[float, str]:
+    """Return the largest of amounts that are not negative, with its name: the first that is no number before all.
+
+    (0.0, "") where nothing is larger.
+    """
+    found = 0.0, ""
+    for amount, name in amounts:
+        if np.isnan(amount):
+            return amount, name
+        if amount > found[0]:
+            found = amount, name
+    return found
 
 
 def frozen(array: np.ndarray) -> np.ndarray:

@@ -106,3 +106,28 @@ def test_a_pole_that_a_programme_left_a_rounding_outside_does_not_hold_the_other
     end = border.along_border(criterion, depth, start, share)
     assert criterion.value(end) < 0.9 * border._fitted(criterion, start)[1]
     assert np.max(np.abs(border.poles_of(criterion, end))) <= radius + 1e-6
+
+
+def excited(seed, f):
+    """A plant of second order, poles near the real axis, behind a function, with a saturation of its output."""
+    rng = np.random.default_rng([seed, 7])
+    u = lfilter([1], [1, -rng.choice([0.0, 0.8])], rng.uniform(-1, 1, 250))
+    u /= np.abs(u).max()
+    turn = rng.uniform(0.6, 0.95) * np.exp(1j * rng.uniform(0, 0.6))
+    y = lfilter(rng.standard_normal(2), np.real(np.poly([turn, turn.conjugate()])), f(2 * u))
+    y = y / y.std() + (0.0 if seed == 12 else 0.2) * np.tanh(y / y.std())
+    return optid.Data(u[50:], (y / y.std() + 10 ** rng.uniform(-2, 0) * rng.standard_normal(250))[50:])
+
+
+def test_a_descent_from_moved_poles_that_fell_without_arriving_is_gone_on_from():
+    fit = optid.fit(excited(12, lambda v: v), "ss.exact", nx=2, constraints=["stable:0.7"])
+    assert fit.solution.status is Status.LOCAL
+    assert fit.solution.objective <= 86.2988  # two real poles that all but meet inside the circle: 86.5776
+
+
+@pytest.mark.slow
+def test_a_flat_valley_is_followed_and_not_called_an_optimum():
+    fit = optid.fit(excited(8, np.abs), "lfr.exact", nx=2, tries=1, constraints=["stable:0.7"], raises=False)
+    assert fit.solution.status is Status.LIMIT
+    assert fit.solution.objective < 22.7  # where linear errors promise 1e-7 of 22.80
+    assert "flat valley" in fit.solution.reason

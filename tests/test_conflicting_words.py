@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import optid
-from optid.identify.prediction_error.curvature import Curvature
+from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.program.solution import Status
 from optid.statistics.linearised import linearised
 
@@ -26,11 +26,47 @@ def record(seed):
         (8, "monotone:increasing", 134.292971), (11, "odd", 144.241427),
         # a slow pole turns the static gain
         (2, "range:low=-2,high=2", 81.323901), (3, "monotone:decreasing", 63.778834),
-        (12, "monotone:decreasing", 62.124550)))])
+        (12, "monotone:decreasing", 62.124550), (26, "range:low=-2,high=2", 73.309533)))])
 def test_words_that_the_record_contradicts_are_fitted_to_their_optimum(seed, word, least):
     fit = optid.fit(record(seed), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=[word])
     assert fit.solution.status is Status.LOCAL
     assert fit.solution.objective == pytest.approx(least, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_pole_that_creeps_to_the_unit_circle_is_named():
+    """There is no optimum: the nearer the pole, the smaller the static gain beside what the record shows."""
+    fit = optid.fit(record(20), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=["range:low=-2,high=2"],
+                    raises=False)
+    assert fit.solution.status is Status.LIMIT and "a pole nears the unit circle" in fit.solution.reason
+    assert fit.solution.objective < 84  # the descents of one hundred programmes ended at 110
+    assert 1 - np.abs(fit.model.poles).max() < 1 / 200
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_measured_curvature_is_that_of_the_sum_of_squares(seed):
+    """Squares of e = e0 + J x + x'B x / 20 have the curvature J'J + sum of e B / 10, which may bend down."""
+    rng = np.random.default_rng(seed)
+    matrix, errors, bends = rng.normal(size=(20, 3)), 5 * rng.normal(size=20), rng.normal(size=(20, 3, 3))
+    bends += bends.transpose(0, 2, 1)
+    units = np.array([1.0, 1e3, 1e-3])
+    matrix, bends = matrix * units, bends * np.outer(units, units)
+
+    class Bent:
+        @staticmethod
+        def linearise(x):
+            e = errors + matrix @ x + np.einsum("kij,i,j->k", bends, x, x) / 20
+            rows = np.column_stack([matrix + np.einsum("kij,j->ki", bends, x) / 10, e])
+            return linearised(lambda _: [(rows, 20)], 1, 0, 3, method="qr")
+
+    plain = Bent.linearise(np.zeros(3))
+    found = measure_curvature(Bent, np.zeros(3), plain)
+    sizes = np.linalg.norm(matrix, axis=0)
+    curved = (matrix.T @ matrix + np.einsum("k,kij->ij", errors, bends) / 10) / np.outer(sizes, sizes)
+    values, vectors = np.linalg.eigh(curved)
+    expected = (vectors * np.abs(values)) @ vectors.T  # with the size of what bends down
+    assert found.whole[0].T @ found.whole[0] / np.outer(sizes, sizes) == pytest.approx(expected, abs=1e-6)
+    assert found.pulled == pytest.approx(plain.pulled, rel=1e-9) and found.value == plain.value
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -9,13 +9,15 @@ from test_core import exact_problem, record
 
 import optid
 from formulations.arx import _problem as arx_problem
-from optid.core.judge import judge
+from optid.core.judge import judge, largest_excess
+from optid.core.leaves import LeafSpace, Quantity
 from optid.core.prices import price_constraints
 from optid.core.problem import Problem
 from optid.core.program import as_program
 from optid.core.terms import GroupNorms, NuclearNorms, Squares
 from optid.errors import DataWarning, StructureError
 from optid.identify.equation_error import compress
+from optid.program.solution import relative_gap
 from optid.registry import named_constraint
 from optid.solving.solve import solve
 
@@ -169,3 +171,31 @@ def test_a_constrained_fit_states_nothing_in_cvxpy_until_it_is_needed():
 def test_what_is_wrong_with_a_constraint_is_said_when_it_is_posed():
     with pytest.raises(StructureError, match="asks for 'q'"):
         optid.fit(RECORD, na=2, nb=2, basis="triangular:6", constraints=[lambda v: v["q"] <= 1])
+
+
+def test_what_is_no_number_is_a_violation_whatever_comes_after_it():
+    """A root of what has become negative is no number; the row after it holds."""
+    root = Quantity("root", lambda x: np.sqrt(x["x"]), lambda x: {"x": np.diag(0.5 / np.sqrt(x["x"]))})
+    squares = Squares(np.eye(1), np.array([-1.0]), 0.0, ("x",))
+    problem = Problem("rooted", {"x": np.ones(1)}, (squares,), (root,), builders=(
+        lambda v: {"root": v["root"] >= 0.5, "below": v["x"] <= 4.0},))
+    with np.errstate(invalid="ignore"):
+        found = judge(problem, {"x": -np.ones(1)}, {})
+        outside = largest_excess(problem, {"x": -np.ones(1)})
+    assert found.residuals.violation == found.residuals.stationarity == outside == np.inf
+    assert found.residuals.worst == "root"
+
+
+@pytest.mark.parametrize("objective, bound", [(np.nan, 1.0), (1.0, np.nan), (np.nan, np.nan)])
+def test_a_gap_of_what_is_no_number_proves_nothing(objective, bound):
+    assert not relative_gap(objective, bound, 1.0) <= 1.0
+    assert relative_gap(2.0, 1.0, 1.0) == 0.5 and relative_gap(1.0, 2.0, 1.0) == 0.0
+    assert relative_gap(1.0, -np.inf, 1.0) == np.inf
+
+
+def test_a_matrix_with_what_is_no_number_is_not_definite():
+    held = Problem("matrix", {"x": np.eye(2)}, (Squares(np.eye(4), np.zeros(4), 0.0, ("x",)),), builders=(
+        lambda v: {"above": v["x"] >> 0},), symmetric=frozenset({"x"})).constraints()[0]
+    space = LeafSpace({"x": np.eye(2)}, frozenset({"x"}))
+    assert np.isnan(held.violation(space, {"x": np.full((2, 2), np.nan)}))
+    assert held.violation(space, {"x": np.diag([1.0, -2.0])}) == pytest.approx(2.0)

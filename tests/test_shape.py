@@ -156,21 +156,29 @@ def test_cones_of_smooth_bases_hold_between_their_points(basis, rule, order):
     assert min(np.max(-steps), np.max(steps)) < 1e-4 * np.max(np.abs(steps)) + 3e-5 * (order == 1)
 
 
+@pytest.mark.parametrize("form, arguments, near", [
+    ("hammerstein_arx.exact", {"na": 1, "nb": 1, "nk": 1}, 1e-7),
+    ("hammerstein_oe.exact", {"na": 1, "nb": 1, "nk": 1}, 3e-6),
+    ("hammerstein_ss.exact", {"nx": 1, "feedthrough": False}, 3e-6)], ids=["arx", "oe", "ss"])
 @pytest.mark.parametrize("degree", [4, 9])
-def test_words_about_a_polynomial_hold_between_any_points(degree):
+def test_words_about_a_polynomial_hold_between_any_points(degree, form, arguments, near):
     rng = np.random.default_rng(degree)
     u = rng.uniform(-1, 1, 300)
     y = plant_response(np.tanh(4 * u) + 0.3 * np.sin(9 * u)) + 0.05 * rng.normal(size=300)
     fine = np.linspace(-0.9999, 0.9999, 40_001)
     for word, low, high in (("monotone", 0.0, np.inf), ("slope:0.2,3", 0.2, 3.0), ("range:-0.9,0.8", -0.9, 0.8)):
-        fit = optid.fit(optid.Data(u, y), "hammerstein_arx.exact", na=1, nb=1, nk=1, basis=f"polynomial:{degree}",
-                        constraints=[word], prove=False)
+        fit = optid.fit(optid.Data(u, y), form, basis=f"polynomial:{degree}", constraints=[word], prove=False,
+                        **arguments)
         lo, hi = fit.model.nonlinearities[0].basis.interval
         points = fine * (hi - lo) / 2 + (hi + lo) / 2
         f = fit.model.nonlinearities[0]
-        gain = fit.model.b[0].sum() / (1 + fit.model.a.sum())
-        values = static(fit.model, points) if word[0] == "r" else f.slope(points) * gain
-        assert values.min() >= low - 1e-7 and values.max() <= high + 1e-7  # to the accuracy of the solver
+        if form == "hammerstein_ss.exact":
+            gain = float(np.squeeze(fit.model.C @ np.linalg.solve(np.eye(1) - fit.model.A, fit.model.B)))
+            curve = gain * f(points) + np.squeeze(fit.model.equilibrium(np.zeros(1))[1]) - gain * f(np.zeros(1))
+        else:
+            gain, curve = fit.model.b[0].sum() / (1 + fit.model.a.sum()), static(fit.model, points)
+        values = curve if word[0] == "r" else f.slope(points) * gain
+        assert values.min() >= low - near and values.max() <= high + near  # to the accuracy of the solver
         assert min(values.min() - low, high - values.max()) < 0.05  # and not by much less than it allows
 
 

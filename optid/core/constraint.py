@@ -120,7 +120,7 @@ class Constraint:
         if self.is_equality:
             return float(np.sum(np.abs(g)))
         if self.cone == "psd":
-            return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
+            return largest_eigenvalue(g)
         return float(np.sum(np.maximum(g, 0.0)))
 
 
@@ -131,6 +131,11 @@ def join_by_name(constraints: Sequence[Constraint], parts: Sequence[Array]) -> d
         found.setdefault(one.name, []).append((one.position, part))
     return {name: np.concatenate([part for _, part in sorted(several, key=lambda pair: pair[0])])
             for name, several in found.items()}
+
+
+def largest_eigenvalue(vector: Array) -> float:
+    """Return that of the symmetric part of a square matrix that is flat, not below zero; NaN where an entry is NaN."""
+    return max(0.0, float(np.linalg.eigvalsh(symmetric_part(vector))[-1])) if np.all(np.isfinite(vector)) else np.nan
 
 
 def symmetric_part(vector: Array) -> Array:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from optid.arrays import Array
-from optid.core.constraint import Constraint, symmetric_part
+from optid.arrays import Array, largest
+from optid.core.constraint import Constraint, largest_eigenvalue, symmetric_part
 from optid.core.leaves import LeafSpace
 from optid.core.problem import Problem
 from optid.core.terms import GroupNorms, Length, NuclearNorms, Values, flat
@@ -93,25 +93,22 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     if not all(np.all(np.isfinite(x[name])) for name in problem.start):
         return Judgement(np.nan, Residuals(np.inf, "", np.inf, np.inf), {}, False, np.zeros(len(problem.gauged)))
     rows = rows_at(problem, x)
-    violation, worst = 0.0, ""
+    amounts = []
     for product in problem.gauged:
         level, parts = product.level(x)
-        amount = abs(level) / (1.0 + sum(float(np.sum(np.abs(flat(x[name])))) for name in parts))
-        if not amount <= violation:  # also true for nan
-            violation, worst = amount, "gauge"
+        amounts.append((abs(level) / (1.0 + sum(float(np.sum(np.abs(flat(x[name])))) for name in parts)), "gauge"))
     for name in problem.symmetric:
         amount = float(np.max(np.abs(x[name] - x[name].T), initial=0.0)) / (1.0 + float(np.max(np.abs(x[name]))))
-        if not amount <= violation:
-            violation, worst = amount, f"symmetry of {name}"
+        amounts.append((amount, f"symmetry of {name}"))
     for name, (low, high) in problem.bounds.items():
         amount = float(np.max(np.maximum(low - x[name], x[name] - high), initial=0.0)) / _width(problem, x, name)
-        if not amount <= violation:
-            violation, worst = amount, name
-    for row in rows:
-        if not row.excess <= violation:
-            violation, worst = row.excess, row.constraint.name
+        amounts.append((amount, name))
+    violation, worst = largest([*amounts, *((row.excess, row.constraint.name) for row in rows)])
 
     lagrangian = LagrangianAtPoint.of(problem, x)
+    if not np.isfinite(violation):
+        rest = Residuals(np.inf, worst, np.inf, np.inf)
+        return Judgement(lagrangian.value, rest, {}, False, np.zeros(len(problem.gauged)))
     given, fitted = _projected(rows, duals), False
     if not problem.is_measured:
         best = np.nan, np.nan
@@ -127,7 +124,7 @@ def judge(problem: Problem, x: Values, duals: Mapping[str, Array]) -> Judgement:
     named: dict[str, list[Array]] = {}
     for row, part in zip(rows, given or ()):
         named.setdefault(row.constraint.name, []).append(part)
-    return Judgement(lagrangian.value, Residuals(violation if np.isfinite(violation) else np.inf, worst, *best),
+    return Judgement(lagrangian.value, Residuals(violation, worst, *best),
                      {name: np.concatenate(parts) for name, parts in named.items()}, fitted,
                      lagrangian.gauge_multipliers(rows, given or ()))
 
@@ -156,12 +153,14 @@ def largest_excess(problem: Problem, x: Values, unknowns: frozenset[str] = froze
 
     All of them, or those that speak about the named unknowns alone.
     """
-    y, worst = problem.leaf_values(x), 0.0
-    for one in problem.constraints(x):
-        if not unknowns or one.leaves(problem.space) <= unknowns:
-            g = one.residual(problem.space, y)
-            amount = _excess(one, g) / sizes_of_terms(one, one.slope(problem.space, y), g, problem.space, y)[0]
-            worst = worst if amount <= worst else amount  # also nan
+    y = problem.leaf_values(x)
+
+    def amount(one: Constraint) -> float:
+        g = one.residual(problem.space, y)
+        return _excess(one, g) / sizes_of_terms(one, one.slope(problem.space, y), g, problem.space, y)[0]
+
+    worst, _ = largest((amount(one), one.name) for one in problem.constraints(x)
+                       if not unknowns or one.leaves(problem.space) <= unknowns)
     return worst if np.isfinite(worst) else float("inf")
 
 
@@ -170,7 +169,7 @@ def _excess(one: Constraint, g: Array) -> float:
     if not np.all(np.isfinite(g)):
         return float("inf")
     if one.cone == "psd":
-        return max(0.0, float(np.max(np.linalg.eigvalsh(symmetric_part(g)))))
+        return largest_eigenvalue(g)
     return float(np.max(np.abs(g) if one.is_equality else np.maximum(g, 0.0), initial=0.0))
 
 
@@ -236,15 +235,13 @@ class LagrangianAtPoint:
             total = self._symmetric(total)
         if any(isinstance(term, Length) for term in problem.terms):
             total = total + self._eased(total)
-        worst = 0.0
+        rates = []
         for name, place in problem.slices.items():
             part, effort = self._free_part(name, total[place], terms[place])
             size = variable_size(self.x[name], problem.space.usual_sizes.get(name))
-            here = relative_gradient(np.abs(part), effort, self.yardstick, size)
-            if not here <= worst:
-                worst = here
+            rates.append((relative_gradient(np.abs(part), effort, self.yardstick, size), name))
         # relative to a hundredth of the zero model's objective where the objective vanishes
-        return worst, products / max(abs(self.value), 1e-2 * problem.scale, np.finfo(float).tiny)
+        return largest(rates)[0], products / max(abs(self.value), 1e-2 * problem.scale, np.finfo(float).tiny)
 
     def floor(self) -> Array:
         """Return what the components of the gradient are relative to (unknowns,)."""

@@ -166,6 +166,8 @@ def tolerance(accuracy: float) -> float:
 def relative_gap(objective: float, bound: float, scale: float) -> float:
     """Return ``(F - D) / max(F, 1e-9 scale)``, never below zero, for the value F reached and the certified bound D.
 
-    The floor, with the scale ``YᵀY``, keeps noise-free problems meaningful.
+    The floor, with the scale ``YᵀY``, keeps noise-free problems meaningful. Where one of them is no number, neither is
+    the gap.
     """
-    return max(0.0, objective - bound) / max(objective, 1e-9 * scale, np.finfo(float).tiny)
+    gap = objective - bound
+    return gap if np.isnan(gap) else max(0.0, gap) / max(objective, 1e-9 * scale, np.finfo(float).tiny)

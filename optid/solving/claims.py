@@ -159,9 +159,11 @@ def _without_point(program: Program, answer: Answer, back_end: BackEnd, settings
     if answer.status is Status.INFEASIBLE:
         if judge(program.core, program.core.start, {}).residuals.violation < 1e-9:
             return Status.FAILED, f"{name} claims infeasibility, but the start satisfies every constraint"
-    if answer.status is Status.INFEASIBLE and _refutable(program) and satisfiable(
-            program, list(program.user_constraints)):
-        return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
+    if answer.status is Status.INFEASIBLE and satisfiable(program, list(program.user_constraints)):
+        if _refutable(program):
+            return Status.FAILED, f"{name} claims infeasibility, but no constraints contradict each other"
+        if program.kind == "NLP":  # descents end where they can't go on, and say this of any place
+            return Status.FAILED, f"{name} claims infeasibility, which no convex relaxation of the constraints confirms"
     if answer.status is Status.UNBOUNDED:
         if all(isinstance(term, Squares) for term in program.core.terms) or program.objective.expr.is_nonneg():
             return Status.FAILED, f"{name} claims that there is no minimum, but the objective is never below zero"

@@ -7,6 +7,7 @@ A symmetric matrix of secants stands for it (Dennis, Gay & Welsch, ACM Transacti
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from optid.arrays import Array
 from optid.statistics.linearised import Linearised
 
 LEAST, MOST = 0.05, 1e6  # curvature of a direction beside that of the linear errors
+STEP = 1e-5  # of the differences that measure it, in errors beside all of them
+FLAT = 1e-10  # curvature of a direction, beside that of single unknowns, at least
 
 
 class Curvature:
@@ -52,3 +55,24 @@ class Curvature:
             return at
         roots = np.sqrt(np.clip(1.0 + values / 2, LEAST, MOST))
         return replace(at, given=((vectors * roots) @ vectors.T @ factor, (vectors / roots) @ vectors.T @ errors))
+
+
+def measure_curvature(criterion: Any, x: Array, at: Linearised) -> Linearised:
+    """Return the errors of a criterion at x (n,) with their whole curvature, by central differences of the gradient.
+
+    Along a flat valley linear errors promise next to nothing, and a step that heeds their bends goes on. Directions in
+    which the sum of squares bends down count with the size of their curvature.
+    """
+    factor = at.whole[0]
+    sizes = np.linalg.norm(factor, axis=0)
+    sizes = np.maximum(sizes, 1e-8 * float(sizes.max(initial=1e-300)))
+    slopes = []
+    for step, moved in zip(STEP * np.sqrt(at.value) / sizes, np.diag(STEP * np.sqrt(at.value) / sizes)):
+        high, low = criterion.linearise(x + moved), criterion.linearise(x - moved)
+        if not np.isfinite(high.value + low.value):
+            return at
+        slopes.append((high.pulled - low.pulled) / (2 * step))
+    scaled = (np.array(slopes) + np.transpose(slopes)) / np.outer(2 * sizes, sizes)
+    values, vectors = np.linalg.eigh(scaled)
+    roots = np.sqrt(np.maximum(np.abs(values), FLAT))
+    return replace(at, given=((vectors * roots).T * sizes, (vectors / roots).T @ (at.pulled / sizes)))

@@ -16,13 +16,13 @@ import numpy as np
 from optid.arrays import Array
 from optid.core.program import Program
 from optid.errors import RankError, StructureError
-from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, slowed
-from optid.identify.prediction_error.curvature import Curvature
+from optid.identify.prediction_error.border import about_poles, along_border, doubled, meet, poles_of, slowed
+from optid.identify.prediction_error.curvature import Curvature, measure_curvature
 from optid.identify.prediction_error.descent import STEPS, Descent
 from optid.identify.prediction_error.tangent_fit import INSIDE, TangentFit
 from optid.program.solution import Bound, Solution, Status
 from optid.solving.solve import Evidence, Procedure
-from optid.statistics.linearised import Linearised
+from optid.statistics.linearised import CONDITION_LIMIT, Linearised
 
 # share of the sum of squares that a full step may still gain, as measured through a back end, whose accuracy limits it
 CONFIRMED = 1e-8
@@ -35,10 +35,17 @@ PATIENCE = 5  # undamped programmes in all that may promise no more than `STALLE
 # from this damping on, with which it is nearly the shortest one, in any case
 TRUSTED, NEAR = 10.0, 1e-2
 CONFLICT = 0.1  # share of the errors above the free optimum from which descents from other signs are worth their time
-MIRRORED = 30  # programmes of a descent from the other sign of f, after which it goes on only where it is better
+SIGNED = 60  # programmes of a descent from other signs, which goes on only where it is better
+MOVED = 30  # the same of one from poles that were moved
+GOING, WORTH = 4, 1e-4  # how often an end that has not arrived is gone on from, and the share of the errors that pays
 # moves of poles along a border; share of the errors that one must gain, and all of them for an end to be no optimum
 ROUNDS, ALONG, BETTER = 12, 1e-6, 1e-5
+ALL = 20  # steps along a flat valley with all curvature, before programmes of linear errors go on
 PARTS = 10  # halvings of an undamped step that are tried where no damped one descends
+IN_VALLEY = "the errors still fall along a flat valley"
+MEETING = "where poles meet on the border of their region the programmes have no answer, or creep"
+CREEPS = ("the errors still fall as a pole nears the unit circle, where a static curve that the record contradicts "
+          "costs nothing; keep poles off it, by stable:0.99 for instance")
 NO_BOUND = "the {} are not convex in poles and zeros: no lower bound is known, several starts are compared"
 
 
@@ -61,8 +68,13 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
     if here.program.user_constraints:
         # how well the record tells the unknowns: a constraint that it contradicts may end where f is all but flat
         figures["condition"] = found.at.condition
-        best = yield from _best_signed(here, fit.criterion.unit * found.value, figures)
-        return (yield from _settled(fit, best, figures))
+        free = fit.criterion.unit * found.value
+        best = yield from _best_signed(here, free, figures)
+        if best is None:
+            return None
+        easy = best.objective <= free * (1 + CONFLICT) and found.at.condition < CONDITION_LIMIT
+        end = yield from _settled(fit, best, figures, easy)
+        return replace(end, reason=CREEPS) if end.status is Status.LIMIT and _creeps(fit, end) else end
     solution = yield here.program
     if not solution.has_point:
         return None
@@ -70,43 +82,79 @@ def refine(fit: TangentFit, found: Descent, figures: Mapping[str, Any], x: Array
     return here.evidence(*verdict, {**figures, "programmes": 1})
 
 
-def _settled(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) -> Procedure:
-    """Go on where poles that move along the border of their region lower the errors.
+def _settled(fit: TangentFit, end: Evidence, figures: Mapping[str, Any], easy: bool) -> Procedure:
+    """Go on from an end while another way lowers the errors: along flat valleys, or with poles along their border.
 
+    An easy end is near the free optimum, where the record tells all unknowns: only poles on a border make it flat.
     Where two poles all but meet there, programmes have no answer any more; the errors as a function of these two, with
     everything else fitted, then say that a point is the best one near it, if nothing else is constrained.
     """
     depth, tried = about_poles(fit.constraints), False
+    alone = all("poles" in getattr(rule, "about", ()) for rule in fit.constraints)
     for _ in range(ROUNDS):
-        if end is None or depth is None or end.status not in (Status.LOCAL, Status.LIMIT, Status.INACCURATE):
+        if end.status not in (Status.LOCAL, Status.LIMIT, Status.INACCURATE):
             break
-        alone = all("poles" in getattr(rule, "about", ()) for rule in fit.constraints)
-        before = fit.places.pack(end.values or {})
-        best = along_border(fit.criterion, depth, before, ALONG, alone)
-        if not alone:
-            best = yield from _beside_others(fit, before, (doubled(fit.criterion, depth, before), best), figures)
-            tried = True
-        if best is before and end.status is Status.LOCAL:
+        best = before = fit.places.pack(end.values or {})
+        if depth is not None:
+            best = along_border(fit.criterion, depth, before, ALONG, alone)
+            if not alone:
+                best = yield from _beside_others(fit, before, (doubled(fit.criterion, depth, before), best), figures)
+                tried = True
+        on_border = best is not before
+        if not on_border and end.status is Status.LOCAL and not (easy and depth is None):
+            best, tried = (yield from _along_valley(fit, before)), True
+        if best is before and (end.status is Status.LOCAL or depth is None):
             break
         there, tried = _Iterate.of(fit, best), True
-        again = yield from _constrained(there, figures, MIRRORED)
-        if again is None or again.status is not Status.LOCAL or not again.objective < end.objective:
-            two = alone and meet(fit.criterion, best)
-            gains = fit.criterion.unit * there.at.value < end.objective * (1 - BETTER)
-            if end.status is Status.LOCAL and not gains and not two:
-                break
-            status = (Status.LOCAL, NO_BOUND.format(fit.criterion.errors)) if two else (
-                Status.LIMIT, "where poles meet on the border of their region the programmes have no answer, or creep")
-            end = there.evidence(*status, end.figures)
+        again = yield from _constrained(there, figures, MOVED)
+        least = min(end.objective, fit.criterion.unit * there.at.value)
+        if _is_inside(fit, again) and (
+                again.status is Status.LOCAL and again.objective < end.objective
+                or again.objective < least * (1 - WORTH)):
+            end = again  # on the way, if not there
+            continue
+        two = alone and depth is not None and meet(fit.criterion, best)
+        two = two and (yield from _along_valley(fit, best)) is best
+        gains = fit.criterion.unit * there.at.value < end.objective * (1 - BETTER)
+        if end.status is Status.LOCAL and not gains and not two:
             break
-        end = again
+        status = (Status.LOCAL, NO_BOUND.format(fit.criterion.errors)) if two else (
+            Status.LIMIT, MEETING if on_border or end.status is not Status.LOCAL else IN_VALLEY)
+        end = there.evidence(*status, end.figures)
+        break
     else:
-        if end is not None:
-            reason = f"the errors still fall along the border after {ROUNDS} moves"
-            end = replace(end, status=Status.LIMIT, reason=reason)
-    if end is not None and tried:  # prices are those of the last programme
+        end = replace(end, status=Status.LIMIT, reason=f"{IN_VALLEY}, or a border, after {ROUNDS} moves")
+    if tried:  # prices are those of the last programme
         yield _end_of(fit, end).program
     return end
+
+
+def _creeps(fit: TangentFit, end: Evidence) -> bool:
+    """Whether the slowest pole of an end that has not arrived acts longer than an experiment."""
+    criterion = fit.criterion
+    longest = max(e.n_samples for e in criterion.data.experiments)
+    known = criterion.dynamics in criterion.unknowns.slices
+    return known and float(np.abs(poles_of(criterion, fit.places.pack(end.values or {}))).max()) > 1 - 1 / longest
+
+
+def _along_valley(fit: TangentFit, x: Array) -> Generator[Program, Solution, Array]:
+    """Return x, or a better point along a flat valley: by programmes with the curvature of the errors, measured."""
+    first = here = _Iterate.of(fit, x)
+    damping = 0.0
+    for _ in range(ALL):
+        at, new = measure_curvature(fit.criterion, here.x, here.at), None
+        while new is None and damping <= 1.0:
+            solution = yield fit.pose(here.x, at, damping)
+            if solution.has_point:
+                gain, new = here.gain(step := here.step(solution), at), here.moved(here.x + step)
+                damping = damping if gain > ALONG * here.at.value else np.inf
+                if new is not None and (new.outside > INSIDE or not here.at.value - new.at.value >= 0.1 * gain > 0):
+                    new = None
+            damping = damping if new is not None else max(10 * damping, 1e-8)
+        if new is None or not damping < np.inf:
+            break
+        here, damping = new, 0.01 * damping if damping > 1e-8 else 0.0
+    return here.x if here.at.value < first.at.value * (1 - BETTER) else x
 
 
 def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], figures: Mapping[str, Any]
@@ -120,7 +168,7 @@ def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], fig
         word = fit.criterion.dynamics
         part = fit.criterion.unknowns.parts(point)[word]
         still = fit.under((*others, lambda view, at=part, word=word: {"poles": view[word] == at}))
-        end = yield from _constrained(_Iterate.of(still, point), figures, MIRRORED)
+        end = yield from _constrained(_Iterate.of(still, point), figures, MOVED)
         there = None if end is None else _end_of(fit, end)
         if there is not None and there.outside <= INSIDE and there.at.value < least:
             best, least = there.x, there.at.value
@@ -191,24 +239,41 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     Constraints that the record contradicts have several local optima; near the free optimum there is one. A slow pole
     is another way to the characteristic that they ask for.
     """
+    fit = here.fit
     best = yield from _constrained(here, figures)
     if best is not None and best.objective <= free * (1 + CONFLICT):
         return best
-    criterion = here.fit.criterion
-    known = about_poles(here.fit.constraints) or criterion.dynamics not in criterion.unknowns.slices
-    slow = None if known else slowed(criterion, here.x)
-    slow_ones = [] if slow is None else [slow, *here.fit.mirrored(slow, [(-1, -1)])]
-    for start in (*here.fit.mirrored(here.x), *slow_ones):
-        end = yield from _constrained(_Iterate.of(here.fit, start), figures, MIRRORED)
+    known = about_poles(fit.constraints) or fit.criterion.dynamics not in fit.criterion.unknowns.slices
+    slow = None if known else slowed(fit.criterion, here.x)
+    best = yield from _gone_on(fit, best, figures)
+    slow_ones = [] if slow is None else [slow, *fit.mirrored(slow, same=True)]
+    for start in (*fit.mirrored(here.x, same=True), *fit.mirrored(here.x), *slow_ones):
+        end = yield from _constrained(_Iterate.of(fit, start), figures, SIGNED)
         if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
             continue
-        if end.status is not Status.LOCAL:
-            end = yield from _constrained(_end_of(here.fit, end), figures)
-        if end is None or best is not None and not end.objective < best.objective:
-            continue
-        if _end_of(here.fit, end).outside <= INSIDE:
+        end = yield from _gone_on(fit, end, figures)
+        if _is_inside(fit, end) and (best is None or end.objective < best.objective):
             best = end
     return best
+
+
+def _gone_on(fit: TangentFit, end: Evidence | None, figures: Mapping[str, Any]) -> Procedure:
+    """Go on from an end that has not arrived, while that lowers the errors by what is worth it or leads inside."""
+    for _ in range(GOING):
+        if end is None or end.status is Status.LOCAL:
+            break
+        again, inside = (yield from _constrained(_end_of(fit, end), figures)), _is_inside(fit, end)
+        if again is None or inside and not (_is_inside(fit, again) and again.objective < end.objective):
+            break
+        worth = not inside or again.objective < end.objective * (1 - WORTH)
+        end = again
+        if not worth:
+            break
+    return end
+
+
+def _is_inside(fit: TangentFit, end: Evidence | None) -> bool:
+    return end is not None and _end_of(fit, end).outside <= INSIDE
 
 
 def _end_of(fit: TangentFit, end: Evidence) -> _Iterate:

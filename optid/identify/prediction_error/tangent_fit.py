@@ -132,12 +132,14 @@ class TangentFit:
         """Return x with the signs of mu and b that the constraints ask for."""
         return with_signs(self.criterion, x, self.excess if self.constraints else None)
 
-    def mirrored(self, x: Array, pairs: Sequence[tuple[int, int]] = ((-1, -1), (1, -1), (-1, 1))) -> Iterator[Array]:
-        """Yield x with other pairs of signs of mu and b of every input.
+    def mirrored(self, x: Array, same: bool = False) -> Iterator[Array]:
+        """Yield x with other pairs of signs of mu and b of every input, of the same function or of its negative.
 
-        What a word says of f may be nearer to one of them, and its optimum to another: f may be convex either way.
+        What a word says of f may be nearer to one of them, and its optimum to another: f may be convex either way. Two
+        descriptions of one function are the same to constraints that speak about it alone.
         """
-        at = self.criterion.unknowns.slices
+        at, told = self.criterion.unknowns.slices, self.problem.fixes_signs
+        pairs = ([(-1, -1)] if told else []) if same else [(1, -1), (-1, 1)] if told else [(1, -1)]
         for mu, b in self.criterion.unknowns.products if self.criterion.gauge == "norm" else ():
             for mu_sign, b_sign in pairs if mu.startswith("mu") else ():
                 turned = np.array(x)
