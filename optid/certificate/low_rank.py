@@ -19,7 +19,7 @@ def certify_low_rank(problem: Problem, values: Values, duals: Values) -> Bound:
     numbers = form.problem
     v, theta = np.asarray(values["yhat"]), np.asarray(values.get("T", np.zeros((0, numbers.l))))
     objective, candidates = numbers.value(v, theta, form.weight), []
-    if "structure" in duals:
+    if np.size(duals.get("structure", ())) == np.prod(numbers.shape):
         candidates.append(-np.reshape(duals["structure"], numbers.shape, order="F"))
     left, _, right = np.linalg.svd(numbers.matrix(v, theta), full_matrices=False)
     candidates.append(left @ right)
