@@ -26,7 +26,9 @@ def record(seed):
         (8, "monotone:increasing", 134.292971), (11, "odd", 144.241427),
         # a slow pole turns the static gain
         (2, "range:low=-2,high=2", 81.323901), (3, "monotone:decreasing", 63.778834),
-        (12, "monotone:decreasing", 62.124550), (26, "range:low=-2,high=2", 73.309533)))])
+        (12, "monotone:decreasing", 62.124550), (26, "range:low=-2,high=2", 73.309533),
+        # from the poles of the free optimum, held at first
+        (41, "odd", 154.002735), (83, "odd", 166.379175)))])
 def test_words_that_the_record_contradicts_are_fitted_to_their_optimum(seed, word, least):
     fit = optid.fit(record(seed), "hammerstein_ss.exact", nx=2, basis="triangular:6", constraints=[word])
     assert fit.solution.status is Status.LOCAL

@@ -165,14 +165,19 @@ def _beside_others(fit: TangentFit, x: Array, moved: Iterable[Array | None], fig
     for point in moved:
         if point is None or point is x:
             continue
-        word = fit.criterion.dynamics
-        part = fit.criterion.unknowns.parts(point)[word]
-        still = fit.under((*others, lambda view, at=part, word=word: {"poles": view[word] == at}))
-        end = yield from _constrained(_Iterate.of(still, point), figures, MOVED)
+        end = yield from _with_poles(fit, point, others, figures)
         there = None if end is None else _end_of(fit, end)
         if there is not None and there.outside <= INSIDE and there.at.value < least:
             best, least = there.x, there.at.value
     return best
+
+
+def _with_poles(fit: TangentFit, x: Array, rules: tuple[Any, ...], figures: Mapping[str, Any]) -> Procedure:
+    """Fit everything but the poles of x again, under rules."""
+    word = fit.criterion.dynamics
+    part = fit.criterion.unknowns.parts(x)[word]
+    still = fit.under((*rules, lambda view: {"poles": view[word] == part}))
+    return (yield from _constrained(_Iterate.of(still, x), figures, MOVED))
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,7 +242,7 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
     """Return the best end of descents from all signs of f and B, where the first ends far above the free optimum.
 
     Constraints that the record contradicts have several local optima; near the free optimum there is one. A slow pole
-    is another way to the characteristic that they ask for.
+    is another way to the characteristic that they ask for, and so are the poles of the free optimum, held at first.
     """
     fit = here.fit
     best = yield from _constrained(here, figures)
@@ -245,9 +250,11 @@ def _best_signed(here: _Iterate, free: float, figures: Mapping[str, Any]) -> Pro
         return best
     known = about_poles(fit.constraints) or fit.criterion.dynamics not in fit.criterion.unknowns.slices
     slow = None if known else slowed(fit.criterion, here.x)
+    held = None if known else (yield from _with_poles(fit, here.x, fit.constraints, figures))
     best = yield from _gone_on(fit, best, figures)
     slow_ones = [] if slow is None else [slow, *fit.mirrored(slow, same=True)]
-    for start in (*fit.mirrored(here.x, same=True), *fit.mirrored(here.x), *slow_ones):
+    free_ones = [] if held is None else [fit.places.pack(held.values or {})]
+    for start in (*fit.mirrored(here.x, same=True), *fit.mirrored(here.x), *slow_ones, *free_ones):
         end = yield from _constrained(_Iterate.of(fit, start), figures, SIGNED)
         if end is None or best is not None and not end.objective < best.objective * (1 + CONFLICT):
             continue
