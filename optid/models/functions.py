@@ -112,8 +112,9 @@ def free_parameters(model: Any) -> int:
         return len(model.parameters)
     if model.structure == "process":
         dynamics = sum(one.p.size for one in model.processes)
-        levels = 1 if model.levels is None else model.levels.size
-        return int(dynamics + sum(f.mu.size for f in model.nonlinearities) + levels + (model.drift != 0))
+        levels = model.l if model.levels is None else model.levels.size
+        drifts = np.count_nonzero(model.drift)
+        return int(dynamics + sum(f.mu.size for f in model.nonlinearities) + levels + drifts)
     shapes = sum(f.basis.size - 1 for f in model.nonlinearities)
     constants = model.l if model.levels is None else model.levels.size
     if model.structure != "ss":

@@ -85,6 +85,12 @@ class View(Mapping[str, cp.Expression]):
         self._auxiliaries.add(variable.id)
         return variable
 
+    def part(self, inner: Mapping[str, cp.Expression], **facts: Any) -> "View":
+        """Return a view of other expressions, whose auxiliary variables are those of this one."""
+        made = View(inner, **facts)
+        made._auxiliaries = self._auxiliaries
+        return made
+
     def owns(self, variable: cp.Variable) -> bool:
         """Whether a variable came from `auxiliary`."""
         return variable.id in self._auxiliaries

@@ -12,7 +12,6 @@ at kinks first. What is not discarded holds the optimum: its middle is a start t
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -310,13 +309,9 @@ def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array 
     return found.point if found.best < value * (1 - GAP) else None
 
 
-def certificate(errors: ProcessErrors) -> Callable[[ProcessErrors, ProcessBox, float], Bound]:
-    """Return what bounds the errors of a fit within a box from below."""
+def certify(errors: ProcessErrors, box: ProcessBox, value: float) -> Bound:
+    """Bound the errors of a fit within a box from below, in units of the record, where there is a method."""
     if not applies(errors):
-        return lambda *_: Bound.none(REASON)
-
-    def certify(errors: ProcessErrors, box: ProcessBox, value: float) -> Bound:
-        found = BranchAndBound(errors, box).certify(value)
-        return replace(found, value=errors.unit * found.value)
-
-    return certify
+        return Bound.none(REASON)
+    found = BranchAndBound(errors, box).certify(value)
+    return replace(found, value=errors.unit * found.value)

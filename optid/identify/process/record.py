@@ -1,17 +1,19 @@
 """A record as the errors of processes need it: its instants, its units, and what it cannot tell refused by name."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array, check_integer, one_of
-from optid.bases import Linear, fitted_bases
+from optid.bases import Basis, Linear, fitted_bases
 from optid.data.record import Data
 from optid.data.stretches import with_whole_inputs
 from optid.errors import DataError, StructureError
-from optid.identify.arguments import check_offset, one_output
+from optid.identify.arguments import check_offset, outputs_in_memory
 from optid.identify.process.errors import ProcessErrors, ProcessUnknowns
+from optid.identify.process.outputs import OutputErrors
 from optid.models.process import HOLDS
 from optid.models.process_dynamics import ProcessStructure, read_structures
 from optid.program.units import in_units, inner_bases, own_units
@@ -41,31 +43,43 @@ def process_type(poles: int, zero: bool, delay: bool, integrator: bool) -> Proce
     return ProcessStructure(check_integer(poles, "poles", 0), False, bool(zero), bool(delay), bool(integrator))
 
 
-def process_errors(data: Data, process: Any, basis: Any, terms: Terms, times: Any = None) -> ProcessErrors:
+def process_errors(data: Data, process: Any, basis: Any, terms: Terms, times: Any = None) -> OutputErrors:
     """Check the arguments of a fit, and return its errors on the record in units of their own.
 
     Arguments and errors as of `formulations.process.process`.
     """
-    data = one_output(data, "simulation errors")
-    constants, free = check_offset(terms.offset, data), terms.initial == "free"
-    structures = read_structures(process, data.inputs)
-    instants = read_times(data, times)
+    data = outputs_in_memory(data, "simulation errors")
+    rows = read_structures(process, data.inputs, data.outputs)
+    instants, free = read_times(data, times), terms.initial == "free"
     if any(np.isnan(e.u).any() for e in data.experiments):
         if times is not None:
             raise DataError("inputs are missing in a record with times of its own: fill them with the value that was "
                             "held, or leave those samples out of the record and of the times")
         data, free = with_whole_inputs(data, SHORTEST), True  # no stretch but the first may begin at rest
         instants = read_times(data, None)
-    refuse_still_inputs(data)
     bases = fitted_bases(data, basis)
+    each = []
+    for output, row in zip(data.outputs, rows):
+        there = [c for c, structure in enumerate(row) if structure is not None]
+        one = data.select(inputs=[data.inputs[c] for c in there], outputs=output)
+        each.append(_of_output(one, [row[c] for c in there], [bases[c] for c in there], replace(terms, initial=(
+            "free" if free else "rest")), instants))
+    return OutputErrors(data, tuple(each))
+
+
+def _of_output(data: Data, structures: Sequence[Any], bases: Sequence[Basis], terms: Terms,
+               instants: tuple[Array, ...]) -> ProcessErrors:
+    """Return the errors of one output, of the inputs that have a process to it."""
+    constants, free = check_offset(terms.offset, data), terms.initial == "free"
+    refuse_still_inputs(data)
     linear = [isinstance(one, Linear) for one in bases]
     if terms.hold == "first" and not all(linear):
         raise StructureError("hold='first' is exact for straight static curves only: use hold='zero' with a basis")
     units = replace(own_units(data, linear, bool(constants)), u_offset=(0.0,) * data.m)
-    bases = tuple(inner_bases(bases, units))
-    unknowns = ProcessUnknowns(structures, tuple(one.size for one in bases), data.n_experiments, constants is True,
-                               bool(terms.drift), free, constants == "each")
-    return ProcessErrors(in_units(data, units), unknowns, bases, units, instants, terms.hold == "first")
+    inner = tuple(inner_bases(bases, units))
+    unknowns = ProcessUnknowns(tuple(structures), tuple(one.size for one in inner), data.n_experiments,
+                               constants is True, bool(terms.drift), free, constants == "each")
+    return ProcessErrors(in_units(data, units), unknowns, inner, units, instants, terms.hold == "first")
 
 
 def read_times(data: Data, times: Any) -> tuple[Array, ...]:
