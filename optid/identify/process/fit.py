@@ -26,7 +26,7 @@ from optid.identify.process.descent import (
 )
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.outputs import OutputErrors
-from optid.identify.process.profile import profile_intervals
+from optid.identify.process.profile import DeadTimeProfiles
 from optid.identify.process.proof import REASON, applies, better_start, certify
 from optid.identify.process.separation import (
     describe_bounds,
@@ -43,8 +43,8 @@ from optid.solving.solve import Evidence, Procedure
 CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
 BOUNDS = "usual bounds"  # of the constraint that keeps numbers at their usual bounds, and dead times from below zero
 NEAR = 0.02  # of a logarithm from its bound, within which the bound is stated to solvers
-PROFILED = 5_000  # outputs up to which profiles are worth their time; with more of them errors are all but quadratic
 ROUNDS = 3  # times that a better start is looked for over boxes
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -90,7 +90,7 @@ def fit_processes(errors: OutputErrors, pose: Callable[[Array, Sequence[Any]], P
             evidence = _judged_along(errors, boxes, bests, evidence)
         if evidence.status is Status.LOCAL and not all(map(applies, errors.each)):
             evidence = replace(evidence, reason=REASON)
-        return replace(evidence, extend=partial(_with_profiles, errors, boxes, bests, evidence),
+        return replace(evidence, profiles=DeadTimeProfiles(errors, boxes, [best.x for best in bests]),
                        bound=partial(_certified, errors, boxes, bests))
     ends = []
     for number in range(max(len(one.points) for one in found) + 1):
@@ -258,15 +258,3 @@ def _at_bounds(errors: OutputErrors, x: Array) -> list[tuple[str, int, float, fl
 
 def _bounds(held: Sequence[tuple[str, int, float, float]], view: Any) -> dict[str, Any]:
     return {BOUNDS: [sign * (view.inner[name][i] - bound) >= 0 for name, i, sign, bound in held]}
-
-
-def _with_profiles(errors: OutputErrors, boxes: Sequence[ProcessBox], bests: Sequence[ProcessPoint],
-                   evidence: Evidence) -> tuple[Any, dict[str, Any]]:
-    """Return the model, and the intervals of dead times by profile likelihood as figures."""
-    found, unit = dict[str, str](), errors.data.time_unit
-    for o, (one, box, best) in enumerate(zip(errors.each, boxes, bests)):
-        if len(one.y) <= PROFILED:
-            for name, (low, high) in profile_intervals(one, box, best.x).items():
-                word = errors.outer(o, name).replace("_", " ", 1)
-                found[f"{word}, 95 % by profile likelihood"] = f"{low:.4g} to {high:.4g} {unit}".rstrip()
-    return evidence.model, found

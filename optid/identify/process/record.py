@@ -57,8 +57,8 @@ def process_errors(data: Data, process: Any, basis: Any, terms: Terms, times: An
                             "held, or leave those samples out of the record and of the times")
         data, free = with_whole_inputs(data, SHORTEST), True  # no stretch but the first may begin at rest
         instants = read_times(data, None)
-    bases = fitted_bases(data, basis)
-    each = []
+    refuse_still_inputs(data)
+    bases, each = fitted_bases(data, basis), []
     for output, row in zip(data.outputs, rows):
         there = [c for c, structure in enumerate(row) if structure is not None]
         one = data.select(inputs=[data.inputs[c] for c in there], outputs=output)
@@ -71,7 +71,6 @@ def _of_output(data: Data, structures: Sequence[Any], bases: Sequence[Basis], te
                instants: tuple[Array, ...]) -> ProcessErrors:
     """Return the errors of one output, of the inputs that have a process to it."""
     constants, free = check_offset(terms.offset, data), terms.initial == "free"
-    refuse_still_inputs(data)
     linear = [isinstance(one, Linear) for one in bases]
     if terms.hold == "first" and not all(linear):
         raise StructureError("hold='first' is exact for straight static curves only: use hold='zero' with a basis")
@@ -121,9 +120,8 @@ def refuse_still_inputs(data: Data) -> None:
         values = np.concatenate([e.u[:, c] for e in data.experiments])
         if np.ptp(values) > 0 and any(np.ptp(e.u[:, c]) > 0 for e in data.experiments):
             continue
-        y = np.concatenate([e.y[:, 0] for e in data.experiments])
-        y = y[np.isfinite(y)]
+        courses = [y[np.isfinite(y)] for y in np.vstack([e.y for e in data.experiments]).T]
+        seen = "; ".join(f"{output!r} alone, from {y[0]:.4g} to {y[-1]:.4g}" for output, y in zip(data.outputs, courses))
         raise DataError(f"input {name!r} never moves within an experiment (it stays at {values[0]:g}), so that gain "
                         "and dead time are not determined, nor is a step before the record began. Determined is the "
-                        f"course of {data.outputs[0]!r} alone, from {y[0]:.4g} to {y[-1]:.4g}: begin the record before "
-                        "the step, or leave the input out")
+                        f"course of {seen}: begin the record before the step, or leave the input out")
