@@ -50,26 +50,27 @@ def draw(name, seed, noise):
     process, gain, parameters, u, _ = CASES[name]
     rng = np.random.default_rng([seed, 17])
     truth, options, curve, keep = process_model(process, K=gain, level=5.0, **parameters), {}, None, None
+    times = None
     if isinstance(u, str):
         kind, u = u, STEP
         if kind == "prbs":
             u = np.repeat(rng.integers(0, 2, 20) * 1.0, 10)
             u[:20] = np.repeat([0.0, 1.0], 10)
         elif kind == "jitter":
-            t = T + np.concatenate([[0.0], rng.uniform(-0.2, 0.2, 199)])
-            u, options = np.where(t >= 9.7, 1.0, 0.0), {"times": t}
+            times = T + np.concatenate([[0.0], rng.uniform(-0.2, 0.2, 199)])
+            u = np.where(times >= 9.7, 1.0, 0.0)
             keep = rng.random(200) > 0.1
             keep[40:55] = keep[90:120] = False
         else:
             u, options = LEVELS, {"basis": "triangular:8"}
             curve = np.clip(u, -0.5, 0.5) if kind == "saturation" else np.sign(u) * np.maximum(np.abs(u) - 0.25, 0)
-    t = options.get("times", np.arange(float(len(u))))
+    t = np.arange(float(len(u))) if times is None else times
     clean = truth.respond((u if curve is None else curve)[:, None], instants=t)
     sigma = noise * (2.0 if gain == 2.0 else np.ptp(clean))
     y = clean + sigma * rng.normal(size=len(u))
     if keep is not None:
         y[~keep] = np.nan
-    return optid.Data(u, y), options, truth, bounds(truth, u, t, np.isfinite(y), sigma, curve)
+    return optid.Data(u, y, times=times), options, truth, bounds(truth, u, t, np.isfinite(y), sigma, curve)
 
 
 def bounds(truth, u, t, keep, sigma, curve):
@@ -155,11 +156,11 @@ def times():
         for name, u in inputs.items():
             for jitter in (False, True):
                 at = t + jitter * np.concatenate([[0.0], rng.uniform(-0.2, 0.2, count - 1)])
-                data = optid.Data(u, truth.respond(u[:, None], instants=at) + 0.1 * rng.normal(size=count))
-                options, best = {"times": at} if jitter else {}, np.inf
+                y = truth.respond(u[:, None], instants=at) + 0.1 * rng.normal(size=count)
+                data, best = optid.Data(u, y, times=at if jitter else None), np.inf
                 for _ in range(3):
                     begun = perf_counter()
-                    optid.fit(data, "process.exact", process="P1D", prove=False, **options)
+                    optid.fit(data, "process.exact", process="P1D", prove=False)
                     best = min(best, perf_counter() - begun)
                 print(f"fit, {count:7,d} samples, {'irregular' if jitter else 'regular'}, {name}: {best:.3f} s")
 

@@ -49,16 +49,15 @@ Array = np.ndarray
 @steps(lambda given: {"process.exact": "QP"})
 def process(data: Data, *, process: str | Sequence[Any] = "", poles: int = 1, zero: bool = False, delay: bool = True,
             integrator: bool = False, order: str = "", basis: Bases = "linear",
-            hold: str = "zero", offset: bool | str = True, drift: bool = False, initial: str = "rest",
-            times: Any = None, constraints: Sequence[Any] = ()) -> Procedure:
+            hold: str = "zero", offset: bool | str = True, drift: bool = False, initial: str = "rest", constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation errors of processes with dead time.
 
     Named variables: ``K``, ``Theta``, ``dead_time``, ``dynamics``, ``log tau``, ``mu``, ``offset``.
 
     Args:
-        data: the record. Outputs may be missing; it is cut where inputs are.
+        data: the record, at any times. Outputs may be missing; it is cut where inputs are.
         process: procest's name of the type: P, the number of poles, D (dead time), I (integrator), Z (zero), U (complex
-            pair), such as "P1D"; one for all pairs, one for each input, or a row of these for each output, None where
+            pair), such as "P1D"; one for all pairs, one for each input, or a row of these for each output, "none" where
             an input has no effect on it. When not given, the next four arguments.
         poles: number of poles, without that of an integrator.
         zero: whether there is a zero.
@@ -70,13 +69,11 @@ def process(data: Data, *, process: str | Sequence[Any] = "", poles: int = 1, ze
         offset: True for one level of the output, "each" for one of every experiment, False for none.
         drift: whether the level moves along a straight line.
         initial: "rest": every experiment begins at rest under its first inputs; "free": with a motion of its own.
-        times: instants of the samples in the unit of the sampling time, (N,) or one array per experiment; regular when
-            not given.
         constraints: builders such as ``formulations.constraints.process.tau(high=60)``.
 
     Raises:
         StructureError: an impossible type, another number of types, words that are unknown.
-        DataError: an input that never moves, times that do not increase.
+        DataError: an input that never moves.
         RankError: too few samples, an output that does not respond, time constants and dead time that the record does
             not separate.
     """
@@ -85,11 +82,12 @@ def process(data: Data, *, process: str | Sequence[Any] = "", poles: int = 1, ze
     if order and process:
         raise StructureError(f"order='auto' chooses the type, which process={process!r} names: give one of both")
     chosen = process or process_type(poles, zero, delay, integrator)
-    errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial), times)
+    errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial))
     errors, figures = choose_types(errors) if order else (errors, {})
-    if times is not None:
-        figures["instants"] = "as given; the verdict, and fits in %, count the samples as regular"
     return (yield from fit_processes(errors, partial(_problem, errors), tuple(constraints), figures))
+
+
+process.takes_any_times = True
 
 
 def _problem(errors: OutputErrors, x: Array, constraints: Sequence[Any]) -> Problem:

@@ -56,7 +56,7 @@ class Advice:
 
 def advise(fit: Any) -> tuple[Advice, ...]:
     """Return at most five steps for a fit of a record in memory, the most useful first."""
-    if not isinstance(fit.data, Data) or fit.model is None:
+    if not isinstance(fit.data, Data) or not fit.data.is_regular or fit.model is None:
         return ()
     told = informativity(fit.data)
     steps = [*_hopeless(told), *_in_a_loop(fit, told), *_on_record(fit), *_on_steps(fit, told)]

@@ -9,17 +9,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from optid.arrays import Array, finite
+from optid.arrays import Array, finite, one_or_all
 from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.models.continuous import ContinuousModel
-from optid.models.experiments import Record, check_inputs, scaled_least_squares
+from optid.models.experiments import Record, check_inputs, in_units_of, scaled_least_squares, state_like
 from optid.models.functions import static_functions
 from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
 
 HOLDS = ("zero", "first")
+
+
+def _is_regular(data: Any) -> bool:
+    return not isinstance(data, Data) or data.is_regular
 
 
 def _of_samples(name: str) -> Any:
@@ -241,15 +246,37 @@ class ProcessModel(Model):
             found[:, o] += 0.0 if one.structure.integrator else values[0, 0]
         return found[:, 0] if self.l == 1 else found
 
-    def _motion(self, count: int) -> Array:
+    def _motion(self, count: int, stamps: Array | None = None) -> Array:
         """Return the free motion (N, l, n) of every entry of a state: sections pair by pair, then levels."""
-        t = np.arange(float(count))
+        t = np.arange(float(count)) if stamps is None else stamps / self.dt
         each = [one.free_response(t, 0.0) for one in self._scaled]
         outputs = np.repeat([o for o, _ in self.pairs], [one.shape[1] for one in each])
         found = np.hstack(each)[:, None, :] * np.equal.outer(np.arange(self.l), outputs)
         if self.levels is None:
             return found
         return np.concatenate([found, np.broadcast_to(np.eye(self.l), (count, self.l, self.l))], axis=2)
+
+    def simulate(self, data: Any, x0: Any = "zero") -> Any:
+        """Compute the outputs from the inputs alone, at the times of the record; arguments as of `Model.simulate`."""
+        return super().simulate(data, x0) if _is_regular(data) else self._at_stamps(data, x0)
+
+    def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
+        """Predict as `Model.predict`: without a noise model nothing but the initial state is learnt from outputs."""
+        return super().predict(data, horizon, x0) if _is_regular(data) else self._at_stamps(data, x0)
+
+    def _at_stamps(self, data: Data, x0: Any) -> Any:
+        """Run over a record at irregular times."""
+        records, found = in_units_of(self, data).experiments, []
+        given = [None] * len(records) if isinstance(x0, str) else list(x0) if len(records) > 1 else [x0]
+        for i, (e, state) in enumerate(zip(records, given), start=1):
+            label = f"Experiment {i}: " * (len(records) > 1)
+            check_inputs(self, e.u, label)
+            y, motion = self.respond(e.u, e.stamps).reshape(e.y.shape), self._motion(len(e.u), e.stamps)
+            if state is not None or x0 != "zero":
+                start = self._least(motion, e.y - y, label) if state is None else state_like(state, self._state_shape)
+                y = y + motion @ start
+            found.append(y)
+        return one_or_all(found)
 
     def _run(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
         found = []
@@ -263,11 +290,15 @@ class ProcessModel(Model):
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
         check_inputs(self, u, label)
-        rest, here = y - self.respond(u).reshape(y.shape), np.isfinite(y)
+        return self._least(self._motion(len(u)), y - self.respond(u).reshape(y.shape), label)
+
+    def _least(self, motion: Array, rest: Array, label: str) -> Array:
+        """Return the state whose motion (N, l, n) explains most of a rest (N, l)."""
+        here = np.isfinite(rest)
         for o, name in enumerate(self.outputs):
             if not here[:, o].any():
                 raise DataError(f"{label}Output {name!r} has no sample: no initial state can be estimated.")
-        return scaled_least_squares(self._motion(len(u))[here], rest[here])
+        return scaled_least_squares(motion[here], rest[here])
 
     # -- other tools ---------------------------------------------------------------------------------------------------
 

@@ -141,7 +141,7 @@ class ProcessErrors(Criterion):
                  for t, drives in zip(self.instants, self.drives)]
         if max(sizes) <= most and sizes == [len(t) for t in self.instants]:
             return self
-        cut = [replace(e, u=e.u[:n], y=e.y[:n]) for e, n in zip(self.data.experiments, sizes)]
+        cut = [replace(e, u=e.u[:n], y=e.y[:n], stamps=None) for e, n in zip(self.data.experiments, sizes)]
         if not all(np.isfinite(e.y).any() for e in cut):
             return self
         data = Data.of_experiments(cut, self.data.dt, self.data.inputs, self.data.outputs)

@@ -43,20 +43,18 @@ def process_type(poles: int, zero: bool, delay: bool, integrator: bool) -> Proce
     return ProcessStructure(check_integer(poles, "poles", 0), False, bool(zero), bool(delay), bool(integrator))
 
 
-def process_errors(data: Data, process: Any, basis: Any, terms: Terms, times: Any = None) -> OutputErrors:
+def process_errors(data: Data, process: Any, basis: Any, terms: Terms) -> OutputErrors:
     """Check the arguments of a fit, and return its errors on the record in units of their own.
 
     Arguments and errors as of `formulations.process.process`.
     """
     data = outputs_in_memory(data, "simulation errors")
     rows = read_structures(process, data.inputs, data.outputs)
-    instants, free = read_times(data, times), terms.initial == "free"
+    free = terms.initial == "free"
     if any(np.isnan(e.u).any() for e in data.experiments):
-        if times is not None:
-            raise DataError("inputs are missing in a record with times of its own: fill them with the value that was "
-                            "held, or leave those samples out of the record and of the times")
         data, free = with_whole_inputs(data, SHORTEST), True  # no stretch but the first may begin at rest
-        instants = read_times(data, None)
+    instants = tuple(np.arange(float(e.n_samples)) if e.stamps is None else e.stamps / data.dt
+                     for e in data.experiments)
     refuse_still_inputs(data)
     bases, each = fitted_bases(data, basis), []
     for output, row in zip(data.outputs, rows):
@@ -79,39 +77,6 @@ def _of_output(data: Data, structures: Sequence[Any], bases: Sequence[Basis], te
     unknowns = ProcessUnknowns(tuple(structures), tuple(one.size for one in inner), data.n_experiments,
                                constants is True, bool(terms.drift), free, constants == "each")
     return ProcessErrors(in_units(data, units), unknowns, inner, units, instants, terms.hold == "first")
-
-
-def read_times(data: Data, times: Any) -> tuple[Array, ...]:
-    """Return the instants of every experiment in sampling times, from its first sample on.
-
-    Raises:
-        DataError: other numbers than the samples, times that are not finite or do not increase, by sample.
-    """
-    if times is None:
-        return tuple(np.arange(float(e.n_samples)) for e in data.experiments)
-    arrays = times if isinstance(times, list | tuple) and np.ndim(times[0]) else [times]
-    if len(arrays) != data.n_experiments:
-        raise DataError(f"times has {len(arrays)} arrays for {data.n_experiments} experiments")
-    found = []
-    for i, (given, e) in enumerate(zip(arrays, data.experiments), start=1):
-        where = f"experiment {i}: " * (data.n_experiments > 1)
-        t = np.asarray(given)
-        if t.dtype.kind == "M":
-            t = (t - t[0]) / np.timedelta64(1, "ns") * 1e-9
-        t = np.asarray(t, dtype=float)
-        if t.shape != (e.n_samples,):
-            raise DataError(f"{where}times has shape {t.shape}; it must be ({e.n_samples},), one for each sample")
-        if not np.isfinite(t).all():
-            raise DataError(f"{where}the time of sample {int(np.argmin(np.isfinite(t)))} is not finite")
-        steps = np.diff(t)
-        if np.any(steps <= 0):
-            k = int(np.argmax(steps <= 0)) + 1
-            word = "runs backwards" if steps[k - 1] < 0 else "stands still"
-            raise DataError(f"{where}the time {word} at sample {k} ({t[k - 1]:g}, then {t[k]:g}; "
-                            f"{int(np.sum(steps <= 0))} such samples in all). Sort the record by time and drop what "
-                            "stands twice, or read it by its sampling time")
-        found.append((t - t[0]) / data.dt)
-    return tuple(found)
 
 
 def refuse_still_inputs(data: Data) -> None:
