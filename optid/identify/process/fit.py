@@ -43,6 +43,7 @@ from optid.solving.solve import Evidence, Procedure
 CELL = "cell"  # of the constraint that keeps a step within the cells of the dead times
 BOUNDS = "usual bounds"  # of the constraint that keeps numbers at their usual bounds, and dead times from below zero
 NEAR = 0.02  # of a logarithm from its bound, within which the bound is stated to solvers
+LATE = 3.0  # samples; the bound of a later dead time, zero, plays no part in the confirmation of an optimum
 ROUNDS = 3  # times that a better start is looked for over boxes
 
 
@@ -83,7 +84,7 @@ def fit_processes(errors: OutputErrors, pose: Callable[[Array, Sequence[Any]], P
     bests = [one.best for one in found]
     x = errors.join([best.x for best in bests])
     if complete:
-        evidence = yield from _confirmed(errors, pose, constraints, x, figures, max(one.steps for one in found))
+        evidence = yield from _confirmed(errors, pose, constraints, x, figures, max(one.steps for one in found), LATE)
         if evidence is None:
             return None
         if evidence.status is Status.INACCURATE:
@@ -163,9 +164,9 @@ def _certified(errors: OutputErrors, boxes: Sequence[ProcessBox], bests: Sequenc
 
 
 def _confirmed(errors: OutputErrors, pose: Callable[[Array, Sequence[Any]], Problem], constraints: Sequence[Any],
-               x: Array, figures: Mapping[str, Any], steps: int = 0) -> Procedure:
-    """Let a back end confirm a point; numbers at their usual bounds stay within these."""
-    problem, held = pose(x, constraints), _at_bounds(errors, x)
+               x: Array, figures: Mapping[str, Any], steps: int = 0, late: float = np.inf) -> Procedure:
+    """Let a back end confirm a point; numbers at their usual bounds, and dead times that are not late, stay within."""
+    problem, held = pose(x, constraints), _at_bounds(errors, x, late)
     if held:
         problem = problem.subject_to(partial(_bounds, held))
         problem = replace(problem, structural=problem.structural | {BOUNDS})
@@ -239,14 +240,14 @@ def _cell(errors: OutputErrors, view: Any) -> dict[str, Any]:
     return {CELL: [numbers >= np.concatenate(lows), numbers <= np.concatenate(highs)]}
 
 
-def _at_bounds(errors: OutputErrors, x: Array) -> list[tuple[str, int, float, float]]:
-    """Return (variable, entry, sign, bound) of the numbers at their usual bounds, and of dead times near zero."""
+def _at_bounds(errors: OutputErrors, x: Array, late: float) -> list[tuple[str, int, float, float]]:
+    """Return (variable, entry, sign, bound) of the numbers at their usual bounds, and of dead times up to a late one."""
     found, pair = [], 0
     for one, part in zip(errors.each, errors.split(x)):
         box, j = usual_box(one), 0
         for c, structure in enumerate(one.unknowns.structures):
             for i, name in enumerate(structure.names):
-                value, near = part[one.unknowns.slices[f"dynamics{c}"]][i], 3.0 if name == "dead_time" else NEAR
+                value, near = part[one.unknowns.slices[f"dynamics{c}"]][i], late if name == "dead_time" else NEAR
                 if value <= box.low[j] + near:
                     found.append((errors.key("dynamics", pair), i, 1.0, float(box.low[j])))
                 if value >= box.high[j] - (1e-9 if name == "dead_time" else NEAR):
