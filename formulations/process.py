@@ -49,7 +49,8 @@ Array = np.ndarray
 @steps(lambda given: {"process.exact": "QP"})
 def process(data: Data, *, process: str | Sequence[Any] = "", poles: int = 1, zero: bool = False, delay: bool = True,
             integrator: bool = False, order: str = "", basis: Bases = "linear",
-            hold: str = "zero", offset: bool | str = True, drift: bool = False, initial: str = "rest", constraints: Sequence[Any] = ()) -> Procedure:
+            hold: str = "zero", offset: bool | str = True, drift: bool = False, initial: str = "rest",
+            constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation errors of processes with dead time.
 
     Named variables: ``K``, ``Theta``, ``dead_time``, ``dynamics``, ``log tau``, ``mu``, ``offset``.

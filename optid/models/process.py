@@ -56,7 +56,7 @@ class ProcessModel(Model):
     processes: tuple[ProcessDynamics, ...]
     nonlinearities: tuple[Nonlinearity, ...]
     level: Array
-    drift: Array | float = 0.0
+    drift: Any = 0.0
     hold: str = "zero"
     pairs: tuple[tuple[int, int], ...] = ()
     dt: float = 1.0
@@ -84,8 +84,8 @@ class ProcessModel(Model):
         m = len(self.inputs) or 1 + max(c for _, c in pairs)
         if len(pairs) != len(self.processes) or list(pairs) != sorted(set(pairs)) or not all(
                 0 <= o < level.size and 0 <= c < m for o, c in pairs):
-            raise StructureError(f"pairs={pairs}: (output, input) of each of {len(self.processes)} processes, in order, "
-                                 f"of {level.size} outputs and {m} inputs")
+            raise StructureError(f"pairs={pairs}: (output, input) of each of {len(self.processes)} processes, in "
+                                 f"order, of {level.size} outputs and {m} inputs")
         given = {"nonlinearities": self.nonlinearities, "processes": tuple(one.sort() for one in self.processes),
                  "level": level, "drift": drift, "pairs": pairs}
         self._fix(given, m, level.size)
@@ -177,7 +177,7 @@ class ProcessModel(Model):
 
     # -- responses -----------------------------------------------------------------------------------------------------
 
-    def _by_output(self, each: Sequence[Array]) -> Array:
+    def _by_output(self, each: Sequence[Any]) -> Any:
         """Return what belongs to pairs, (N,) each, as (N, l, r): zero for the other outputs."""
         found = np.zeros((len(each[0]), self.l, len(each)), dtype=each[0].dtype)
         for j, ((o, _), one) in enumerate(zip(self.pairs, each)):

@@ -207,8 +207,8 @@ class View(Mapping[str, cp.Expression]):
         if self["offset"].size > 1:
             raise StructureError("constraints on the static characteristic are defined for one output")
         if self.key("Theta", channel) not in self and self.key("b", channel) not in self:
-            raise StructureError(f"a process with an integrator has no static characteristic from {channel}: its output "
-                                 "comes to rest at no level. The word K bounds its slope")
+            raise StructureError(f"a process with an integrator has no static characteristic from {channel}: its "
+                                 "output comes to rest at no level. The word K bounds its slope")
         if self.key("Theta", channel) not in self:  # a linear model has b alone
             return cp.hstack([cp.sum(self[self.key("b", channel)])])
         return cp.sum(self[self.key("Theta", channel)], axis=1)

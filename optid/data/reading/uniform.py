@@ -171,8 +171,8 @@ def _not_uniform(stamps: np.ndarray, steps: np.ndarray, median: float, bad: np.n
             reason, remedy = "The clock has jitter", f"pass time_tolerance={needed:g} to accept it."
         else:
             reason = "The sampling is irregular"
-            remedy = (f"pass resample='{median:.6g}s' to bring the record onto a uniform grid, or gaps='stamps' to keep "
-                      "the stamps for a process in continuous time ('process.exact').")
+            remedy = (f"pass resample='{median:.6g}s' to bring the record onto a uniform grid, or gaps='stamps' to "
+                      "keep the stamps for a process in continuous time ('process.exact').")
     return DataError(
         f"{label}: time stamps are not uniform. Sample {first + k + 1} (t = {stamps[k + 1]}) comes {steps[k]:.6g} "
         f"after the one before, the median step is {median:.6g} ({count} step(s) deviate by more than {tolerance:.2%}"

@@ -241,7 +241,7 @@ def _cell(errors: OutputErrors, view: Any) -> dict[str, Any]:
 
 
 def _at_bounds(errors: OutputErrors, x: Array, late: float) -> list[tuple[str, int, float, float]]:
-    """Return (variable, entry, sign, bound) of the numbers at their usual bounds, and of dead times up to a late one."""
+    """Return (variable, entry, sign, bound) of numbers at their usual bounds, and of dead times up to a late one."""
     found, pair = [], 0
     for one, part in zip(errors.each, errors.split(x)):
         box, j = usual_box(one), 0

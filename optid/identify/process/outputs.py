@@ -165,9 +165,10 @@ class OutputErrors(Criterion):
         found = [one.linearise(part, method) for one, part in zip(self.each, self.split(x))]
         if len(found) == 1:
             return found[0]
-        states = tuple((block_diag(*(s[0] for s in several)), block_diag(*(s[1] for s in several)),
+        beside: Any = block_diag
+        states = tuple((beside(*(s[0] for s in several)), beside(*(s[1] for s in several)),
                         np.concatenate([s[2] for s in several])) for several in zip(*(one.states for one in found)))
-        return Linearised(block_diag(*(one.root for one in found)), np.concatenate([one.pull for one in found]),
+        return Linearised(beside(*(one.root for one in found)), np.concatenate([one.pull for one in found]),
                           states, sum(one.remainder for one in found), sum(one.rows for one in found),
                           max(one.condition for one in found),
                           "qr" if all(one.method == "qr" for one in found) else "gram")

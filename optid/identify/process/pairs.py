@@ -13,7 +13,7 @@ from optid.program.view import View
 
 
 def for_outputs(errors: OutputErrors, constraints: Sequence[Any]) -> Iterator[Any]:
-    """Yield constraints so that each is about one output: recorded rules about that which they name, or about every one.
+    """Yield constraints so that each is about one output: recorded rules about the one they name, or every one.
 
     Others, such as functions of the user, see the quantities of all pairs: ``view["K[level,valve]"]``.
 

@@ -60,7 +60,8 @@ def _interval(errors: ProcessErrors, box: ProcessBox, x: Array, place: int, leve
 
     best, dof = ProcessPoint.of(errors, x), len(errors.y) - errors.unknowns.size
     width = _width(errors, best, place)
-    ratio = 1.0 if coloured is None or not coloured > 0 else (coloured / errors.data.dt / width) ** 2
+    # what the colour of errors lets intervals gain is smaller than what a short record is wrong about it
+    ratio = 1.0 if coloured is None else max((coloured / errors.data.dt / width) ** 2, 1.0)
     most = best.value * (1 + ratio * float(fisher.ppf(level, 1, dof)) / dof)
     low, high = (_end(errors, box, best, place, sign * width, most) for sign in (-1.0, 1.0))
     return low, high

@@ -86,7 +86,8 @@ def refuse_still_inputs(data: Data) -> None:
         if np.ptp(values) > 0 and any(np.ptp(e.u[:, c]) > 0 for e in data.experiments):
             continue
         courses = [y[np.isfinite(y)] for y in np.vstack([e.y for e in data.experiments]).T]
-        seen = "; ".join(f"{output!r} alone, from {y[0]:.4g} to {y[-1]:.4g}" for output, y in zip(data.outputs, courses))
+        seen = "; ".join(f"{output!r} alone, from {y[0]:.4g} to {y[-1]:.4g}"
+                         for output, y in zip(data.outputs, courses))
         raise DataError(f"input {name!r} never moves within an experiment (it stays at {values[0]:g}), so that gain "
                         "and dead time are not determined, nor is a step before the record began. Determined is the "
                         f"course of {seen}: begin the record before the step, or leave the input out")
