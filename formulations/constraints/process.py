@@ -26,11 +26,29 @@ def tau(value: float | None = None, low: float | None = None, high: float | None
         channel: str | None = None, output: str | None = None) -> Rule:
     """The time constants equal ``value`` or lie in [low, high], in units of time; all, or the one of a number from 1.
 
+    The first is the largest one: larger ones obey a lower bound as well, and smaller ones an upper bound.
+
     Raises:
-        StructureError: no bound, crossing ones, or one that is not positive.
+        StructureError: no bound, crossing ones, one that is not positive, or no such number.
     """
-    names = ("tau", "tau1", "tau2", "tau3") if number is None else (f"tau{int(number)}", *("tau",) * (number == 1))
-    return _bounded("tau", names, value, low, high, (channel, output))
+    names = ("tau", "tau1", "tau2", "tau3")
+    if number is None:
+        return _bounded("tau", names, value, low, high, (channel, output))
+    if number not in (1, 2, 3):
+        raise StructureError(f"tau: number={number!r} must be 1, 2 or 3; the first time constant is the largest one")
+    own, pair = int(number), (channel, output)
+    parts = [(names[own : own + 1] + ("tau",) * (own == 1), value, low, high)]
+    least, most = (low, high) if value is None else (value, value)
+    parts += [(names[1:own], None, least, None)] * (least is not None and own > 1)
+    parts += [(names[own + 1 :], None, None, most)] * (most is not None and own < 3)
+    first, *others = (_bounded("tau", *part, pair) for part in parts)
+
+    def build(view: View) -> list[Limit]:
+        present = {name.partition("[")[0] for name in view}
+        return first.build(view) + [limit for (those, *_), rule in zip(parts[1:], others)
+                                    if any(f"log {name}" in present for name in those) for limit in rule.build(view)]
+
+    return Rule(label(f"tau{own}", *pair), build)
 
 
 @recorded

@@ -79,7 +79,7 @@ def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
     return arguments
 
 
-def at_stamps(how: Mapping[str, Any], formulation: str) -> Mapping[str, Any]:
+def at_stamps(how: dict[str, Any], formulation: str) -> dict[str, Any]:
     """Return the reading options with the stamps kept where the formulation takes any times and no repair is asked for.
 
     `LookupFailed` for an unknown formulation.

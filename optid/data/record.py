@@ -191,8 +191,8 @@ class Data(Ports):
             return
         steps = np.concatenate([np.diff(e.stamps) for e in self.experiments if e.stamps is not None])
         raise DataError(f"{what} needs samples at even distances; the times of this record step by {steps.min():.4g} "
-                        f"to {steps.max():.4g} {self.time_unit or 'samples'}. Read it with resample='{self.dt:.6g}s', or "
-                        "fit 'process.exact', which takes any times.")
+                        f"to {steps.max():.4g} {self.time_unit or 'samples'}. Read it with "
+                        f"resample='{self.dt:.6g}s', or fit 'process.exact', which takes any times.")
 
     # -- what the data look like ---------------------------------------------------------------------------------
 

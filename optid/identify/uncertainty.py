@@ -175,7 +175,7 @@ class Uncertainty:
                         value + upper.reshape(value.shape))
 
     def profiled(self, name: str, row: Sequence[float]) -> Array:
-        """Return (estimate, standard error, lower, upper) of a parameter, with the ends of its profile if it has one."""
+        """Return (estimate, standard error, lower, upper) of a parameter, with the ends of its profile if any."""
         coloured = "coloured" in getattr(self.source, "words", ())
         ends = None if self.profiles is None else self.profiles(name, self.level, row[1] if coloured else None)
         return np.array(row if ends is None else (*row[:2], *ends), dtype=float)

@@ -92,9 +92,9 @@ def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
     if p >= MOVING or gain <= EXACT * errors.energy:
         return ""
     found, of = f"not at rest (p = {p:.1g})", errors.data.outputs[0]
-    warnings.warn(f"output {of!r} does not begin at rest under its first inputs (p = {p:.1g}): initial='free' estimates "
-                  "a motion of its own for every experiment; gain and time constants are biased without it", DataWarning,
-                  stacklevel=2)
+    warnings.warn(f"output {of!r} does not begin at rest under its first inputs (p = {p:.1g}): initial='free' "
+                  "estimates a motion of its own for every experiment; gain and time constants are biased without it",
+                  DataWarning, stacklevel=2)
     return found
 
 
