@@ -39,7 +39,7 @@ from optid.identify.process.pairs import for_outputs
 from optid.identify.process.record import Terms, process_errors, process_type
 from optid.models import Nonlinearity
 from optid.models.process import ProcessModel
-from optid.program.units import outer_bases, outward
+from optid.program.units import outward
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 
@@ -95,7 +95,7 @@ def _problem(errors: OutputErrors, x: Array, constraints: Sequence[Any]) -> Prob
     """Minimise ‖e‖² over the numbers of all processes, the static curves and the levels."""
     places, one, data = Places.of(errors), errors.each[0], errors.data
     several = len(errors.each) > 1
-    facts = {"units": one.units, "bases": dict(zip(data.inputs, outer_bases(one.bases, one.units)))}
+    facts = {"units": one.units, "bases": dict(zip(data.inputs, one.outer_bases))}
     return Problem(
         "process.exact",
         start=places.values(x),

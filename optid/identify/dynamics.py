@@ -179,7 +179,7 @@ class _Reading:
             word, bracket, channel = name.partition("[")
             rows = self.limits(name, lambda model, place=place: model.coefficients()[place][1])
             if self.known is not None and np.isfinite(rows[0, 1]):
-                wald, rows = rows, self.known.profiled(name, rows[0])[None]
+                wald, rows = rows, self.known.with_profile(name, rows[0])[None]
                 if np.any(rows != wald):
                     self.notes.append(f"Interval of the {times[word]}{bracket}{channel} by profile likelihood; by its "
                                       f"standard error {wald[0, 2]:.4g} to {wald[0, 3]:.4g}.")

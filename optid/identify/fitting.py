@@ -167,16 +167,12 @@ class Fit(Rendered):
         """
         from optid.identify.informativity import informativity
 
-        return informativity(self.data) if self._is_regular else None
-
-    @property
-    def _is_regular(self) -> bool:
-        return isinstance(self.data, Data) and self.data.is_regular
+        return informativity(self.data) if isinstance(self.data, Data) and self.data.is_regular else None
 
     @property
     def record_findings(self) -> tuple[str, ...]:
         """What reading the record found, and what it can tell, one sentence each."""
-        return (*self.data.findings, *(self.informativity.findings if self._is_regular else ()))
+        return (*self.data.findings, *(self.informativity.findings if self.informativity else ()))
 
     @cached_property
     def verdict(self) -> Any:
@@ -186,7 +182,7 @@ class Fit(Rendered):
         """
         from optid.identify.verdict import verdict
 
-        if not self._is_regular or self.model is None:
+        if not isinstance(self.data, Data) or not self.data.is_regular or self.model is None:
             return None
         try:
             known = self.uncertainty

@@ -174,7 +174,7 @@ class Uncertainty:
         return Interval(value, error.reshape(value.shape), value + lower.reshape(value.shape),
                         value + upper.reshape(value.shape))
 
-    def profiled(self, name: str, row: Sequence[float]) -> Array:
+    def with_profile(self, name: str, row: Sequence[float]) -> Array:
         """Return (estimate, standard error, lower, upper) of a parameter, with the ends of its profile if any."""
         coloured = "coloured" in getattr(self.source, "words", ())
         ends = None if self.profiles is None else self.profiles(name, self.level, row[1] if coloured else None)
@@ -189,7 +189,7 @@ class Uncertainty:
         if self.model.structure != "ss":
             names = [name for name, _ in self.model.coefficients()]
             rows = self._rows(names, lambda model: np.array([value for _, value in model.coefficients()]))
-            return [(name, *self.profiled(name, row)) for name, *row in rows]
+            return [(name, *self.with_profile(name, row)) for name, *row in rows]
         poles = self.model.poles[self.model.poles.imag >= 0]
         names = [f"pole {i + 1}{part}" for i, pole in enumerate(poles)
                  for part in ([", real", ", imaginary"] if pole.imag else [""])]

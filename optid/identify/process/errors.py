@@ -22,7 +22,7 @@ from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.identify.prediction_error.descent import Criterion
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
-from optid.program.units import energy_unit
+from optid.program.units import energy_unit, outer_bases
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.unknowns import Unknowns
 
@@ -100,6 +100,11 @@ class ProcessErrors(Criterion):
     def unit(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
         """What one unit of the sum of squares is in units of the record."""
         return energy_unit(self.units)
+
+    @property
+    def outer_bases(self) -> tuple[Basis, ...]:
+        """The bases of the inputs in the units of the record."""
+        return outer_bases(self.bases, self.units)
 
     def key(self, name: str, number: int) -> str:
         """Name a quantity of an input: plain with one input, ``name[input]`` with several."""

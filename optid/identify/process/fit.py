@@ -99,7 +99,7 @@ def fit_processes(errors: OutputErrors, pose: Callable[[Array, Sequence[Any]], P
             [one.points[min(number, len(one.points)) - 1].x for one in found])
         within = pose(start, (*constraints, partial(_cell, errors)))
         within = replace(within, structural=within.structural | {CELL})
-        fit = TangentFit(within, errors, errors.compressed)
+        fit = TangentFit(within, errors, errors.compress)
         end = yield from refine(fit, _descent(errors, start), dict(figures), start)
         if end is None:
             return None
@@ -170,7 +170,7 @@ def _confirmed(errors: OutputErrors, pose: Callable[[Array, Sequence[Any]], Prob
     if held:
         problem = problem.subject_to(partial(_bounds, held))
         problem = replace(problem, structural=problem.structural | {BOUNDS})
-    fit = TangentFit(problem, errors, errors.compressed)
+    fit = TangentFit(problem, errors, errors.compress)
     return (yield from refine(fit, _descent(errors, x, steps), figures, x))
 
 

@@ -199,7 +199,7 @@ class OutputErrors(Criterion):
         """Whether the numbers of all outputs are those of processes."""
         return all(one.admissible(part) for one, part in zip(self.each, self.split(x)))
 
-    def compressed(self, at: Linearised, reference: Array) -> CompressedErrors:
+    def compress(self, at: Linearised, reference: Array) -> CompressedErrors:
         """Return the compressed errors near a point."""
         return (CompressedErrors if len(self.each) == 1 else CompressedOutputs)(self, at, reference)
 

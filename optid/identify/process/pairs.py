@@ -8,7 +8,6 @@ from typing import Any
 
 from optid.errors import StructureError
 from optid.identify.process.outputs import OF_OUTPUTS, OutputErrors
-from optid.program.units import outer_bases
 from optid.program.view import View
 
 
@@ -55,7 +54,7 @@ class OfOutput:
         own = {name: whole for name, whole in there.items() if whole in view.inner}
         part = view.part({name: view.inner[whole] for name, whole in own.items()}, iterate=view.iterate,
                          channels=one.data.inputs, outputs=one.data.outputs, reference=Renamed(view.reference, own),
-                         bases=dict(zip(one.data.inputs, outer_bases(one.bases, one.units))))
+                         bases=dict(zip(one.data.inputs, one.outer_bases)))
         return {self.name: self.rule.build(part)}
 
 

@@ -34,8 +34,8 @@ SECONDS = 20.0  # after which a proof is given up
 WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may compute; boxes that it needs at least
 MOST = {2: 5e6, 3: 1e3}  # responses to single moves in one bound beyond which no proof is tried, by unknowns
 METHOD = "branch and bound over time constants and dead time"
-REASON = ("a lower bound is known for one or two real poles with dead time, one held input, a straight static curve and "
-          "a start at rest alone; elsewhere several starts are compared")
+REASON = ("a lower bound is known for one or two real poles with dead time, one held input, a straight static curve "
+          "and a start at rest alone; elsewhere several starts are compared")
 
 
 @cached_njit
@@ -306,8 +306,8 @@ def _halves(boxes: Array, wide: NDArray[np.intp], middles: Array) -> Array:
 
 def applies(errors: ProcessErrors) -> bool:
     """Whether a lower bound is known: one or two real poles with dead time, straight f, held input, start at rest."""
-    one = errors.unknowns.structures
-    return (one in ((ProcessStructure(1),), (ProcessStructure(2),)) and errors.unknowns.sizes == (1,) and not errors.unknowns.free
+    u, known = errors.unknowns, (ProcessStructure(1), ProcessStructure(2))
+    return (len(u.structures) == 1 and u.structures[0] in known and u.sizes == (1,) and not u.free
             and not errors.straight and type(errors.bases[0]).__name__ == "Linear")
 
 
