@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.identify.process.cones import explained, norm, products, project
 from optid.identify.process.descent import ProcessBox
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.two_poles import two_pole_bounds
@@ -52,7 +53,7 @@ def box_bounds(boxes, smooth, record, moves, edges):
     """
     t, y, still, base = record
     s, w = moves
-    count, n, columns = len(boxes), len(t), still.shape[1]
+    count, n = len(boxes), len(t)
     found = np.zeros((count, 4))
     x, envelope = np.zeros((3, n)), np.zeros(n)
     energy = 0.0
@@ -87,86 +88,21 @@ def box_bounds(boxes, smooth, record, moves, edges):
                         x0 += w[j] * middle
                         rest += size * max(up - middle, middle - down)
                 x[0, k], x[1, k], x[2, k], envelope[k] = x0, x1, x2, rest
-        rows = 3 if smooth[i] else 1
-        for c in range(columns):
-            for o in range(rows):
-                total = 0.0
-                for k in range(n):
-                    total += still[k, c] * x[o, k]
-                for k in range(n):
-                    x[o, k] -= total * still[k, c]
-        gram, side, rho = np.zeros((3, 3)), np.zeros(3), 0.0
-        for k in range(n):
-            rho += envelope[k] * envelope[k]
-            for o in range(rows):
-                side[o] += x[o, k] * y[k]
-                for p in range(o, rows):
-                    gram[o, p] += x[o, k] * x[p, k]
-        rho = np.sqrt(rho)
-        for o in range(3):
-            for p in range(o):
-                gram[o, p] = gram[p, o]
+        project(x, still)
+        gram, side = products(x, y)
+        rho = norm(envelope)
         first, second = h1 * np.sqrt(gram[1, 1]), h2 * np.sqrt(gram[2, 2])
         change, length = rho + first + second, np.sqrt(gram[0, 0])
         at_middle = energy - side[0] * side[0] / gram[0, 0] if gram[0, 0] > 0.0 else energy
         lower = 0.0
         if change < length:
             largest = np.sqrt(energy) / (length - change)  # of the gain anywhere in the box
-            least = energy - _explained(gram, side, h1, h2) if smooth[i] else at_middle
+            least = energy - explained(gram, side, np.array([h1, h2])) if smooth[i] else at_middle
             lower = max(np.sqrt(max(least, 0.0)) - largest * rho, 0.0) ** 2
         found[i, 0], found[i, 1] = lower, at_middle
         found[i, 2] = first if smooth[i] else h1 * length
         found[i, 3] = second if smooth[i] else h2 / tau * length
     return found
-
-
-@cached_njit
-def _explained(gram, side, h1, h2):
-    """Return the most that K x0 + K a x1 + K b x2 explains with |a| <= h1 and |b| <= h2: faces of a cone, one by one.
-
-    On a face some of a and b are at their ends; the optimum of a face counts where it obeys the other bounds.
-    """
-    best = 0.0
-    for one in range(-1, 2):
-        for two in range(-1, 2):
-            # columns: x0 with what is fixed, then what is free
-            q = np.zeros((3, 3))
-            size = 1
-            q[0, 0], q[1, 0], q[2, 0] = 1.0, one * h1, two * h2
-            if one == 0:
-                q[1, size], size = 1.0, size + 1
-            if two == 0:
-                q[2, size], size = 1.0, size + 1
-            inner, right = np.zeros((size, size)), np.zeros(size)
-            for i in range(size):
-                for k in range(3):
-                    right[i] += q[k, i] * side[k]
-                    for j in range(size):
-                        for m in range(3):
-                            inner[i, j] += q[k, i] * gram[k, m] * q[m, j]
-            scale = np.zeros(size)
-            for i in range(size):
-                scale[i] = np.sqrt(inner[i, i]) if inner[i, i] > 0.0 else 1.0
-            for i in range(size):
-                right[i] /= scale[i]
-                for j in range(size):
-                    inner[i, j] /= scale[i] * scale[j]
-                inner[i, i] += 1e-13
-            v = np.linalg.solve(inner, right)
-            gain = 0.0
-            for i in range(size):
-                gain += v[i] * right[i]
-                v[i] /= scale[i]
-            inside, at = True, 1
-            if one == 0:
-                inside, at = inside and abs(v[at]) <= h1 * abs(v[0]) * (1 + 1e-9), at + 1
-            if two == 0:
-                inside = inside and abs(v[at]) <= h2 * abs(v[0]) * (1 + 1e-9)
-            if inside:
-                best = max(best, gain)
-                if one == 0 and two == 0:
-                    return gain
-    return best
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,8 @@ def gram_matrices(F, C, instants, course, thetas, still, settings):  # noqa: N80
     for i in range(len(thetas)):
         for j in range(len(changes)):
             later[j] = changes[j] + thetas[i]
-        response = run(F, C, instants, later, inputs, (settings[m] > 0, True), start)
+        sides = settings[m] > 0.0, settings[m] >= 0.0  # a literal True would have the kernel compiled once more
+        response = run(F, C, instants, later, inputs, sides, start)
         for k in range(len(instants)):
             for c in range(m):
                 row[c] = response[k, 0, c] + settings[c]

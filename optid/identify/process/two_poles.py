@@ -13,6 +13,7 @@ of the average: its largest one in the box serves for all.
 
 import numpy as np
 
+from optid.identify.process.cones import explained, norm, products, project
 from optid.kernel_cache import cached_njit
 
 SERIES = 1e-3  # difference of the poles times the time, below which a series has more digits
@@ -50,16 +51,20 @@ def two_pole_bounds(boxes, record, moves, edges):
     found, x = np.zeros((count, 5)), np.zeros((4, n))
     rough, fine = np.zeros(n), np.zeros(n)  # what x may differ from its middle, and from its tangent
     middle, low, high = np.zeros(4), np.zeros(4), np.zeros(4)
-    energy = np.sum(y * y)
+    energy = 0.0
+    for k in range(n):
+        energy += y[k] * y[k]
     for i in range(count):
-        a1, b1, a2, b2 = np.exp(boxes[i, :4])
+        a1, b1, a2, b2 = np.exp(boxes[i, 0]), np.exp(boxes[i, 1]), np.exp(boxes[i, 2]), np.exp(boxes[i, 3])
         m1, m2 = np.exp((boxes[i, 0] + boxes[i, 1]) / 2), np.exp((boxes[i, 2] + boxes[i, 3]) / 2)
         early, late = boxes[i, 4], boxes[i, 5]
         theta = (early + late) / 2
         h1, h2, h3 = (boxes[i, 1] - boxes[i, 0]) / 2, (boxes[i, 3] - boxes[i, 2]) / 2, (late - early) / 2
-        x[:], rough[:], fine[:] = 0.0, 0.0, 0.0
+        x[:] = 0.0
+        rough[:] = 0.0
+        fine[:] = 0.0
+        x[0] = base
         for e in range(len(edges) - 1):
-            x[0, edges[e, 0] : edges[e + 1, 0]] = base[edges[e, 0] : edges[e + 1, 0]]
             for j in range(edges[e, 1], edges[e + 1, 1]):
                 size, before = abs(w[j]), -1.0
                 # averages p1 * k2, p2 * k1, q1 * k2, q1 * k2 * k2, q2 * k1, |q1'| * k2 and k1 * k2
@@ -92,67 +97,20 @@ def two_pole_bounds(boxes, record, moves, edges):
                     fine[k] += size * (
                         p12 * h1 * h1 / 2 + p21 * h2 * h2 / 2 + max(q12, q122) * h1 * h2 + r12 * h1 * h3
                         + max(q2, q21) / a1 * h2 * h3 + max(e2 / a2, k12) / a1 * h3 * h3 / 2)
-        for c in range(still.shape[1]):
-            for o in range(4):
-                total = 0.0
-                for k in range(n):
-                    total += still[k, c] * x[o, k]
-                for k in range(n):
-                    x[o, k] -= total * still[k, c]
-        gram, side = x @ x.T, x @ y
+        project(x, still)
+        gram, side = products(x, y)
         length = np.sqrt(gram[0, 0])
         found[i, 1] = energy - side[0] ** 2 / gram[0, 0] if length > 0.0 else energy
-        effects = np.array([h1 * np.sqrt(gram[1, 1]), h2 * np.sqrt(gram[2, 2]), h3 * np.sqrt(gram[3, 3])])
-        wide, rest = np.sqrt(np.sum(rough * rough)), np.sqrt(np.sum(fine * fine))
+        e1, e2, e3 = h1 * np.sqrt(gram[1, 1]), h2 * np.sqrt(gram[2, 2]), h3 * np.sqrt(gram[3, 3])
+        wide, rest = norm(rough), norm(fine)
         lower = 0.0
         if wide < length:
             lower = max(np.sqrt(max(found[i, 1], 0.0)) - np.sqrt(energy) / (length - wide) * wide, 0.0) ** 2
-        change = rest + np.sum(effects)
+        change = rest + e1 + e2 + e3
         if change < length:
-            least = np.sqrt(max(energy - _explained(gram, side, np.array([h1, h2, h3])), 0.0))
+            least = np.sqrt(max(energy - explained(gram, side, np.array([h1, h2, h3])), 0.0))
             lower = max(lower, max(least - np.sqrt(energy) / (length - change) * rest, 0.0) ** 2)
         found[i, 0] = lower
-        found[i, 2:] = effects if change < 2 * length else np.array([h1, h2, h3])
+        tangent = change < 2 * length
+        found[i, 2], found[i, 3], found[i, 4] = (e1, e2, e3) if tangent else (h1, h2, h3)
     return found
-
-
-@cached_njit
-def _explained(gram, side, h):
-    """Return the most that K (x0 + a x1 + b x2 + c x3) explains with |a|, |b|, |c| <= h: faces of a cone, one by one.
-
-    On a face some are at their ends; the optimum of a face counts where it obeys the other bounds.
-    """
-    best, ends = 0.0, np.zeros(3)
-    for face in range(27):
-        code, size = (face + 13) % 27, 1  # the interior first
-        basis = np.zeros((4, 4))
-        basis[0, 0] = 1.0
-        for p in range(3):
-            ends[p] = code % 3 - 1
-            code //= 3
-            if ends[p] == 0.0:
-                basis[p + 1, size], size = 1.0, size + 1
-            else:
-                basis[p + 1, 0] = ends[p] * h[p]
-        inner, right = basis.T @ gram @ basis, basis.T @ side
-        inner, right = inner[:size, :size].copy(), right[:size].copy()
-        scale = np.zeros(size)
-        for p in range(size):
-            scale[p] = np.sqrt(inner[p, p]) if inner[p, p] > 0.0 else 1.0
-        for p in range(size):
-            right[p] /= scale[p]
-            for q in range(size):
-                inner[p, q] /= scale[p] * scale[q]
-            inner[p, p] += 1e-13
-        v = np.linalg.solve(inner, right)
-        gain = np.sum(v * right)
-        v /= scale
-        inside, at = True, 1
-        for p in range(3):
-            if ends[p] == 0.0:
-                inside, at = inside and abs(v[at]) <= h[p] * abs(v[0]) * (1 + 1e-9), at + 1
-        if inside:
-            best = max(best, gain)
-            if size == 4:
-                return gain
-    return best
