@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 from refusals import refuses
+from scipy import stats
 from scipy.optimize import minimize
 
 import optid
@@ -539,6 +540,61 @@ def test_the_command_prints_gain_time_constant_dead_time_and_proof(tmp_path):
     assert re.search(r"static gain .* K/%\n", done.output) and re.search(r"tau +active \(1 of 1\)", done.output)
     assert optid.load(tmp_path / "step.json").orders == {"process": "P1D"}
     assert "dead time" in (tmp_path / "step.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("process", ["P2D", "P2DZ", "P3D", "P3DU", "P3DZ"])
+def test_richer_types_fit_no_worse_and_say_what_is_not_determined(process):
+    """Of a record of one pole the second one is a matter of the noise: its direction is flat, and said to be."""
+    data = record(seed=21)
+    plain = fit(data, prove=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optid.errors.DataWarning)
+        try:
+            rich = fit(data, process, prove=False)
+        except RankError as error:
+            assert "can change together" in str(error) and "Determined is their sum" in str(error)
+            return
+    assert rich.solution.objective <= plain.solution.objective * (1 + 1e-5)
+    assert rich.solution.status is Status.LOCAL or "not determined" in rich.solution.reason
+    worst = max(row.error / row.estimate for row in rich.params if row.name.startswith("tau"))
+    said = " ".join(str(rich.figures.get(name, "")) for name in ("not determined", "bounds", "time constants"))
+    assert worst < 20 or said.strip()
+
+
+def test_a_binding_word_is_the_reason_for_failed_tests():
+    found = fit(record(), constraints=["tau:high=20"])
+    assert found.verdict.failed and "tau binds" in found.summary()
+    assert any("leaving out 'tau', which binds" in one.sentence for one in found.advice)
+
+
+@pytest.mark.parametrize("word", ["gain:low=1", "through:0,5", "range:low=0,high=9", "slope:low=0"])
+def test_words_about_rest_point_integrators_to_their_slope(word):
+    truth = process_model("P1DI", K=0.05, tau=9.0, dead_time=12.4, level=5.0)
+    with pytest.raises(StructureError, match="integrator has no static characteristic from u.*The word K"):
+        fit(record(truth, ((T >= 10) & (T < 60)) * 1.0, 0.01), "P1DI", constraints=[word])
+
+
+def test_a_bound_on_the_slope_of_an_integrator_may_push_the_dead_time_to_zero():
+    truth = process_model("P1DI", K=0.05, tau=9.0, dead_time=12.4, level=5.0)
+    data = record(truth, ((T >= 10) & (T < 60)) * 1.0, 0.01)
+    held = fit(data, "P1DI", constraints=["K:low=0.06"])
+    assert held.solution.status is Status.LOCAL and estimates(held)["dead_time"] == pytest.approx(0, abs=1e-6)
+    at_zero = fit(data, "P1DI", constraints=["K:0.06", "dead_time:0"])
+    assert held.solution.objective == pytest.approx(at_zero.solution.objective, rel=1e-6)
+
+
+def test_intervals_of_dead_times_are_those_of_the_profile():
+    data, level = record(), 0.9
+    found = fit(data, prove=False)
+    row = found.conf_int(level)["dead_time"]
+    errors = errors_of(data)
+    dof = 200 - errors.unknowns.size
+    most = found.solution.objective * (1 + stats.f.ppf(level, 1, dof) / dof)
+    for end in (row.lower, row.upper):  # everything else fitted again there
+        there = fit(data, constraints=[words.dead_time(end)], prove=False)
+        assert there.solution.objective == pytest.approx(most, rel=1e-4)
+    shown = found.dynamics["dead time"]
+    assert (shown.lower, shown.upper) == (found.params["dead_time"].lower, found.params["dead_time"].upper)
 
 
 def test_real_poles_of_an_oscillation_are_equal_and_said_to_be():

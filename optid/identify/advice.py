@@ -193,6 +193,12 @@ def _tried(fit: Any) -> Iterator[Advice]:
 def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield structures as a phrase, as options, and as changes of the arguments of a fit."""
     name, arguments, data = fit.formulation, fit.arguments, fit.data
+    binding = [price.name for price in fit.prices if price.binding]
+    held = [rule for rule in arguments.get("constraints", ()) if not any(
+        word == getattr(rule, "name", "") or word.startswith(f"{getattr(rule, 'name', ' ')} of ") for word in binding)]
+    if len(held) < len(arguments.get("constraints", ())):
+        words = ", ".join(map(repr, binding))
+        yield f"leaving out {words}, which bind{'s' * (len(binding) == 1)},", f"without {words}", {"constraints": held}
     if hasattr(fit.model, "nk") and "nb" in arguments:
         told = informativity(data)
         shown = [told.lags] if told.processes else []
