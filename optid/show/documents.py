@@ -156,10 +156,9 @@ def _trust(fit: "Fit", judged: "Verdict | None", test: Data | None, advise: bool
         why = "samples at even distances" if isinstance(fit.data, Data) else "a record in memory"
         return [Banner("plain", "The model on this record: not judged", f"The tests of a verdict need {why}.",
                        tuple(one for one in found if isinstance(one, tuple)))]
-    binding = [price.name for price in fit.prices if price.binding] if judged.failed else []
-    if binding:
-        found = [*found, Notes([f"{', '.join(binding)} bind{'s' * (len(binding) == 1)}: the record alone would not "
-                                "have it so, and tests may fail for that reason (see the prices)."])]
+    if judged.failed and any(price.binding for price in fit.prices):
+        found = [*found, Notes(["An active constraint may be the reason for tests that fail: the record alone would "
+                                "not have it so. See the prices."])]
     advice = attempt("The advice", lambda: [Notes([str(one) for one in fit.advice])] if fit.advice else []) if (
         advise and judged.word in ADVISED) else []
     return [Banner(TONES[judged.word], f"The model on this record: {judged.word}", summary.judgement(judged),

@@ -45,7 +45,7 @@ def products(x, y):
 
 
 @cached_njit
-def explained(gram, side, h):
+def most_explained(gram, side, h):
     """Return the most that K (x_0 + sum a_i x_i) explains with |a_i| <= h_i: faces of a cone, one by one.
 
     On a face some a_i are at their ends; the optimum of a face counts where it obeys the other bounds.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
-from optid.identify.process.cones import explained, norm, products, project
+from optid.identify.process.cones import most_explained, norm, products, project
 from optid.identify.process.descent import ProcessBox
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.two_poles import two_pole_bounds
@@ -97,7 +97,7 @@ def box_bounds(boxes, smooth, record, moves, edges):
         lower = 0.0
         if change < length:
             largest = np.sqrt(energy) / (length - change)  # of the gain anywhere in the box
-            least = energy - explained(gram, side, np.array([h1, h2])) if smooth[i] else at_middle
+            least = energy - most_explained(gram, side, np.array([h1, h2])) if smooth[i] else at_middle
             lower = max(np.sqrt(max(least, 0.0)) - largest * rho, 0.0) ** 2
         found[i, 0], found[i, 1] = lower, at_middle
         found[i, 2] = first if smooth[i] else h1 * length

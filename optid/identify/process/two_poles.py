@@ -13,7 +13,7 @@ of the average: its largest one in the box serves for all.
 
 import numpy as np
 
-from optid.identify.process.cones import explained, norm, products, project
+from optid.identify.process.cones import most_explained, norm, products, project
 from optid.kernel_cache import cached_njit
 
 SERIES = 1e-3  # difference of the poles times the time, below which a series has more digits
@@ -108,7 +108,7 @@ def two_pole_bounds(boxes, record, moves, edges):
             lower = max(np.sqrt(max(found[i, 1], 0.0)) - np.sqrt(energy) / (length - wide) * wide, 0.0) ** 2
         change = rest + e1 + e2 + e3
         if change < length:
-            least = np.sqrt(max(energy - explained(gram, side, np.array([h1, h2, h3])), 0.0))
+            least = np.sqrt(max(energy - most_explained(gram, side, np.array([h1, h2, h3])), 0.0))
             lower = max(lower, max(least - np.sqrt(energy) / (length - change) * rest, 0.0) ** 2)
         found[i, 0] = lower
         tangent = change < 2 * length
