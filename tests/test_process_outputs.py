@@ -13,6 +13,7 @@ from optid.errors import DataError, StructureError
 from optid.identify.informativity import informativity
 from optid.models.process import ProcessModel, process_model
 from optid.program.solution import Status
+from optid.show import charts
 
 T = np.arange(300.0)
 PAIRS = [["P1D", "P1"], ["P2", "P1D"]]
@@ -85,6 +86,15 @@ def test_the_model_of_several_outputs_runs_and_travels(record, both, tmp_path):
     assert np.allclose(loaded.frequency_response([0.1]), model.to_continuous().frequency_response([0.1]))
     assert [row.name for row in both.dynamics][-4:] == [
         "static gain[level,valve]", "static gain[level,heater]", "static gain[temp,valve]", "static gain[temp,heater]"]
+
+
+def test_figures_show_a_curve_for_every_pair(both):
+    series = charts.bode_charts({"": both.model}, [(-1.0, 1.0)] * 2)[0].series
+    assert [one.name for one in series] == ["valve to level", "heater to level", "valve to temp", "heater to temp"]
+    assert all(np.isfinite(one.ys).all() for one in series)
+    one_input = ProcessModel(STEP.processes, STEP.nonlinearities, STEP.level, pairs=((0, 1),), inputs=("a", "b"))
+    assert [one.name for one in charts.bode_charts({"": one_input}, [(-1.0, 1.0)] * 2)[0].series] == ["response"]
+    np.testing.assert_allclose(one_input.simulate(np.column_stack([T, T]))[:, 0], STEP.simulate(T))
 
 
 def test_an_older_file_of_one_output_has_no_pairs():

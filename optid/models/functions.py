@@ -99,8 +99,12 @@ def step_length(model: Model) -> int:
 def response_pairs(model: Model) -> list[tuple[str, str]]:
     """Return (input, output) of every column of a response of the linear part, in the order of its last two axes.
 
-    Where an input has several static functions there is one column for each of them, by its word.
+    Where an input has several static functions there is one column for each of them, by its word; of processes one for
+    each pair, of which the responses of other outputs are zero.
     """
+    own: Any = getattr(model, "pairs", None)
+    if own is not None:
+        return [(model.inputs[c], output) for output in model.outputs for _, c in own]
     words = [function.word for function in static_functions(model) if function.family == "nonlinearities"]
     sources = words if len(words) > model.m else model.inputs
     return [(source, output) for output in model.outputs for source in sources]
