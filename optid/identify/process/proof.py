@@ -31,7 +31,7 @@ from optid.program.solution import Bound
 GAP = 1e-6  # relative gap at which a fit counts as proved
 COARSE = 1e-2  # gap of the pass that looks for better starts before a fit is confirmed
 PIECES = 8  # of the range of every unknown at the beginning
-SECONDS = 20.0  # after which a proof is given up
+SECONDS = 20.0  # of the processor, after which a proof is given up
 WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may compute; boxes that it needs at least
 MOST = {2: 5e6, 3: 1e3}  # responses to single moves in one bound beyond which no proof is tried, by unknowns
 METHOD = "branch and bound over time constants and dead time"
@@ -168,9 +168,9 @@ class BranchAndBound:
         ends = [np.linspace(low, high, PIECES + 1) for low, high in zip(self.box.low, self.box.high)]
         lows, highs = (np.meshgrid(*(end[part] for end in ends)) for part in (slice(None, -1), slice(1, None)))
         boxes = np.column_stack([side.ravel() for pair in zip(lows, highs) for side in pair])
-        count, bound, begun, best, point = 0, np.inf, time.perf_counter(), np.inf, self.box.low
+        count, bound, begun, best, point = 0, np.inf, time.thread_time(), np.inf, self.box.low
         while len(boxes := self._different(boxes)):
-            if time.perf_counter() - begun > seconds or count > most:
+            if time.thread_time() - begun > seconds or count > most:
                 break
             part, boxes = boxes[-2000:], boxes[:-2000]
             found, middles = self._bounded(part)
@@ -211,9 +211,9 @@ class BranchAndBound:
         if self.work > MOST[len(self.box.low)]:
             return Bound.none(f"{self.work:.1e} pairs of a sample and a move of the input: a proof would take too "
                               "long; several starts are compared")
-        begun = time.perf_counter()
+        begun = time.thread_time()
         found = self.search(value, GAP, SECONDS)
-        words = f"{found.boxes} boxes in {time.perf_counter() - begun:.2g} s"
+        words = f"{found.boxes} boxes in {time.thread_time() - begun:.2g} s"
         if len(found.left):
             return Bound(0.0, False, METHOD, f"given up after {words}: {len(found.left)} boxes are left, down to a "
                          f"dead time of {self._time(found.left[:, -2].min())}")
