@@ -31,7 +31,7 @@ from optid.program.solution import Bound
 GAP = 1e-6  # relative gap at which a fit counts as proved
 COARSE = 1e-2  # gap of the pass that looks for better starts before a fit is confirmed
 PIECES = 8  # of the range of every unknown at the beginning
-SECONDS = {2: 20.0, 3: 10.0}  # of the processor, after which a proof is given up, by unknowns
+SECONDS = {2: 20.0, 3: 15.0}  # of the processor, after which a proof is given up, by unknowns
 WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may compute; boxes that it needs at least
 MOST = {2: 5e6, 3: 1e3}  # responses to single moves in one bound beyond which no proof is tried, by unknowns
 METHOD = "branch and bound over time constants and dead time"
