@@ -1,4 +1,4 @@
-"""Processes in continuous time by simulation errors: gain, time constants, dead time and static curve of every input.
+"""Processes in continuous time by simulation errors: gain, time constants, dead time and static curve of every pair.
 
     y(t) = sum_c G_c(s) exp(-theta_c s) f_c(u_c(t)) + level (+ drift t),    f_c = mu_cᵀ eta_c,
     G(s) = (tau_zero s + 1) / [s] prod (tau_i s + 1) (T² s² + 2 zeta T s + 1)
@@ -13,7 +13,8 @@ Starts from a grid descend in the dynamics, everything linear projected out, fro
 
 confirm it. For one time constant with dead time and a straight f branch and bound proves that no other optimum is
 better. Constraints are stated in ``log tau``, ``log T``, ``log zeta``, ``tau_zero``, ``dead_time``, ``K``, ``mu`` and
-``Theta`` (a column), with several inputs as in ``K[valve]``; see `formulations.constraints.process`.
+``Theta`` (a column), with several inputs as in ``K[valve]``; see `formulations.constraints.process`. Several outputs,
+each divided by its standard deviation, have processes of their own, ``K[level,valve]``, and are searched one by one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,12 +33,13 @@ from optid.errors import StructureError
 from optid.identify.prediction_error.tangent_fit import Places
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.fit import fit_processes
-from optid.identify.process.order import choose_type
-from optid.identify.process.proof import certificate
+from optid.identify.process.order import choose_types
+from optid.identify.process.outputs import OutputErrors
+from optid.identify.process.pairs import for_outputs
 from optid.identify.process.record import Terms, process_errors, process_type
 from optid.models import Nonlinearity
 from optid.models.process import ProcessModel
-from optid.program.units import outer_bases
+from optid.program.units import outward
 from optid.solving.solve import Procedure
 from optid.solving.steps import steps
 
@@ -45,18 +47,19 @@ Array = np.ndarray
 
 
 @steps(lambda given: {"process.exact": "QP"})
-def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, zero: bool = False, delay: bool = True,
+def process(data: Data, *, process: str | Sequence[Any] = "", poles: int = 1, zero: bool = False, delay: bool = True,
             integrator: bool = False, order: str = "", basis: Bases = "linear",
             hold: str = "zero", offset: bool | str = True, drift: bool = False, initial: str = "rest",
-            times: Any = None, constraints: Sequence[Any] = ()) -> Procedure:
+            constraints: Sequence[Any] = ()) -> Procedure:
     """Minimise the simulation errors of processes with dead time.
 
     Named variables: ``K``, ``Theta``, ``dead_time``, ``dynamics``, ``log tau``, ``mu``, ``offset``.
 
     Args:
-        data: the record; one output. Outputs may be missing; it is cut where inputs are.
-        process: procest's name of the type, one for all inputs or one for each: P, the number of poles, D (dead time),
-            I (integrator), Z (zero), U (complex pair), such as "P1D". When not given, the next four arguments.
+        data: the record, at any times. Outputs may be missing; it is cut where inputs are.
+        process: procest's name of the type: P, the number of poles, D (dead time), I (integrator), Z (zero), U (complex
+            pair), such as "P1D"; one for all pairs, one for each input, or a row of these for each output, "none" where
+            an input has no effect on it. When not given, the next four arguments.
         poles: number of poles, without that of an integrator.
         zero: whether there is a zero.
         delay: whether there is a dead time.
@@ -67,13 +70,11 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
         offset: True for one level of the output, "each" for one of every experiment, False for none.
         drift: whether the level moves along a straight line.
         initial: "rest": every experiment begins at rest under its first inputs; "free": with a motion of its own.
-        times: instants of the samples in the unit of the sampling time, (N,) or one array per experiment; regular when
-            not given.
         constraints: builders such as ``formulations.constraints.process.tau(high=60)``.
 
     Raises:
-        StructureError: an impossible type, several outputs, words that are unknown.
-        DataError: an input that never moves, times that do not increase.
+        StructureError: an impossible type, another number of types, words that are unknown.
+        DataError: an input that never moves.
         RankError: too few samples, an output that does not respond, time constants and dead time that the record does
             not separate.
     """
@@ -82,26 +83,39 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
     if order and process:
         raise StructureError(f"order='auto' chooses the type, which process={process!r} names: give one of both")
     chosen = process or process_type(poles, zero, delay, integrator)
-    errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial), times)
-    errors, figures = choose_type(errors) if order else (errors, {})
-    if times is not None:
-        figures["instants"] = "as given; the verdict, and fits in %, count the samples as regular"
-    pose = partial(_problem, errors)
-    return (yield from fit_processes(errors, pose, tuple(constraints), certificate(errors), figures))
+    errors = process_errors(data, chosen, basis, Terms(hold, offset, drift, initial))
+    errors, figures = choose_types(errors) if order else (errors, {})
+    return (yield from fit_processes(errors, partial(_problem, errors), tuple(constraints), figures))
 
 
-def _problem(errors: ProcessErrors, x: Array, constraints: Sequence[Any]) -> Problem:
+process.takes_any_times = True
+
+
+def _problem(errors: OutputErrors, x: Array, constraints: Sequence[Any]) -> Problem:
     """Minimise ‖e‖² over the numbers of all processes, the static curves and the levels."""
-    places = Places.of(errors)
+    places, one, data = Places.of(errors), errors.each[0], errors.data
+    several = len(errors.each) > 1
+    facts = {"units": one.units, "bases": dict(zip(data.inputs, one.outer_bases))}
     return Problem(
         "process.exact",
         start=places.values(x),
         terms=(Errors(places.squares, places.value),),
-        further=partial(_signals, errors), model=partial(_model, errors),
-        facts={"iterate": True, "channels": errors.data.inputs, "units": errors.units, "outputs": errors.data.outputs,
-               "bases": dict(zip(errors.data.inputs, outer_bases(errors.bases, errors.units)))},
-        builders=tuple(constraints), scale=errors.energy, unit=errors.unit,
+        further=partial(_signals_of_outputs if several else _signals, errors if several else one),
+        model=partial(_model, errors),
+        facts={"iterate": True, "channels": data.inputs, "outputs": data.outputs, **({} if several else facts)},
+        builders=tuple(for_outputs(errors, constraints)), scale=errors.energy, unit=errors.unit,
         energy=errors.unit * errors.energy_of_record)
+
+
+def _signals_of_outputs(errors: OutputErrors, variables: Mapping[str, Any], _: Any) -> dict[str, Any]:
+    """Return what constraints speak about in the units of the record: of every output what it has alone."""
+    found = dict[str, Any]()
+    for o, one in enumerate(errors.each):
+        inner = errors.of_output(o, variables)
+        signals = outward({**inner, **_signals(one, inner, None)}, one.units, one.data.inputs, states=False)
+        found |= {errors.outer(o, name): signal for name, signal in signals.items()
+                  if name != "x0" and not name.startswith("dynamics")}
+    return found
 
 
 def _signals(errors: ProcessErrors, variables: Mapping[str, Any], _: Any) -> dict[str, Any]:
@@ -127,16 +141,18 @@ def _signals(errors: ProcessErrors, variables: Mapping[str, Any], _: Any) -> dic
     return found
 
 
-def _model(errors: ProcessErrors, values: Mapping[str, Array]) -> ProcessModel:
+def _model(errors: OutputErrors, values: Mapping[str, Array]) -> ProcessModel:
     """Return the model of named values in the units of the record."""
-    unknowns, dt = errors.unknowns, errors.data.dt
-    x = Places.of(errors).pack(values)
-    curves = tuple(Nonlinearity(basis, np.atleast_1d(values[errors.key("mu", c)]))
-                   for c, basis in enumerate(errors.bases))
-    states = np.reshape(values.get("x0", np.zeros(0)), (-1, unknowns.experiments), order="F")
-    levels = states[-1:].T if unknowns.levels else None
-    level = np.asarray(values.get("offset", np.zeros(1) if levels is None else levels.mean(axis=0)))
-    drift = float(np.sum(values.get("drift", 0.0))) / (errors.length * dt)
-    model = ProcessModel(tuple(one.in_unit(1 / dt) for one in errors.processes(x)), curves, level, drift,
-                         "first" if errors.straight else "zero", levels=levels, **model_meta(errors.data))
+    processes, curves, levels, drift = list[Any](), list[Any](), [], []
+    for o, one in enumerate(errors.each):
+        own, unknowns, dt = errors.of_output(o, values), one.unknowns, one.data.dt
+        processes += [process.in_unit(1 / dt) for process in one.processes(Places.of(one).pack(own))]
+        curves += [Nonlinearity(basis, np.atleast_1d(own[one.key("mu", c)])) for c, basis in enumerate(one.bases)]
+        states = np.reshape(own.get("x0", np.zeros(0)), (-1, unknowns.experiments), order="F")
+        levels.append(states[-1] if unknowns.levels else np.atleast_1d(own.get("offset", np.zeros(1))))
+        drift.append(float(np.sum(own.get("drift", 0.0))) / (one.length * dt))
+    every = np.array(levels).T
+    model = ProcessModel(tuple(processes), tuple(curves), every.mean(axis=0), np.array(drift),
+                         "first" if errors.each[0].straight else "zero", errors.pairs,
+                         levels=every if errors.each[0].unknowns.levels else None, **model_meta(errors.data))
     return model.with_transform(errors.units)

@@ -39,6 +39,19 @@ auto.figures["process type"]
 
 
 # %%
+# Historians store a value when it changes, and loggers jitter. A process is exact at any times: those of the samples
+# are handed over with them, or kept by ``optid.read(..., gaps="stamps")``, which ``optid fit`` does by itself.
+kept = np.sort(np.random.default_rng(2).permutation(240)[:150])
+late = optid.Data(valve[kept], temperature[kept], 5.0, "valve", "temperature", ["%"], ["K"],
+                  times=5.0 * kept)
+optid.fit(late, "process.exact", process="P1D").dynamics
+
+# %%
+# With several outputs there is a process for every pair of input and output, ``None`` where an input has no effect:
+# ``process=[["P1D", "P1"], ["P2", None]]``, or ``--process P1D,P1,P2,none``. Words name the pair:
+# ``"tau:high=60,channel=valve,output=level"``.
+
+# %%
 # A PI controller by the SIMC rule (Skogestad 2003), for a closed loop as slow as the dead time. The uncertainty of the
 # model is that of the settings, too.
 def simc(model):

@@ -2,7 +2,7 @@
 
 They apply to `formulations.process` alone; another formulation refuses them by name. The unknowns are the logarithms of
 time constants, in which bounds on them stay bounds: a price is per unit of the bound as it was written. ``channel`` is
-the name of an input, needed where there are several.
+the name of an input, ``output`` that of an output, needed where there are several.
 """
 
 from collections.abc import Sequence
@@ -18,116 +18,140 @@ from optid.program.view import View
 __all__ = ["K", "T", "dead_time", "overdamped", "tau", "tau_zero", "zeta"]
 
 
+Pair = tuple[str | None, str | None]  # names of input and output
+
+
 @recorded
 def tau(value: float | None = None, low: float | None = None, high: float | None = None, number: float | None = None,
-        channel: str | None = None) -> Rule:
+        channel: str | None = None, output: str | None = None) -> Rule:
     """The time constants equal ``value`` or lie in [low, high], in units of time; all, or the one of a number from 1.
 
+    The first is the largest one: larger ones obey a lower bound as well, and smaller ones an upper bound.
+
     Raises:
-        StructureError: no bound, crossing ones, or one that is not positive.
+        StructureError: no bound, crossing ones, one that is not positive, or no such number.
     """
-    names = ("tau", "tau1", "tau2", "tau3") if number is None else (f"tau{int(number)}", *("tau",) * (number == 1))
-    return _bounded("tau", names, value, low, high, channel)
+    names = ("tau", "tau1", "tau2", "tau3")
+    if number is None:
+        return _bounded("tau", names, value, low, high, (channel, output))
+    if number not in (1, 2, 3):
+        raise StructureError(f"tau: number={number!r} must be 1, 2 or 3; the first time constant is the largest one")
+    own, pair = int(number), (channel, output)
+    parts = [(names[own : own + 1] + ("tau",) * (own == 1), value, low, high)]
+    least, most = (low, high) if value is None else (value, value)
+    parts += [(names[1:own], None, least, None)] * (least is not None and own > 1)
+    parts += [(names[own + 1 :], None, None, most)] * (most is not None and own < 3)
+    first, *others = (_bounded("tau", *part, pair) for part in parts)
+
+    def build(view: View) -> list[Limit]:
+        present = {name.partition("[")[0] for name in view}
+        return first.build(view) + [limit for (those, *_), rule in zip(parts[1:], others)
+                                    if any(f"log {name}" in present for name in those) for limit in rule.build(view)]
+
+    return Rule(label(f"tau{own}", *pair), build)
 
 
 @recorded
 def T(value: float | None = None, low: float | None = None, high: float | None = None,  # noqa: N802
-      channel: str | None = None) -> Rule:
+      channel: str | None = None, output: str | None = None) -> Rule:
     """The time constant of the second-order factor equals ``value`` or lies in [low, high]; errors as of `tau`."""
-    return _bounded("T", ("T",), value, low, high, channel)
+    return _bounded("T", ("T",), value, low, high, (channel, output))
 
 
 @recorded
-def zeta(value: float | None = None, low: float | None = None, high: float | None = None, channel: str | None = None
-         ) -> Rule:
+def zeta(value: float | None = None, low: float | None = None, high: float | None = None, channel: str | None = None,
+         output: str | None = None) -> Rule:
     """The damping of the second-order factor equals ``value`` or lies in [low, high]; errors as of `tau`."""
-    return _bounded("zeta", ("zeta",), value, low, high, channel)
+    return _bounded("zeta", ("zeta",), value, low, high, (channel, output))
 
 
 @recorded
-def overdamped(channel: str | None = None) -> Rule:
+def overdamped(channel: str | None = None, output: str | None = None) -> Rule:
     """The damping of the second-order factor is at least one: its poles are real."""
 
     def build(view: View) -> list[Limit]:
-        return [_lower(view[view.key("log zeta", _input(view, "overdamped", ("log zeta",), channel))], 1.0)]
+        return [_lower(view[view.key("log zeta", _input(view, "overdamped", ("log zeta",), (channel, output)))], 1.0)]
 
-    return Rule(label("overdamped", channel), build)
+    return Rule(label("overdamped", channel, output), build)
 
 
 @recorded
 def tau_zero(value: float | None = None, low: float | None = None, high: float | None = None,
-             channel: str | None = None) -> Rule:
+             channel: str | None = None, output: str | None = None) -> Rule:
     """The time constant of the zero equals ``value`` or lies in [low, high]; negative with an inverse response.
 
     Raises:
         StructureError: no bound, or crossing ones.
     """
-    return _linear("tau_zero", value, low, high, channel)
+    return _linear("tau_zero", value, low, high, (channel, output))
 
 
 @recorded
 def dead_time(value: float | None = None, low: float | None = None, high: float | None = None,
-              channel: str | None = None) -> Rule:
+              channel: str | None = None, output: str | None = None) -> Rule:
     """The dead time equals ``value`` or lies in [low, high], in units of time.
 
     Raises:
         StructureError: no bound, crossing ones, or a negative one.
     """
     _refuse_below("dead_time", 0.0, value, low, high)
-    return _linear("dead_time", value, low, high, channel)
+    return _linear("dead_time", value, low, high, (channel, output))
 
 
 @recorded
 def K(value: float | None = None, low: float | None = None, high: float | None = None,  # noqa: N802
-      channel: str | None = None) -> Rule:
+      channel: str | None = None, output: str | None = None) -> Rule:
     """The gain equals ``value`` or lies in [low, high]; with an integrator, the slope of the output.
 
     Raises:
         StructureError: no bound, crossing ones, or a static curve, whose gain has the word "gain".
     """
-    return _linear("K", value, low, high, channel)
+    return _linear("K", value, low, high, (channel, output))
 
 
 def _bounded(word: str, names: Sequence[str], value: float | None, low: float | None, high: float | None,
-             channel: str | None) -> Rule:
+             pair: Pair) -> Rule:
     """Return bounds on positive parameters, of which those that the process has are meant."""
     check_bounds(word, low if value is None else value, high if value is None else value)
     _refuse_below(word, np.finfo(float).tiny, value, low, high)
 
     def build(view: View) -> list[Limit]:
-        one = _input(view, word, [f"log {name}" for name in names], channel)
+        one = _input(view, word, [f"log {name}" for name in names], pair)
         logs = [view[view.key(f"log {name}", one)] for name in names if view.key(f"log {name}", one) in view]
         if value is not None:
             return [Limit(log == np.log(value), 1 / value, "value") for log in logs]
         return [_lower(log, low) for log in logs if low is not None] + [
             Limit(log <= np.log(high), 1 / high, "high") for log in logs if high is not None]
 
-    return Rule(label(word, channel), build)
+    return Rule(label(word, *pair), build)
 
 
 def _lower(log: Any, bound: float) -> Limit:
     return Limit(np.log(bound) - log <= 0, 1 / bound, "low")
 
 
-def _linear(word: str, value: float | None, low: float | None, high: float | None, channel: str | None) -> Rule:
+def _linear(word: str, value: float | None, low: float | None, high: float | None, pair: Pair) -> Rule:
     check_bounds(word, low if value is None else value, high if value is None else value)
 
     def build(view: View) -> list[Limit]:
-        entry = view[view.key(word, _input(view, word, [word], channel))]
+        entry = view[view.key(word, _input(view, word, [word], pair))]
         if value is not None:
             return [Limit(entry == value, 1.0, "value")]
         return ([Limit(entry >= low, 1.0, "low")] if low is not None else []) + (
             [Limit(entry <= high, 1.0, "high")] if high is not None else [])
 
-    return Rule(label(word, channel), build)
+    return Rule(label(word, *pair), build)
 
 
-def _input(view: View, word: str, names: Sequence[str], channel: str | None) -> str | None:
+def _input(view: View, word: str, names: Sequence[str], pair: Pair) -> str | None:
     """Return the input that is meant; refuse other formulations, and processes without such a parameter."""
     if not any(name.startswith("dynamics") for name in view):
         raise StructureError(f"constraint {word!r} is about a process in continuous time: use the formulation "
                              "'process.exact'; elsewhere 'stable', 'damped' or 'strip' restrict the poles")
+    channel, output = pair
     one = None if len(view.channels) == 1 and channel is None else view.channel(channel)
+    if output is not None:
+        view.output(output)
     if not any(view.key(name, one) in view for name in names):
         plain = names[0].removeprefix("log ")
         remedy = {"K": "the static curve has the word 'gain'", "dead_time": "choose a type with D, such as 'P1D'",

@@ -157,7 +157,7 @@ def _one_each(given: Any, channels: Sequence[str], kind: str, ranges: Sequence[A
             raise DataError(f"{kind} {channel!r} has no sample at all; choose another column or drop the {kind}")
         if low == high:
             raise DataError(f"{kind} {channel!r} is constant ({low:g}): nothing can be identified from it; "
-                            "excite the input or drop the channel")
+                            "excite the input or drop the channel, or begin the record before its step")
         found.append(family.fitted(float(low), float(high)))
     return found
 

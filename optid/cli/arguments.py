@@ -79,6 +79,17 @@ def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
     return arguments
 
 
+def at_stamps(how: dict[str, Any], formulation: str) -> dict[str, Any]:
+    """Return the reading options with the stamps kept where the formulation takes any times and no repair is asked for.
+
+    `LookupFailed` for an unknown formulation.
+    """
+    from optid.registry import formulation as look_up
+
+    any_times = getattr(look_up(formulation)[1], "takes_any_times", False)
+    return {**how, "gaps": "stamps"} if any_times and how["gaps"] is None and how["resample"] is None else how
+
+
 def as_modelled(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
     """Return the reading options with channels and sampling time of a model where none are given."""
     return {

@@ -136,6 +136,9 @@ def _json(key: str, words: Any) -> str:
 
     if isinstance(words, bool):
         return json.dumps(words)
+    whole = [value(word) for word in words]
+    if len(whole) == 1 and isinstance(whole[0], list):  # JSON, which may be nested
+        return words[0]
     found = listed(words)
     if not found:
         raise typer.BadParameter(f"{option_of(key)} needs a value")

@@ -52,7 +52,8 @@ How the files are written:
     date_format (FORMAT): Format of the time stamps, such as '%d.%m.%Y %H:%M:%S'. [dim]ISO 8601[/]
     time_zone (ZONE): Zone of local time stamps, such as Europe/Berlin.
     time_tolerance (SHARE): Largest deviation of a time step, relative to the median step.
-    gaps (WORD): Lost rows become 'missing' samples, or 'experiments' begin after them. [dim]refused[/]
+    gaps (WORD): Lost rows become 'missing' samples, 'experiments' begin after them, or rows keep their 'stamps',
+        however irregular (processes in continuous time). [dim]refused; process.exact: stamps[/]
     resample (DURATION): Bring the record onto this sampling time, such as 1s or 5min.
     quality (COLUMN:VALUE...): Columns of quality and their value for a good sample, such as PV.Q:192.
     from_ (--from TIME): Leave out the samples before this date or second.

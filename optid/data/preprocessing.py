@@ -67,6 +67,7 @@ def decimate(data: Changed, q: int) -> Changed:
         DataError: q is not a positive integer, samples are missing, or an experiment is shorter than the filter.
     """
     check_integer(q, "q", error=DataError)
+    data.refuse_irregular("decimate")
     return _at_ratio(data, 1, int(q))
 
 
@@ -82,6 +83,7 @@ def resample(data: Changed, dt: float) -> Changed:
         DataError: an impossible sampling time, missing samples, or an experiment shorter than the filter.
     """
     dt = sampling_time(dt)
+    data.refuse_irregular("resample")
     ratio = Fraction(data.dt / dt).limit_denominator(1000)
     if not 1e-3 <= ratio <= 1000 or abs(float(ratio) * dt / data.dt - 1) > 1e-9:
         raise DataError(f"dt = {dt:g} is in no ratio of integers up to 1000 to the sampling time of the record, "
@@ -107,6 +109,7 @@ def filter(data: Changed, low: float | None = None, high: float | None = None, o
         DataError: frequencies that are not 0 < low < high < half the sampling rate, or missing samples.
     """
     order = check_integer(order, "order", 1, 20, error=DataError)
+    data.refuse_irregular("a filter")
     edges = [edge for edge in (low, high) if edge is not None]
     nyquist = 0.5 / data.dt
     if not edges or any(isinstance(edge, bool) or not isinstance(edge, int | float | np.number) for edge in edges) or \

@@ -87,7 +87,7 @@ def read(source: Any, inputs: Wanted = None, outputs: Wanted = None, dt: float |
     first = sources[0]
     units = runs[0].units
     return Data.of_experiments(
-        [Experiment(piece.u, piece.y, float(seconds(np.atleast_1d(piece.stamp))[0])) for piece in pieces],
+        [Experiment(piece.u, piece.y, float(seconds(np.atleast_1d(piece.stamp))[0]), piece.times) for piece in pieces],
         1.0 if step is None else step, *runs[0].names,
         how.input_units or [units.get(one, "") for one in runs[0].names[0]],
         how.output_units or [units.get(one, "") for one in runs[0].names[1]],

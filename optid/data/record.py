@@ -1,7 +1,7 @@
 """Records of inputs and outputs: one or several experiments with names, units and a sampling time."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -12,7 +12,7 @@ from optid.arrays import as_list, as_records, frozen, one_or_all
 from optid.data import preprocessing
 from optid.data.channels import Channel, Ports, Transform, channel_fields, interval_text, listed, sampling_time
 from optid.data.description import Description, instant
-from optid.data.timeline import Timeline, seconds_of, starts_of
+from optid.data.timeline import Timeline, read_times, seconds_of, starts_of
 from optid.errors import DataError, nearest
 from optid.registry import render
 
@@ -25,16 +25,20 @@ class Experiment:
         u: (N, m) inputs, float64, read-only; NaN = missing.
         y: (N, l) outputs, float64, read-only; NaN = missing.
         start: time of the first sample.
+        stamps: (N,) times after the first sample where these are irregular, None where they are multiples of dt.
     """
 
     u: np.ndarray
     y: np.ndarray
     start: float = 0.0
+    stamps: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.u.shape[0] != self.y.shape[0]:
             raise DataError(f"u has {self.u.shape[0]} samples and y has {self.y.shape[0]}. Cut both to the samples "
                             "that were recorded together, or fill the lost ones with NaN.")
+        if self.stamps is not None and self.stamps.shape != (self.u.shape[0],):
+            raise DataError(f"{self.stamps.size} irregular times for {self.u.shape[0]} samples: give one for each.")
 
     @property
     def n_samples(self) -> int:
@@ -69,7 +73,8 @@ class Data(Ports):
 
     def __init__(self, u: Any, y: Any, dt: float | None = None, inputs: str | Sequence[str] | None = None,
                  outputs: str | Sequence[str] | None = None, input_units: str | Sequence[str] | None = None,
-                 output_units: str | Sequence[str] | None = None, name: str = "", start: Any = 0.0) -> None:
+                 output_units: str | Sequence[str] | None = None, name: str = "", start: Any = 0.0,
+                 times: Any = None) -> None:
         """Copy and check the record.
 
         Args:
@@ -83,6 +88,9 @@ class Data(Ports):
             name: name of the data set, for reports.
             start: time of the first sample, one for all experiments or one for each: seconds, or dates (datetime64,
                 ISO text).
+            times: times of the samples in place of start, in seconds or as dates: (N,), or a list of as many arrays.
+                Where they are no multiples of a sampling time only processes in continuous time take the record, and
+                dt is what counts as one, the median step when not given.
 
         Raises:
             DataError: wrong shape or type, infinite sample, different lengths, wrong number of names; the message
@@ -96,10 +104,13 @@ class Data(Ports):
         if len(us) != len(ys):
             raise DataError(f"u has {len(us)} experiments and y has {len(ys)}; give one array of each per experiment.")
         starts, dated = starts_of(start, len(us))
+        stamps: Sequence[np.ndarray | None] = [None] * len(us)
+        if times is not None:
+            starts, dated, stamps, dt = read_times(times, [len(ue) for ue in us], dt)
         experiments = []
-        for k, (ue, ye, s) in enumerate(zip(us, ys, np.broadcast_to(starts, len(us)))):
+        for k, (ue, ye, s, t) in enumerate(zip(us, ys, np.broadcast_to(starts, len(us)), stamps)):
             try:
-                experiments.append(Experiment(ue, ye, float(s)))
+                experiments.append(Experiment(ue, ye, float(s), t))
             except DataError as error:
                 raise DataError(f"experiment {k + 1}: {error}" if len(us) > 1 else str(error)) from None
         self._complete(experiments, dt, inputs, outputs, input_units, output_units, name=str(name), dated=dated)
@@ -167,7 +178,21 @@ class Data(Ports):
     @property
     def timelines(self) -> tuple[Timeline, ...]:
         """When the samples of each experiment were taken."""
-        return tuple(Timeline(e.start, self.dt, self.time_unit, self.dated) for e in self.experiments)
+        return tuple(Timeline(e.start, self.dt, self.time_unit, self.dated, e.stamps) for e in self.experiments)
+
+    @property
+    def is_regular(self) -> bool:
+        """Whether the samples of every experiment were taken every dt."""
+        return all(e.stamps is None for e in self.experiments)
+
+    def refuse_irregular(self, what: str) -> None:
+        """Refuse a record whose samples were not taken every dt; the message says what needs them (`DataError`)."""
+        if self.is_regular:
+            return
+        steps = np.concatenate([np.diff(e.stamps) for e in self.experiments if e.stamps is not None])
+        raise DataError(f"{what} needs samples at even distances; the times of this record step by {steps.min():.4g} "
+                        f"to {steps.max():.4g} {self.time_unit or 'samples'}. Read it with "
+                        f"resample='{self.dt:.6g}s', or fit 'process.exact', which takes any times.")
 
     # -- what the data look like ---------------------------------------------------------------------------------
 
@@ -318,6 +343,8 @@ class Data(Ports):
             """The first sample not before a time, with 1e-6 of a step for the rounding of the times."""
             if end is None or whole:
                 return end
+            if e.stamps is not None:
+                return int(np.searchsorted(e.stamps, end - e.start - 1e-6 * self.dt))
             return int(np.ceil(min(max((end - e.start) / self.dt - 1e-6, 0.0), e.n_samples)))
 
         spans = [slice(sample(part.start, e), sample(part.stop, e)).indices(e.n_samples) for e in self.experiments]
@@ -351,7 +378,7 @@ class Data(Ports):
         kept = [self.experiments[k] for k in picked]
         t = self.transform
         return self._with(
-            experiments=tuple(Experiment(frozen(e.u[:, i]), frozen(e.y[:, o]), e.start) for e in kept),
+            experiments=tuple(Experiment(frozen(e.u[:, i]), frozen(e.y[:, o]), e.start, e.stamps) for e in kept),
             inputs=_take(self.inputs, i), outputs=_take(self.outputs, o), input_units=_take(self.input_units, i),
             output_units=_take(self.output_units, o),
             transform=Transform(_take(t.u_scale, i), _take(t.u_offset, i), _take(t.y_scale, o), _take(t.y_offset, o)),
@@ -415,11 +442,14 @@ class Data(Ports):
 
         The functions must not change their arguments.
         """
-        experiments = tuple(Experiment(frozen(of_u(e.u)), frozen(of_y(e.y)), e.start) for e in self.experiments)
+        experiments = tuple(replace(e, u=frozen(of_u(e.u)), y=frozen(of_y(e.y))) for e in self.experiments)
         return self._with(experiments=experiments, **changes)
 
     def _cut(self, e: Experiment, first: int, last: int) -> Experiment:
-        return Experiment(e.u[first:last], e.y[first:last], e.start + first * self.dt)
+        if e.stamps is None:
+            return Experiment(e.u[first:last], e.y[first:last], e.start + first * self.dt)
+        t = e.stamps[first:last]
+        return Experiment(e.u[first:last], e.y[first:last], e.start + float(t[0]), frozen(t - t[0]))
 
     def _with(self, **changes: Any) -> "Data":
         return _filled(object.__new__(Data), **{f.name: getattr(self, f.name) for f in fields(self)} | changes)

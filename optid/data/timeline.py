@@ -1,13 +1,17 @@
 """When the samples of an experiment were taken: numbers of samples, times and dates as text."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from optid.arrays import frozen
 from optid.data.description import instant
 from optid.errors import DataError
+
+EVEN = 1e-6  # of a sampling time by which a time may miss a multiple of it and count as that
 
 
 @dataclass(frozen=True)
@@ -19,19 +23,22 @@ class Timeline:
         dt: sampling time.
         unit: its unit; "" where it is unknown.
         dated: whether the times are dates.
+        stamps: (N,) times after sample 0 where these are no multiples of dt.
     """
 
     start: float = 0.0
     dt: float = 1.0
     unit: str = ""
     dated: bool = False
+    stamps: np.ndarray | None = None
 
     def instants(self, samples: Any) -> np.ndarray:
         """Return the times of samples (n,), as datetime64 where they are dates."""
+        later = self.dt * np.asarray(samples) if self.stamps is None else self.stamps[np.asarray(samples)]
         if not self.dated:
-            return self.start + self.dt * np.asarray(samples)
+            return self.start + later
         start = np.datetime64(round(self.start * 1e6), "us").astype("M8[ns]")  # seconds since 1970 hold microseconds
-        return start + np.round(self.dt * np.asarray(samples) * 1e9).astype("m8[ns]")
+        return start + np.round(later * 1e9).astype("m8[ns]")
 
     def text(self, sample: int) -> str:
         """Return the time of a sample: a date, a number with its unit, or "" where the unit is unknown."""
@@ -63,6 +70,49 @@ def starts_of(start: Any, count: int) -> tuple[np.ndarray, bool]:
     if starts.shape not in ((1,), (count,)) or not (np.isfinite(starts) & (np.abs(starts) < 1e15)).all():
         raise DataError(f"start = {start!r}: one finite time or date, or one for each of the {count} experiments.")
     return starts, dated
+
+
+def read_times(times: Any, counts: Sequence[int], dt: float | None
+               ) -> tuple[np.ndarray, bool, list[np.ndarray | None], float]:
+    """Return (starts, whether they are dates, stamps of every experiment or None where regular, sampling time).
+
+    Raises:
+        DataError: other numbers than the samples, times that are not finite or do not increase, by sample.
+    """
+    arrays = list(times) if isinstance(times, list | tuple) and np.ndim(times[0]) else [times]
+    if len(arrays) != len(counts):
+        raise DataError(f"times has {len(arrays)} arrays for {len(counts)} experiments")
+    starts, kinds, found = [], set[bool](), []
+    for i, (given, count) in enumerate(zip(arrays, counts), start=1):
+        where, t = f"experiment {i}: " * (len(counts) > 1), np.asarray(given)
+        if t.shape != (count,) or not count:
+            raise DataError(f"{where}times has shape {t.shape}; it must be ({count},), one for each sample")
+        dated = t.dtype.kind in "MUO"
+        try:
+            t = t.astype("M8[ns]") if dated else t.astype(float)
+        except (ValueError, TypeError):
+            raise DataError(f"{where}times must be numbers of seconds or dates; the first is {t[0]!r}") from None
+        lost = np.isnat(t) if dated else ~np.isfinite(t)
+        if lost.any():
+            raise DataError(f"{where}the time of sample {int(np.argmax(lost))} is not finite")
+        later = (t - t[0]) / np.timedelta64(1, "ns") * 1e-9 if dated else t - t[0]
+        steps = np.diff(later)
+        if np.any(steps <= 0):
+            k = int(np.argmax(steps <= 0)) + 1
+            word = "runs backwards" if steps[k - 1] < 0 else "stands still"
+            raise DataError(f"{where}the time {word} at sample {k} ({t[k - 1]}, then {t[k]}; "
+                            f"{int(np.sum(steps <= 0))} such samples in all). Sort the record by time and drop what "
+                            "stands twice")
+        kinds.add(dated)
+        starts.append(float(t[0].astype("M8[us]").astype(np.int64)) / 1e6 if dated else float(t[0]))
+        found.append(later)
+    if len(kinds) > 1:
+        raise DataError("times are dates in some experiments and numbers in others; give dates in all")
+    steps = np.concatenate([np.diff(one) for one in found])
+    if dt is None:
+        dt = float(f"{np.median(steps):.12g}") if steps.size else 1.0
+    even = [bool(np.all(np.abs(one - dt * np.arange(one.size)) <= EVEN * dt)) for one in found]
+    return np.array(starts), kinds.pop(), [None if regular else frozen(one) for one, regular in zip(found, even)], dt
 
 
 def seconds_of(end: Any) -> Any:

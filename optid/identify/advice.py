@@ -56,7 +56,7 @@ class Advice:
 
 def advise(fit: Any) -> tuple[Advice, ...]:
     """Return at most five steps for a fit of a record in memory, the most useful first."""
-    if not isinstance(fit.data, Data) or fit.model is None:
+    if not isinstance(fit.data, Data) or not fit.data.is_regular or fit.model is None:
         return ()
     told = informativity(fit.data)
     steps = [*_hopeless(told), *_in_a_loop(fit, told), *_on_record(fit), *_on_steps(fit, told)]
@@ -193,6 +193,12 @@ def _tried(fit: Any) -> Iterator[Advice]:
 def _neighbours(fit: Any) -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield structures as a phrase, as options, and as changes of the arguments of a fit."""
     name, arguments, data = fit.formulation, fit.arguments, fit.data
+    binding = [price.name for price in fit.prices if price.binding]
+    held = [rule for rule in arguments.get("constraints", ()) if not any(
+        word == getattr(rule, "name", "") or word.startswith(f"{getattr(rule, 'name', ' ')} of ") for word in binding)]
+    if len(held) < len(arguments.get("constraints", ())):
+        words = ", ".join(map(repr, binding))
+        yield f"leaving out {words}, which bind{'s' * (len(binding) == 1)},", f"without {words}", {"constraints": held}
     if hasattr(fit.model, "nk") and "nb" in arguments:
         told = informativity(data)
         shown = [told.lags] if told.processes else []

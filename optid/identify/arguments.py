@@ -50,8 +50,15 @@ def one_output(data: Any, errors: str) -> Data:
         raise StructureError(
             f"a transfer-function model has one output; there are {data.l} ({', '.join(data.outputs)}). Fit each by "
             "itself (data.select(outputs=...)), or all of them with 'hammerstein_ss.exact'")
-    if not any(np.isfinite(e.y).any() for e in data.experiments):
-        raise DataError(f"output {data.outputs[0]!r} has no sample that is present")
+    return outputs_in_memory(data, errors)
+
+
+def outputs_in_memory(data: Any, errors: str) -> Data:
+    """Refuse streams (`StructureError`), and outputs without a single sample (`DataError`)."""
+    data = in_memory(data, errors)
+    for o, name in enumerate(data.outputs):
+        if not any(np.isfinite(e.y[:, o]).any() for e in data.experiments):
+            raise DataError(f"output {name!r} has no sample that is present")
     return data
 
 

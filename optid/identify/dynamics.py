@@ -85,6 +85,8 @@ def integrating_pole(model: Any, known: Any = None) -> tuple[float, str]:
             return pole, "A pole at 1: the model integrates, its output comes to rest at no level"
         if known is not None and pole > 0:
             found = known.of(lambda model, pole=pole: nearest_real(poles_of(model), pole))
+            if model.structure == "process" and found.lower <= 0:
+                continue  # a time constant that is not told from zero
             if found.lower <= 1 <= found.upper:
                 return pole, (f"The record does not tell the pole {pole:.5g} (from {float(found.lower):.5g} to "
                               f"{float(found.upper):.5g}) from 1: the model may integrate, no level of rest is known")
@@ -176,20 +178,25 @@ class _Reading:
         for place, (name, _) in enumerate(self.model.coefficients()):
             word, bracket, channel = name.partition("[")
             rows = self.limits(name, lambda model, place=place: model.coefficients()[place][1])
+            if self.known is not None and np.isfinite(rows[0, 1]):
+                wald, rows = rows, self.known.with_profile(name, rows[0])[None]
+                if np.any(rows != wald):
+                    self.notes.append(f"Interval of the {times[word]}{bracket}{channel} by profile likelihood; by its "
+                                      f"standard error {wald[0, 2]:.4g} to {wald[0, 3]:.4g}.")
             if word in times:
                 found.append(_parameter(times[word] + bracket + channel, rows[0], units[name]))
             elif word == "T":
                 rows = self.limits(name, lambda model, place=place: 1 / model.coefficients()[place][1])
                 found.append(_parameter(f"natural frequency{bracket}{channel}", rows[0], f"rad/{units[name] or 1}"))
         model = self.model
-        for c, (one, f, channel) in enumerate(zip(model.processes, model.nonlinearities, model.inputs)):
+        for j, ((_, c), one, f) in enumerate(zip(model.pairs, model.processes, model.nonlinearities)):
             name, (low, high) = "slope" if one.structure.integrator else "static gain", middle(*self.levels[c])
             ends = np.array([low, high])
             if not f.is_linear:
-                self.notes.append(f"{name.capitalize()} between {channel} = {low:g} and {high:g}.")
-            rows = self.limits(name, lambda model, c=c, ends=ends: (
-                np.diff(model.nonlinearities[c](ends)) / np.diff(ends)))
-            found.append(_parameter(name + self._of(channel), rows[0], units["K" + self._of(channel)]))
+                self.notes.append(f"{name.capitalize()} between {model.inputs[c]} = {low:g} and {high:g}.")
+            rows = self.limits(name, lambda model, j=j, ends=ends: (
+                np.diff(model.nonlinearities[j](ends)) / np.diff(ends)))
+            found.append(_parameter(model.of_pair(name, j), rows[0], units[model.of_pair("K", j)]))
         return found
 
     # -- poles -----------------------------------------------------------------------------------------------------

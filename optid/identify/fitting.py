@@ -160,22 +160,28 @@ class Fit(Rendered):
 
     @property
     def informativity(self) -> Any:
-        """What the record can tell (`optid.identify.informativity.Informativity`); None for a stream."""
+        """What the record can tell (`optid.identify.informativity.Informativity`); None where its times are irregular.
+
+        None also for a stream.
+        """
         from optid.identify.informativity import informativity
 
-        return informativity(self.data) if isinstance(self.data, Data) else None
+        return informativity(self.data) if isinstance(self.data, Data) and self.data.is_regular else None
 
     @property
     def record_findings(self) -> tuple[str, ...]:
         """What reading the record found, and what it can tell, one sentence each."""
-        return (*self.data.findings, *(self.informativity.findings if isinstance(self.data, Data) else ()))
+        return (*self.data.findings, *(self.informativity.findings if self.informativity else ()))
 
     @cached_property
     def verdict(self) -> Any:
-        """Tests of the model on the record (`optid.identify.verdict.Verdict`); None for a stream, or no model."""
+        """Tests of the model on the record (`optid.identify.verdict.Verdict`).
+
+        None for a stream, a record at irregular times, or no model.
+        """
         from optid.identify.verdict import verdict
 
-        if not isinstance(self.data, Data) or self.model is None:
+        if not isinstance(self.data, Data) or not self.data.is_regular or self.model is None:
             return None
         try:
             known = self.uncertainty
@@ -335,6 +341,8 @@ def fit(data: Data | Stream, formulation_name: str | Callable[..., Any] = "hamme
     if built:
         arguments["constraints"] = built
     check_arguments(name, pose, arguments)
+    if isinstance(data, Data) and not getattr(pose, "takes_any_times", False):
+        data.refuse_irregular(f"{name!r}")
     whole = {**defaults(pose), **arguments}
     solvers = choose_solvers(name, pose, whole, solver)
     try:

@@ -72,6 +72,7 @@ class Uncertainty:
         source: where they come from.
         point: (m,) inputs at which `table` lists the static gain of a state-space model; None for zero.
         state: (n,) from which its equilibrium there is looked for; None for zero.
+        profiles: intervals by profile likelihood, as of `optid.solving.solve.Evidence`; None without.
     """
 
     model: Any = field(repr=False)
@@ -79,6 +80,7 @@ class Uncertainty:
     source: Tangent | Refits = field(repr=False)
     point: Array | None = field(default=None, repr=False)
     state: Array | None = field(default=None, repr=False)
+    profiles: Any = field(default=None, repr=False)
 
     @property
     def meaning(self) -> str:
@@ -172,6 +174,12 @@ class Uncertainty:
         return Interval(value, error.reshape(value.shape), value + lower.reshape(value.shape),
                         value + upper.reshape(value.shape))
 
+    def with_profile(self, name: str, row: Sequence[float]) -> Array:
+        """Return (estimate, standard error, lower, upper) of a parameter, with the ends of its profile if any."""
+        coloured = "coloured" in getattr(self.source, "words", ())
+        ends = None if self.profiles is None else self.profiles(name, self.level, row[1] if coloured else None)
+        return np.array(row if ends is None else (*row[:2], *ends), dtype=float)
+
     def table(self) -> list[tuple[str, float, float, float, float]]:
         """Return (name, estimate, standard error, lower, upper) of what tables of the model show.
 
@@ -180,7 +188,8 @@ class Uncertainty:
         """
         if self.model.structure != "ss":
             names = [name for name, _ in self.model.coefficients()]
-            return self._rows(names, lambda model: np.array([value for _, value in model.coefficients()]))
+            rows = self._rows(names, lambda model: np.array([value for _, value in model.coefficients()]))
+            return [(name, *self.with_profile(name, row)) for name, *row in rows]
         poles = self.model.poles[self.model.poles.imag >= 0]
         names = [f"pole {i + 1}{part}" for i, pole in enumerate(poles)
                  for part in ([", real", ", imaginary"] if pole.imag else [""])]
@@ -236,7 +245,8 @@ def uncertainty(fit: Any, level: float = 0.95, draws: int = DRAWS, seed: int = 0
     source = linearise(fit, rebuild, draws, seed)
     _ = source.neighbours  # so that models which cannot be differentiated are refused here, not by a table of them
     if fit.model.structure != "ss":
-        return Uncertainty(fit.model, float(level), source)
+        evidence = fit.outcome.evidence
+        return Uncertainty(fit.model, float(level), source, profiles=evidence and evidence.profiles)
     experiments = fit.data.raw().experiments
     point = np.nanmean(np.vstack([e.u for e in experiments]), axis=0)
     return Uncertainty(fit.model, float(level), source, point, _mean_state(fit.model, experiments))

@@ -25,13 +25,19 @@ def in_units_of(model: Any, data: Data) -> Data:
     return data if data.transform.is_identity else data.raw()
 
 
+def regular_in_units_of(model: Any, data: Data) -> Data:
+    """Return data as `in_units_of`, and refuse samples at irregular times (`DataError`)."""
+    data.refuse_irregular("this model")
+    return in_units_of(model, data)
+
+
 def records_of(model: Any, data: Any) -> tuple[list[Record], bool]:
     """Return the record of every experiment, and whether the inputs were one-dimensional; errors as `in_units_of`.
 
     The data are Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
     """
     if isinstance(data, Data):
-        flat, pairs = False, [(e.u, e.y) for e in in_units_of(model, data).experiments]
+        flat, pairs = False, [(e.u, e.y) for e in regular_in_units_of(model, data).experiments]
     else:
         arrays = [data] if is_scalar_list(data) else list(data)
         flat, pairs = all(np.ndim(u) == 1 for u in arrays), [(samples_of(u, "u", model.m), None) for u in arrays]

@@ -99,8 +99,12 @@ def step_length(model: Model) -> int:
 def response_pairs(model: Model) -> list[tuple[str, str]]:
     """Return (input, output) of every column of a response of the linear part, in the order of its last two axes.
 
-    Where an input has several static functions there is one column for each of them, by its word.
+    Where an input has several static functions there is one column for each of them, by its word; of processes one for
+    each pair, of which the responses of other outputs are zero.
     """
+    own: Any = getattr(model, "pairs", None)
+    if own is not None:
+        return [(model.inputs[c], output) for output in model.outputs for _, c in own]
     words = [function.word for function in static_functions(model) if function.family == "nonlinearities"]
     sources = words if len(words) > model.m else model.inputs
     return [(source, output) for output in model.outputs for source in sources]
@@ -112,8 +116,9 @@ def free_parameters(model: Any) -> int:
         return len(model.parameters)
     if model.structure == "process":
         dynamics = sum(one.p.size for one in model.processes)
-        levels = 1 if model.levels is None else model.levels.size
-        return int(dynamics + sum(f.mu.size for f in model.nonlinearities) + levels + (model.drift != 0))
+        levels = model.l if model.levels is None else model.levels.size
+        drifts = np.count_nonzero(model.drift)
+        return int(dynamics + sum(f.mu.size for f in model.nonlinearities) + levels + drifts)
     shapes = sum(f.basis.size - 1 for f in model.nonlinearities)
     constants = model.l if model.levels is None else model.levels.size
     if model.structure != "ss":

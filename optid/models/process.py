@@ -9,16 +9,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from optid.arrays import Array, finite
+from optid.arrays import Array, finite, one_or_all
 from optid.data.channels import Transform
+from optid.data.record import Data
 from optid.errors import DataError, StructureError
 from optid.models.continuous import ContinuousModel
-from optid.models.experiments import Record, check_inputs, scaled_least_squares
+from optid.models.experiments import Record, check_inputs, in_units_of, scaled_least_squares, state_like
+from optid.models.functions import static_functions
 from optid.models.model import Model
 from optid.models.nonlinearity import Nonlinearity
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
 
 HOLDS = ("zero", "first")
+
+
+def _is_regular(data: Any) -> bool:
+    return not isinstance(data, Data) or data.is_regular
 
 
 def _of_samples(name: str) -> Any:
@@ -32,24 +38,27 @@ def _of_samples(name: str) -> Any:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ProcessModel(Model):
-    """y(t) = sum_c G_c(s) exp(-theta_c s) f_c(u_c(t)) + level + drift t, in raw units.
+    """y(t) = sum_c G_c(s) exp(-theta_c s) f_c(u_c(t)) + level + drift t, of every output, in raw units.
 
     A run begins at rest under the first inputs; a process with an integrator stands still there. An initial state is
-    the deviation from rest of the sections of all inputs, the motion of which is not delayed.
+    the deviation from rest of the sections of all processes, the motion of which is not delayed.
 
     Attributes:
-        processes: dynamics of every input, of static gain one; times in the unit of dt.
-        level: (1,) output at rest where every f is zero; with integrators, output at the start.
-        drift: slope of the level over time.
+        processes: dynamics of every pair, of static gain one; times in the unit of dt.
+        nonlinearities: static curve of every pair.
+        level: (l,) outputs at rest where every f is zero; with integrators, outputs at the start.
+        drift: (l,) slopes of the levels over time.
         hold: what an input does between its samples, "zero" (stays) or "first" (straight lines).
-        nonlinearities, dt, time_unit, inputs, outputs, input_units, output_units, gauge, levels: see `Model`.
+        pairs: (output, input) of every process, output by output; of one output all inputs when not given.
+        dt, time_unit, inputs, outputs, input_units, output_units, gauge, levels: see `Model`.
     """
 
     processes: tuple[ProcessDynamics, ...]
     nonlinearities: tuple[Nonlinearity, ...]
     level: Array
-    drift: float = 0.0
+    drift: Any = 0.0
     hold: str = "zero"
+    pairs: tuple[tuple[int, int], ...] = ()
     dt: float = 1.0
     inputs: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
@@ -70,9 +79,21 @@ class ProcessModel(Model):
         if self.hold not in HOLDS:
             raise StructureError(f"hold={self.hold!r} must be one of {', '.join(map(repr, HOLDS))}")
         level = np.atleast_1d(finite(self.level, "level"))
+        drift = np.broadcast_to(finite(self.drift, "drift"), level.shape)
+        pairs = tuple((int(o), int(c)) for o, c in self.pairs) or tuple((0, c) for c in range(len(self.processes)))
+        m = len(self.inputs) or 1 + max(c for _, c in pairs)
+        if len(pairs) != len(self.processes) or list(pairs) != sorted(set(pairs)) or not all(
+                0 <= o < level.size and 0 <= c < m for o, c in pairs):
+            raise StructureError(f"pairs={pairs}: (output, input) of each of {len(self.processes)} processes, in "
+                                 f"order, of {level.size} outputs and {m} inputs")
         given = {"nonlinearities": self.nonlinearities, "processes": tuple(one.sort() for one in self.processes),
-                 "level": level, "drift": float(self.drift)}
-        self._fix(given, len(self.processes), 1)
+                 "level": level, "drift": drift, "pairs": pairs}
+        self._fix(given, m, level.size)
+
+    @property
+    def input_of(self) -> tuple[int, ...]:
+        """The input that every function acts on."""
+        return tuple(c for _, c in self.pairs)
 
     @property
     def c0(self) -> None:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -88,8 +109,11 @@ class ProcessModel(Model):
     @property
     def orders(self) -> dict[str, Any]:
         """Types of the processes, for tables."""
-        return {"process" + ("" if self.m == 1 else f" {name}"): one.structure.word
-                for name, one in zip(self.inputs, self.processes)}
+        if self.l > 1:
+            return {f"process {self.outputs[o]},{self.inputs[c]}": one.structure.word
+                    for (o, c), one in zip(self.pairs, self.processes)}
+        return {"process" + ("" if self.m == 1 else f" {self.inputs[c]}"): one.structure.word
+                for (_, c), one in zip(self.pairs, self.processes)}
 
     @property
     def poles(self) -> Array:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -99,64 +123,92 @@ class ProcessModel(Model):
 
     @property
     def dead_times(self) -> Array:
-        """Dead time (m,) of every input, in the unit of dt."""
+        """Dead time (r,) of every pair, in the unit of dt."""
         return np.array([one.dead_time for one in self.processes])
 
-    def _of(self, name: str, c: int) -> str:
+    def of_pair(self, name: str, number: int) -> str:
+        """Name a quantity of a pair."""
+        o, c = self.pairs[number]
+        if self.l > 1:
+            return f"{name}[{self.outputs[o]},{self.inputs[c]}]"
         return name if self.m == 1 else f"{name}[{self.inputs[c]}]"
 
+    def _of_output(self, name: str, o: int) -> str:
+        return name if self.l == 1 else f"{name}[{self.outputs[o]}]"
+
     def coefficients(self) -> list[tuple[str, float]]:
-        """Return gain, time constants and dead time of every input, the level, and the drift where there is one."""
+        """Return gain, time constants and dead time of every pair, the levels, and drifts where there are some."""
         found = []
-        for c, (one, f) in enumerate(zip(self.processes, self.nonlinearities)):
+        for number, (one, f) in enumerate(zip(self.processes, self.nonlinearities)):
             if f.is_linear:
-                found.append((self._of("K", c), float(f.mu[0])))
-            found += [(self._of(name, c), float(value)) for name, value in zip(one.structure.names, one.p)]
-        return found + [("level", float(self.level[0]))] + [("drift", self.drift)] * (self.drift != 0)
+                found.append((self.of_pair("K", number), float(f.mu[0])))
+            found += [(self.of_pair(name, number), float(value)) for name, value in zip(one.structure.names, one.p)]
+        for name, values in (("level", self.level), ("drift", self.drift * np.any(self.drift))):
+            found += [(self._of_output(name, o), float(value)) for o, value in enumerate(np.atleast_1d(values))
+                      if name == "level" or np.any(self.drift)]
+        return found
 
     def coefficient_units(self) -> dict[str, str]:
         """Return the units of the coefficients by name, "" where unknown."""
-        time = self.time_unit or ("samples" if self.dt == 1 else "")
-        y = self.output_units[0]
-        found = {"level": y, "drift": f"{y or 1}/{time}" if time else y}
-        for c, one in enumerate(self.processes):
+        time, found = self.time_unit or ("samples" if self.dt == 1 else ""), {}
+        for o, y in enumerate(self.output_units):
+            found |= {self._of_output("level", o): y, self._of_output("drift", o): f"{y or 1}/{time}" if time else y}
+        for number, ((o, c), one) in enumerate(zip(self.pairs, self.processes)):
+            y = self.output_units[o]
             below = " ".join(part for part in (self.input_units[c], time * one.structure.integrator) if part)
-            found[self._of("K", c)] = f"{y or 1}/{f'({below})' if ' ' in below else below}" if below else y
-            found |= {self._of(name, c): time * bool(timed)
+            found[self.of_pair("K", number)] = f"{y or 1}/{f'({below})' if ' ' in below else below}" if below else y
+            found |= {self.of_pair(name, number): time * bool(timed)
                       for name, timed in zip(one.structure.names, one.structure.temporal)}
         return found
 
     def equation(self) -> str:
-        """Return the equation as text."""
-        terms = []
-        for one, f, name in zip(self.processes, self.nonlinearities, self.inputs):
-            gain = f"{f.mu[0]:.4g} {name}" if f.is_linear else f"f{'' if self.m == 1 else f'_{name}'}({name})"
-            terms.append(f"{one.equation()} {gain}")
-        rest = [(self.level[0], ""), *([(self.drift, " t")] if self.drift else [])]
-        beside = "".join(f" {'-' if size < 0 else '+'} {abs(size):.4g}{of}" for size, of in rest)
-        return f"{self.outputs[0]} = {' + '.join(terms)}{beside}"
+        """Return the equations as text, one per output."""
+        words, lines = [function.word for function in static_functions(self)], []
+        for o, output in enumerate(self.outputs):
+            terms = []
+            for (to, c), one, f, word in zip(self.pairs, self.processes, self.nonlinearities, words):
+                if to == o:
+                    name = self.inputs[c]
+                    terms.append(f"{one.equation()} {f'{f.mu[0]:.4g} {name}' if f.is_linear else f'{word}({name})'}")
+            rest = [(self.level[o], ""), *([(self.drift[o], " t")] if self.drift[o] else [])]
+            beside = "".join(f" {'-' if size < 0 else '+'} {abs(size):.4g}{of}" for size, of in rest)
+            lines.append(f"{output} = {' + '.join(terms)}{beside}")
+        return "\n".join(lines)
 
     # -- responses -----------------------------------------------------------------------------------------------------
 
+    def _by_output(self, each: Sequence[Any]) -> Any:
+        """Return what belongs to pairs, (N,) each, as (N, l, r): zero for the other outputs."""
+        found = np.zeros((len(each[0]), self.l, len(each)), dtype=each[0].dtype)
+        for j, ((o, _), one) in enumerate(zip(self.pairs, each)):
+            found[:, o, j] = one
+        return found
+
     def impulse_response(self, n: int = 100) -> Array:
-        """Return the response of the linear part to a unit held for one sampling time, (n, 1, m)."""
+        """Return the response of the linear part to a unit held for one sampling time, (n, l, r)."""
         t, pulse = np.arange(float(n)), np.array([[0.0], [1.0], [0.0]])
-        return np.stack([one.in_unit(self.dt).response(t, np.array([-1.0, 0.0, 1.0]), pulse)[:, :, 0]
-                         for one in self.processes], axis=2)
+        return self._by_output([one.response(t, np.array([-1.0, 0.0, 1.0]), pulse)[:, 0, 0] for one in self._scaled])
 
     def frequency_response(self, w: ArrayLike) -> Any:
-        """Return that of the linear part at w (radians per unit of time), with dead time, complex (len(w), 1, m)."""
+        """Return that of the linear part at w (radians per unit of time), with dead time, complex (len(w), l, r)."""
         s = 1j * np.atleast_1d(np.asarray(w, dtype=float))
-        return np.stack([one.transfer(s) for one in self.processes], axis=1)[:, None]
+        return self._by_output([one.transfer(s) for one in self.processes])
 
     def static_curve(self, c: int, u: Array) -> Array:
-        """Return the static characteristic (k, 1) of an input at (k,) values, without the level."""
+        """Return the static characteristic (k, l) of an input at (k,) values, without the levels."""
         self._refuse_integrator()
-        return self.nonlinearities[c](np.asarray(u, dtype=float))[:, None]
+        found = np.zeros((len(u), self.l))
+        for (o, place), f in zip(self.pairs, self.nonlinearities):
+            if place == c:
+                found[:, o] = f(np.asarray(u, dtype=float))
+        return found
 
     def _static_gain(self, u0: Array) -> Array:
         self._refuse_integrator()
-        return np.array([[float(f.slope(point)) for f, point in zip(self.nonlinearities, u0)]])
+        found = np.zeros((self.l, self.m))
+        for (o, c), f in zip(self.pairs, self.nonlinearities):
+            found[o, c] = float(f.slope(u0[c]))
+        return found
 
     def _refuse_integrator(self) -> None:
         if any(one.structure.integrator for one in self.processes):
@@ -166,19 +218,19 @@ class ProcessModel(Model):
 
     @property
     def n_sections(self) -> int:
-        """Number of sections of all inputs."""
+        """Number of sections of all processes."""
         return sum(one.structure.order for one in self.processes)
 
     @property
     def _state_shape(self) -> tuple[int]:
-        return (self.n_sections + (self.levels is not None),)
+        return (self.n_sections + self.l * (self.levels is not None),)
 
     @cached_property
     def _scaled(self) -> tuple[ProcessDynamics, ...]:
         return tuple(one.in_unit(self.dt) for one in self.processes)
 
     def respond(self, u: Array, instants: Array | None = None, read_at: Array | None = None) -> Array:
-        """Return the output (N,) to inputs (J, m) from rest, at any instants.
+        """Return the outputs (N, l) to inputs (J, m) from rest, at any instants; (N,) of a model with one output.
 
         Args:
             u: inputs, none missing.
@@ -187,24 +239,50 @@ class ProcessModel(Model):
         """
         t = np.arange(float(len(u))) if instants is None else np.asarray(instants, dtype=float) / self.dt
         at = t if read_at is None else np.asarray(read_at, dtype=float) / self.dt
-        found = self.level[0] + self.drift * self.dt * (at - t[0])
-        for c, (one, f) in enumerate(zip(self._scaled, self.nonlinearities)):
-            changes, values = thin_out(t, f(u[:, c])[:, None], self.hold == "first")
-            found = found + one.response(at, changes, values - values[0], straight=self.hold == "first")[:, 0, 0]
-            found = found if one.structure.integrator else found + values[0, 0]
-        return found
+        found, straight = self.level + self.drift * self.dt * (at - t[0])[:, None], self.hold == "first"
+        for (o, c), one, f in zip(self.pairs, self._scaled, self.nonlinearities):
+            changes, values = thin_out(t, f(u[:, c])[:, None], straight)
+            found[:, o] += one.response(at, changes, values - values[0], straight=straight)[:, 0, 0]
+            found[:, o] += 0.0 if one.structure.integrator else values[0, 0]
+        return found[:, 0] if self.l == 1 else found
 
-    def _motion(self, count: int) -> Array:
-        """Return the free motion (N, n) of every entry of a state."""
-        t = np.arange(float(count))
-        found = np.hstack([one.free_response(t, 0.0) for one in self._scaled])
-        return found if self.levels is None else np.column_stack([found, np.ones(count)])
+    def _motion(self, count: int, stamps: Array | None = None) -> Array:
+        """Return the free motion (N, l, n) of every entry of a state: sections pair by pair, then levels."""
+        t = np.arange(float(count)) if stamps is None else stamps / self.dt
+        each = [one.free_response(t, 0.0) for one in self._scaled]
+        outputs = np.repeat([o for o, _ in self.pairs], [one.shape[1] for one in each])
+        found = np.hstack(each)[:, None, :] * np.equal.outer(np.arange(self.l), outputs)
+        if self.levels is None:
+            return found
+        return np.concatenate([found, np.broadcast_to(np.eye(self.l), (count, self.l, self.l))], axis=2)
+
+    def simulate(self, data: Any, x0: Any = "zero") -> Any:
+        """Compute the outputs from the inputs alone, at the times of the record; arguments as of `Model.simulate`."""
+        return super().simulate(data, x0) if _is_regular(data) else self._at_stamps(data, x0)
+
+    def predict(self, data: Data, horizon: int = 1, x0: Any = "fit") -> Any:
+        """Predict as `Model.predict`: without a noise model nothing but the initial state is learnt from outputs."""
+        return super().predict(data, horizon, x0) if _is_regular(data) else self._at_stamps(data, x0)
+
+    def _at_stamps(self, data: Data, x0: Any) -> Any:
+        """Run over a record at irregular times."""
+        records, found = in_units_of(self, data).experiments, []
+        given = [None] * len(records) if isinstance(x0, str) else list(x0) if len(records) > 1 else [x0]
+        for i, (e, state) in enumerate(zip(records, given), start=1):
+            label = f"Experiment {i}: " * (len(records) > 1)
+            check_inputs(self, e.u, label)
+            y, motion = self.respond(e.u, e.stamps).reshape(e.y.shape), self._motion(len(e.u), e.stamps)
+            if state is not None or x0 != "zero":
+                start = self._least(motion, e.y - y, label) if state is None else state_like(state, self._state_shape)
+                y = y + motion @ start
+            found.append(y)
+        return one_or_all(found)
 
     def _run(self, simulator: str, records: Sequence[Record], x0: Any) -> list[Array]:
         found = []
         for (u, _, label), state in zip(records, self._states(simulator, records, x0)):
             check_inputs(self, u, label)
-            found.append((self.respond(u) + self._motion(len(u)) @ state)[:, None])
+            found.append(self.respond(u).reshape(len(u), self.l) + self._motion(len(u)) @ state)
         return found
 
     def _predicted(self, u: Array, y: Array, horizon: int, state: Array, label: str) -> Array:
@@ -212,10 +290,15 @@ class ProcessModel(Model):
 
     def _fitted(self, simulator: str, u: Array, y: Any, label: str) -> Array:
         check_inputs(self, u, label)
-        rest, here = y[:, 0] - self.respond(u), np.isfinite(y[:, 0])
-        if not here.any():
-            raise DataError(f"{label}Output {self.outputs[0]!r} has no sample: no initial state can be estimated.")
-        return scaled_least_squares(self._motion(len(u))[here], rest[here])
+        return self._least(self._motion(len(u)), y - self.respond(u).reshape(y.shape), label)
+
+    def _least(self, motion: Array, rest: Array, label: str) -> Array:
+        """Return the state whose motion (N, l, n) explains most of a rest (N, l)."""
+        here = np.isfinite(rest)
+        for o, name in enumerate(self.outputs):
+            if not here[:, o].any():
+                raise DataError(f"{label}Output {name!r} has no sample: no initial state can be estimated.")
+        return scaled_least_squares(motion[here], rest[here])
 
     # -- other tools ---------------------------------------------------------------------------------------------------
 
@@ -227,7 +310,7 @@ class ProcessModel(Model):
         """
         for there, what in (
                 (self.hold == "first", "Inputs that go straight between samples (hold='first')"),
-                (self.drift != 0, "A drift, which is no answer to the inputs,"),
+                (bool(np.any(self.drift)), "A drift, which is no answer to the inputs,"),
                 (any(one.structure.integrator for one in self.processes),
                  "An integrator that stands still under the first inputs of every run, whichever they are,")):
             if there:
@@ -237,9 +320,12 @@ class ProcessModel(Model):
         names = {name: getattr(self, name) for name in ("inputs", "outputs", "input_units", "output_units")}
         inner: Any = block_diag(*A)
         driven: Any = block_diag(*b)
-        return ContinuousModel(inner, driven.T, np.concatenate(c)[None], np.array([d]), self.nonlinearities,
-                               tuple(range(self.m)), self.dead_times, np.zeros(self.n_sections), self.level,
-                               self.time_unit, **names)
+        read, direct = np.zeros((self.l, self.n_sections)), np.zeros((self.l, len(d)))
+        edges = np.cumsum([0, *map(len, A)])
+        for j, (o, _) in enumerate(self.pairs):
+            read[o, edges[j] : edges[j + 1]], direct[o, j] = c[j], d[j]
+        return ContinuousModel(inner, driven.T, read, direct, self.nonlinearities, self.input_of, self.dead_times,
+                               np.zeros(self.n_sections), self.level, self.time_unit, **names)
 
     @property
     def zeros(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -258,14 +344,15 @@ class ProcessModel(Model):
         return self
 
     def _in_raw_units(self, transform: Transform) -> Self:
-        size, level = transform.y_scale[0], transform.y_offset[0] + transform.y_scale[0] * self.level
-        curves = []
-        for one, f, scale, origin in zip(self.processes, self.nonlinearities, transform.u_scale, transform.u_offset):
-            curve, constant = f.mapped(scale, origin)
-            curves.append(curve.scaled(size))
-            level = level + size * constant * (not one.structure.integrator)
-        levels = None if self.levels is None else transform.y_offset[0] + size * self.levels
-        return replace(self, nonlinearities=tuple(curves), level=level, drift=size * self.drift, levels=levels)
+        sizes, curves = np.array(transform.y_scale), []
+        shift = np.array(transform.y_offset)
+        for (o, c), one, f in zip(self.pairs, self.processes, self.nonlinearities):
+            curve, constant = f.mapped(transform.u_scale[c], transform.u_offset[c])
+            curves.append(curve.scaled(sizes[o]))
+            shift[o] += sizes[o] * constant * (not one.structure.integrator)
+        levels = None if self.levels is None else shift + sizes * self.levels
+        return replace(self, nonlinearities=tuple(curves), level=shift + sizes * self.level, drift=sizes * self.drift,
+                       levels=levels)
 
     def to_dict(self) -> dict[str, Any]:
         """Describe the model in JSON types."""
@@ -275,7 +362,7 @@ class ProcessModel(Model):
     def from_dict(cls, content: Mapping[str, Any], functions: dict[str, Any] | None = None) -> Self:
         """Build what `to_dict` described."""
         processes = tuple(ProcessDynamics.from_dict(one) for one in content["processes"])
-        return super().from_dict({**content, "processes": processes}, functions)
+        return super().from_dict({"pairs": (), **content, "processes": processes}, functions)
 
 
 def process_model(process: str, *, K: float = 1.0, level: float = 0.0, dt: float = 1.0, **parameters: Any  # noqa: N803

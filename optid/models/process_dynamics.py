@@ -287,9 +287,30 @@ def thin_out(changes: Array, inputs: Array, straight: bool) -> tuple[Array, Arra
     return changes[moves], inputs[moves]
 
 
-def read_structures(process: Any, inputs: Sequence[str]) -> tuple[ProcessStructure, ...]:
-    """Read one type of process for every input, or one for all (`StructureError`: another number)."""
-    words = list(process) if isinstance(process, list | tuple) else [process] * len(inputs)
-    if len(words) != len(inputs):
-        raise StructureError(f"process has {len(words)} entries for {len(inputs)} inputs ({', '.join(inputs)})")
-    return tuple(ProcessStructure.read(word) for word in words)
+def read_structures(process: Any, inputs: Sequence[str], outputs: Sequence[str] = ("y",)
+                    ) -> tuple[tuple[ProcessStructure | None, ...], ...]:
+    """Read the types of all pairs, a row per output; None or "none" where an input has no effect on it.
+
+    One type is that of all pairs, one per input that of every output; rows may follow one another in one list
+    (`StructureError`: other numbers of them, an output without any process).
+    """
+    several = isinstance(process, list | tuple)
+    if several and len(process) == len(inputs) * len(outputs) and all(word is None or isinstance(
+            word, str | ProcessStructure) for word in process):
+        process = [process[i : i + len(inputs)] for i in range(0, len(process), len(inputs))]
+    rows = list(process) if several and any(isinstance(row, list | tuple) for row in process) else (
+        [process] * len(outputs))
+    if len(rows) != len(outputs):
+        raise StructureError(f"process has {len(rows)} rows for {len(outputs)} outputs ({', '.join(outputs)}): one row "
+                             "of types per output, one type per input")
+    found = []
+    for row, output in zip(rows, outputs):
+        words = list(row) if isinstance(row, list | tuple) else [row] * len(inputs)
+        where = f"for output {output!r} " * (len(outputs) > 1)
+        if len(words) != len(inputs):
+            raise StructureError(f"process {where}has {len(words)} entries for {len(inputs)} inputs "
+                                 f"({', '.join(inputs)})")
+        found.append(tuple(None if word is None or word == "none" else ProcessStructure.read(word) for word in words))
+        if not any(found[-1]):
+            raise StructureError(f"process {where}names no type: leave the output out where no input has an effect")
+    return tuple(found)

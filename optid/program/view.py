@@ -88,6 +88,12 @@ class View(Mapping[str, cp.Expression]):
         self._auxiliaries.add(variable.id)
         return variable
 
+    def part(self, inner: Mapping[str, cp.Expression], **facts: Any) -> "View":
+        """Return a view of other expressions, whose auxiliary variables are those of this one."""
+        made = View(inner, **facts)
+        made._auxiliaries = self._auxiliaries
+        return made
+
     def owns(self, variable: cp.Variable) -> bool:
         """Whether a variable came from `auxiliary`."""
         return variable.id in self._auxiliaries
@@ -203,6 +209,9 @@ class View(Mapping[str, cp.Expression]):
             return self[self.key("static", channel)][:, self.output(output)]
         if self["offset"].size > 1:
             raise StructureError("constraints on the static characteristic are defined for one output")
+        if self.key("Theta", channel) not in self and self.key("b", channel) not in self:
+            raise StructureError(f"a process with an integrator has no static characteristic from {channel}: its "
+                                 "output comes to rest at no level. The word K bounds its slope")
         if self.key("Theta", channel) not in self:  # a linear model has b alone
             return cp.hstack([cp.sum(self[self.key("b", channel)])])
         return cp.sum(self[self.key("Theta", channel)], axis=1)

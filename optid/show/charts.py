@@ -190,6 +190,8 @@ def bode_charts(models: dict[str, Any], levels: Levels, known: Any = None, hertz
     for m, (label, model) in enumerate(models.items()):
         curves = (model.frequency_response(w) * mean_slopes(model, levels)).reshape(w.size, -1)
         for k, (u, y) in enumerate(pairs):
+            if not curves[:, k].any():
+                continue
             colour = COLOURS[(m * len(pairs) + k) % len(COLOURS)]
             name = " ".join(part for part in (label, f"{u} to {y}" if len(pairs) > 1 else "") if part) or "response"
             if size is not None and turn is not None:

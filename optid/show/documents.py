@@ -142,7 +142,7 @@ def _length(data: Any) -> str:
     return f"{data.n_samples} samples" if data.n_samples else ""
 
 
-def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> list[Any]:
+def _trust(fit: "Fit", judged: "Verdict | None", test: Data | None, advise: bool) -> list[Any]:
     which = ", lowest output" if fit.model.l > 1 else ""
 
     def cards() -> Iterator[tuple[str, str]]:
@@ -152,6 +152,13 @@ def _trust(fit: "Fit", judged: "Verdict", test: Data | None, advise: bool) -> li
         return ((label + which, wording.percent(np.min(values))) for label, values in fits)
 
     found = attempt("The fit at first glance", cards)
+    if judged is None:
+        why = "samples at even distances" if isinstance(fit.data, Data) else "a record in memory"
+        return [Banner("plain", "The model on this record: not judged", f"The tests of a verdict need {why}.",
+                       tuple(one for one in found if isinstance(one, tuple)))]
+    if judged.failed and any(price.binding for price in fit.prices):
+        found = [*found, Notes(["An active constraint may be the reason for tests that fail: the record alone would "
+                                "not have it so. See the prices."])]
     advice = attempt("The advice", lambda: [Notes([str(one) for one in fit.advice])] if fit.advice else []) if (
         advise and judged.word in ADVISED) else []
     return [Banner(TONES[judged.word], f"The model on this record: {judged.word}", summary.judgement(judged),

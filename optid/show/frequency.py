@@ -83,6 +83,8 @@ def nyquist_chart(model: Any, levels: Levels, known: Any = None) -> Chart:
     marks = np.unique(np.searchsorted(way, np.linspace(0, way[-1], MARKED)))  # evenly along the curves
     series, pairs = [], response_pairs(model)
     for k, (u, y) in enumerate(pairs):
+        if not response[:, k].any():
+            continue
         colour = COLOURS[k % len(COLOURS)]
         if known is not None:
             def at_marks(model: Any, k: int = k) -> Array:

@@ -16,7 +16,7 @@ MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 
 TIME_TOLERANCE = 0.01  # a time step may deviate from the median step by this share of it
 
-GAPS = ("missing", "experiments")
+GAPS = ("missing", "experiments", "stamps")
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
 """Seconds in a unit of time."""
@@ -46,7 +46,8 @@ class Format:
         time_zone: zone of local time stamps without an offset, such as "Europe/Berlin"; they become UTC.
         time_tolerance: largest deviation of a time step from the median step, relative to it.
         gaps: what becomes of lost rows: "missing" samples, or "experiments" that begin after them; a row that
-            is repeated counts once. When not given they are refused.
+            is repeated counts once. With "stamps" every row keeps its stamp, however irregular, which processes in
+            continuous time alone take. When not given they are refused.
         resample: sampling time onto which the record is brought, in seconds or such as "1s", "5min": inputs are held,
             outputs interpolated linearly; where samples come faster, both are averaged over a sampling time.
         quality: the value of each column of quality that marks a good sample, such as {"PV.Q": 192} or

@@ -148,6 +148,9 @@ def sample_evenly(runs: Sequence[RawRun], how: Format, dt: float | None
         where = run.label if run.clock is None else f"{run.label}, column {run.clock.columns[0]!r}"
         pieces, found, said = regular(run.stamps, run.u, run.y, dt, how, where)
         findings += said
+        if any(piece.times is not None for piece in pieces):
+            evenly, step = evenly + pieces, step or found
+            continue
         step = agreed_step(found, step, how.time_tolerance, run.label)
         if dt is None and found and run.step and abs(found - run.step) > how.time_tolerance * run.step:
             raise DataError(f"{run.label}: the time stamps step by {found:.6g} s, and the sampling time beside them is "

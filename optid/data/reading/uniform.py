@@ -23,6 +23,7 @@ class Piece:
     stamp: Any  # of the first sample
     u: np.ndarray  # (N, m)
     y: np.ndarray  # (N, l)
+    times: np.ndarray | None = None  # (N,) seconds after the first stamp, where they are irregular
 
 
 def uniform_step(stamps: np.ndarray, tolerance: float, label: str, step: float | None = None, first: int = 0
@@ -124,6 +125,8 @@ def regular(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, dt: float | None, 
         if step is not None and drift > max(1.0, 3 * how.time_tolerance) * step:
             said.append(f"clock: the stamps leave an even grid of {step:g} s by up to {drift:.3g} s")
         return [Piece(stamps[0], u, y)], step, said
+    if how.gaps == "stamps":
+        return _as_stamped(stamps, u, y, how, label)
     return _without_gaps(stamps, u, y, how, label)
 
 
@@ -180,7 +183,8 @@ def _not_uniform(stamps: np.ndarray, steps: np.ndarray, median: float, bad: np.n
             reason, remedy = "The clock has jitter", f"pass time_tolerance={needed:g} to accept it."
         else:
             reason = "The sampling is irregular"
-            remedy = f"pass resample='{median:.6g}s' to bring the record onto a uniform grid."
+            remedy = (f"pass resample='{median:.6g}s' to bring the record onto a uniform grid, or gaps='stamps' to "
+                      "keep the stamps for a process in continuous time ('process.exact').")
     return DataError(
         f"{label}: time stamps are not uniform. Sample {first + k + 1} (t = {stamps[k + 1]}) comes {steps[k]:.6g} "
         f"after the one before, the median step is {median:.6g} ({count} step(s) deviate by more than {tolerance:.2%}"
@@ -234,6 +238,20 @@ def _check_spread(stamps: np.ndarray, dt: float, label: str) -> str:
 
 
 # -- repairs
+
+
+def _as_stamped(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, how: Format, label: str
+                ) -> tuple[list[Piece], float, list[str]]:
+    """Keep samples at their stamps, which must increase; those that are uniform are regular."""
+    steps = seconds(np.diff(stamps))
+    median = float(np.median(steps))
+    bad = steps <= 0
+    if bad.any():
+        raise _not_uniform(stamps, steps, median, bad, how.time_tolerance, label, 0)
+    if not np.any(np.abs(steps - median) > how.time_tolerance * median):
+        return [Piece(stamps[0], u, y)], sampling_time(stamps), []
+    said = f"clock: the stamps are irregular, {steps.min():.4g} to {steps.max():.4g} s apart: they are kept as they are"
+    return [Piece(stamps[0], u, y, seconds(stamps - stamps[0]))], float(f"{median:.12g}"), [said]
 
 
 def _without_gaps(stamps: np.ndarray, u: np.ndarray, y: np.ndarray, how: Format, label: str

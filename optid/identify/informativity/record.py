@@ -84,7 +84,11 @@ def informativity(data: Data) -> Informativity:
 
     Args:
         data: the record; the first 30,000 samples of a longer one are read.
+
+    Raises:
+        DataError: samples at irregular times.
     """
+    data.refuse_irregular("what a record can tell")
     data = data.raw()
     if data not in _KNOWN:
         with np.errstate(all="ignore"):

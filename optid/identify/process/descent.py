@@ -14,7 +14,7 @@ from optid.identify.process.errors import ProcessErrors
 
 STEPS, ARRIVED = 60, 1e-10  # steps of a descent; relative gain of a full step that is none
 GOOD, POOR = 0.75, 0.25  # shares of the expected gain above, and below, which damping falls, and rises
-SHARP = 1e-15  # the same of a point that is reported
+SHARP, VALLEY = 1e-15, 300  # the same of a point that is reported, and steps to it
 LARGEST = 2.0  # largest change of the logarithm of a time constant in a step
 SHORT, GRAM = 1000, 1e-6  # rows up to which columns are factorised; least eigenvalue of a scaled Gram matrix
 RANK = 1e-11  # singular value of the columns of the linear unknowns, relative to the largest, that counts as zero
@@ -134,8 +134,25 @@ def sharpen(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> tupl
     """Return the optimum of the cells of a point to the last digits, and the steps that it took."""
     for c, place in _delays(errors):
         box = box.within(place, *errors.cell(start.x, c))
-    end, _, steps = descend(errors, start.x, box, tolerance=SHARP)
+    end, _, steps = descend(errors, start.x, box, steps=VALLEY, tolerance=SHARP)
     return min(start, end, key=lambda one: one.value), steps
+
+
+def falls_along(errors: ProcessErrors, start: ProcessPoint, box: ProcessBox) -> float:
+    """Return by which share the sum of squares falls at most along the Gauss-Newton step, whole or in any part.
+
+    Where the record hardly shows a direction the step is long, and what its linear model promises does not come.
+    """
+    at, basis = errors.unknowns.dynamic, np.linalg.qr(start.columns)[0]
+    slopes = errors.slopes(start.x)
+    slopes = slopes - basis @ (basis.T @ slopes)
+    step = np.linalg.lstsq(slopes, start.errors, rcond=1e-14)[0]
+    least = start.value
+    for part in 0.25 ** np.arange(25):
+        x = start.x.copy()
+        x[at] = np.clip(x[at] + part * step, box.low, box.high)
+        least = min(least, ProcessPoint.of(errors, x).value)
+    return 1 - least / max(start.value, 1e-300)
 
 
 def join_equal(errors: ProcessErrors, start: ProcessPoint) -> ProcessPoint:

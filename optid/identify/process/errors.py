@@ -22,7 +22,7 @@ from optid.data.channels import Transform
 from optid.data.record import Data
 from optid.identify.prediction_error.descent import Criterion
 from optid.models.process_dynamics import ProcessDynamics, ProcessStructure, thin_out
-from optid.program.units import energy_unit
+from optid.program.units import energy_unit, outer_bases
 from optid.statistics.linearised import Linearised, Method, linearised
 from optid.statistics.unknowns import Unknowns
 
@@ -101,6 +101,11 @@ class ProcessErrors(Criterion):
         """What one unit of the sum of squares is in units of the record."""
         return energy_unit(self.units)
 
+    @property
+    def outer_bases(self) -> tuple[Basis, ...]:
+        """The bases of the inputs in the units of the record."""
+        return outer_bases(self.bases, self.units)
+
     def key(self, name: str, number: int) -> str:
         """Name a quantity of an input: plain with one input, ``name[input]`` with several."""
         return name if self.data.m == 1 else f"{name}[{self.data.inputs[number]}]"
@@ -141,7 +146,7 @@ class ProcessErrors(Criterion):
                  for t, drives in zip(self.instants, self.drives)]
         if max(sizes) <= most and sizes == [len(t) for t in self.instants]:
             return self
-        cut = [replace(e, u=e.u[:n], y=e.y[:n]) for e, n in zip(self.data.experiments, sizes)]
+        cut = [replace(e, u=e.u[:n], y=e.y[:n], stamps=None) for e, n in zip(self.data.experiments, sizes)]
         if not all(np.isfinite(e.y).any() for e in cut):
             return self
         data = Data.of_experiments(cut, self.data.dt, self.data.inputs, self.data.outputs)

@@ -12,6 +12,7 @@ import numpy as np
 from optid.errors import RankError, StructureError
 from optid.identify.process.descent import ProcessPoint, search_cells
 from optid.identify.process.errors import ProcessErrors
+from optid.identify.process.outputs import OutputErrors
 from optid.identify.process.starts import best_descents, usual_box
 from optid.models.process_dynamics import ProcessStructure
 
@@ -47,8 +48,19 @@ def try_type(errors: ProcessErrors, structure: ProcessStructure) -> RankedType:
     return RankedType(structure, count * np.log(value / count) + tried.unknowns.size * np.log(count), best)
 
 
-def choose_type(errors: ProcessErrors) -> tuple[ProcessErrors, dict[str, Any]]:
-    """Return the errors with the type that the criterion chooses, and what it says of the runner-up.
+def choose_types(errors: OutputErrors) -> tuple[OutputErrors, dict[str, Any]]:
+    """Return the errors with the types that the criterion chooses for every output, and what it says of runners-up.
+
+    `RankError` as of `choose_type`.
+    """
+    each, words = zip(*(choose_type(one) for one in errors.each))
+    said = words[0] if len(words) == 1 else "; ".join(
+        f"{output}: {word}" for output, word in zip(errors.data.outputs, words))
+    return replace(errors, each=each), {"process type": said}
+
+
+def choose_type(errors: ProcessErrors) -> tuple[ProcessErrors, str]:
+    """Return the errors of an output with the type that the criterion chooses, and what it says of the runner-up.
 
     Raises:
         RankError: too few samples for the smallest type and its runner-up.
@@ -70,4 +82,4 @@ def choose_type(errors: ProcessErrors) -> tuple[ProcessErrors, dict[str, Any]]:
     behind = second.criterion - best.criterion
     word = (f"not distinguishable from {second.named.word}" if behind < EVIDENCE else f"runner-up {second.named.word}")
     chosen = replace(errors, unknowns=replace(errors.unknowns, structures=(best.named,) * errors.data.m))
-    return chosen, {"process type": f"{best.named.word} by BIC, {word}, {behind:.1f} behind"}
+    return chosen, f"{best.named.word} by BIC, {word}, {behind:.1f} behind"

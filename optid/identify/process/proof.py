@@ -1,4 +1,4 @@
-"""A proof that no other time constant and dead time fit better: branch and bound for one pole with dead time.
+"""A proof that no other time constants and dead time fit better: branch and bound for one or two poles with dead time.
 
 With a held input that moves by w_j at s_j the response of a pole with dead time is
 
@@ -8,11 +8,11 @@ and V(log tau, theta) = min over gain and levels of |y - K x|². A box of (log t
 bound of V there lies above what was found. In a box across kinks x is known up to an interval, since S falls in both
 unknowns. In a cell, x = x0 + a x1 + b x2 + r with |a| <= h1, |b| <= h2 and r within an envelope of its second
 derivatives: least squares over K, K a and K b in their cone, less the largest K |r|, is a lower bound. Boxes are halved
-at kinks first. What is not discarded holds the optimum: its middle is a start that no grid can miss.
+at kinks first. What is not discarded holds the optimum: its middle is a start that no grid can miss. Two real poles are
+searched likewise, in three unknowns and without kinks, see `two_poles`.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -20,21 +20,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optid.arrays import Array
+from optid.identify.process.cones import most_explained, norm, products, project
 from optid.identify.process.descent import ProcessBox
 from optid.identify.process.errors import ProcessErrors
+from optid.identify.process.two_poles import two_pole_bounds
 from optid.kernel_cache import cached_njit
 from optid.models.process_dynamics import ProcessStructure
 from optid.program.solution import Bound
 
 GAP = 1e-6  # relative gap at which a fit counts as proved
 COARSE = 1e-2  # gap of the pass that looks for better starts before a fit is confirmed
-PIECES = 8  # of the range of either unknown at the beginning
-SECONDS = 20.0  # after which a proof is given up
+PIECES = 8  # of the range of every unknown at the beginning
+SECONDS = {2: 20.0, 3: 15.0}  # of the processor, after which a proof is given up, by unknowns
 WORK, LEAST = 2e6, 1000  # responses to single moves that the coarse pass may compute; boxes that it needs at least
-MOST = 5e6  # responses to single moves in one bound beyond which no proof is tried
-METHOD = "branch and bound over time constant and dead time"
-REASON = ("a lower bound is known for one pole with dead time, a held input, a straight static curve and a start at "
-          "rest alone; elsewhere several starts are compared")
+MOST = {2: 5e6, 3: 1e3}  # responses to single moves in one bound beyond which no proof is tried, by unknowns
+METHOD = "branch and bound over time constants and dead time"
+REASON = ("a lower bound is known for one or two real poles with dead time, one held input, a straight static curve "
+          "and a start at rest alone; elsewhere several starts are compared")
 
 
 @cached_njit
@@ -51,7 +53,7 @@ def box_bounds(boxes, smooth, record, moves, edges):
     """
     t, y, still, base = record
     s, w = moves
-    count, n, columns = len(boxes), len(t), still.shape[1]
+    count, n = len(boxes), len(t)
     found = np.zeros((count, 4))
     x, envelope = np.zeros((3, n)), np.zeros(n)
     energy = 0.0
@@ -86,86 +88,21 @@ def box_bounds(boxes, smooth, record, moves, edges):
                         x0 += w[j] * middle
                         rest += size * max(up - middle, middle - down)
                 x[0, k], x[1, k], x[2, k], envelope[k] = x0, x1, x2, rest
-        rows = 3 if smooth[i] else 1
-        for c in range(columns):
-            for o in range(rows):
-                total = 0.0
-                for k in range(n):
-                    total += still[k, c] * x[o, k]
-                for k in range(n):
-                    x[o, k] -= total * still[k, c]
-        gram, side, rho = np.zeros((3, 3)), np.zeros(3), 0.0
-        for k in range(n):
-            rho += envelope[k] * envelope[k]
-            for o in range(rows):
-                side[o] += x[o, k] * y[k]
-                for p in range(o, rows):
-                    gram[o, p] += x[o, k] * x[p, k]
-        rho = np.sqrt(rho)
-        for o in range(3):
-            for p in range(o):
-                gram[o, p] = gram[p, o]
+        project(x, still)
+        gram, side = products(x, y)
+        rho = norm(envelope)
         first, second = h1 * np.sqrt(gram[1, 1]), h2 * np.sqrt(gram[2, 2])
         change, length = rho + first + second, np.sqrt(gram[0, 0])
         at_middle = energy - side[0] * side[0] / gram[0, 0] if gram[0, 0] > 0.0 else energy
         lower = 0.0
         if change < length:
             largest = np.sqrt(energy) / (length - change)  # of the gain anywhere in the box
-            least = energy - _explained(gram, side, h1, h2) if smooth[i] else at_middle
+            least = energy - most_explained(gram, side, np.array([h1, h2])) if smooth[i] else at_middle
             lower = max(np.sqrt(max(least, 0.0)) - largest * rho, 0.0) ** 2
         found[i, 0], found[i, 1] = lower, at_middle
         found[i, 2] = first if smooth[i] else h1 * length
         found[i, 3] = second if smooth[i] else h2 / tau * length
     return found
-
-
-@cached_njit
-def _explained(gram, side, h1, h2):
-    """Return the most that K x0 + K a x1 + K b x2 explains with |a| <= h1 and |b| <= h2: faces of a cone, one by one.
-
-    On a face some of a and b are at their ends; the optimum of a face counts where it obeys the other bounds.
-    """
-    best = 0.0
-    for one in range(-1, 2):
-        for two in range(-1, 2):
-            # columns: x0 with what is fixed, then what is free
-            q = np.zeros((3, 3))
-            size = 1
-            q[0, 0], q[1, 0], q[2, 0] = 1.0, one * h1, two * h2
-            if one == 0:
-                q[1, size], size = 1.0, size + 1
-            if two == 0:
-                q[2, size], size = 1.0, size + 1
-            inner, right = np.zeros((size, size)), np.zeros(size)
-            for i in range(size):
-                for k in range(3):
-                    right[i] += q[k, i] * side[k]
-                    for j in range(size):
-                        for m in range(3):
-                            inner[i, j] += q[k, i] * gram[k, m] * q[m, j]
-            scale = np.zeros(size)
-            for i in range(size):
-                scale[i] = np.sqrt(inner[i, i]) if inner[i, i] > 0.0 else 1.0
-            for i in range(size):
-                right[i] /= scale[i]
-                for j in range(size):
-                    inner[i, j] /= scale[i] * scale[j]
-                inner[i, i] += 1e-13
-            v = np.linalg.solve(inner, right)
-            gain = 0.0
-            for i in range(size):
-                gain += v[i] * right[i]
-                v[i] /= scale[i]
-            inside, at = True, 1
-            if one == 0:
-                inside, at = inside and abs(v[at]) <= h1 * abs(v[0]) * (1 + 1e-9), at + 1
-            if two == 0:
-                inside = inside and abs(v[at]) <= h2 * abs(v[0]) * (1 + 1e-9)
-            if inside:
-                best = max(best, gain)
-                if one == 0 and two == 0:
-                    return gain
-    return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,14 +111,14 @@ class Search:
 
     bound: float
     best: float
-    point: Array  # (2,) log tau and theta of the best middle
-    left: Array  # (B, 4) boxes that were not discarded
+    point: Array  # (d,) logarithms of the time constants and theta of the best middle
+    left: Array  # (B, 2 d) boxes that were not discarded
     boxes: int
 
 
 @dataclass(frozen=True, eq=False)
 class BranchAndBound:
-    """Boxes of (log tau, theta) for one pole with dead time, in sampling times."""
+    """Boxes of the logarithms of one or two time constants and theta, in sampling times."""
 
     errors: ProcessErrors
     box: ProcessBox
@@ -198,7 +135,7 @@ class BranchAndBound:
             edges.append((edges[-1][0] + len(t), edges[-1][1] + len(s[-1])))
         kinks = np.unique(np.concatenate([np.subtract.outer(t, one).ravel()
                                           for t, one in zip(self.errors.read_at, s)]))
-        inside = (kinks > self.box.low[1]) & (kinks < self.box.high[1])
+        inside = (kinks > self.box.low[-1]) & (kinks < self.box.high[-1])
         kinks = kinks[inside]
         kept = np.concatenate([[True], np.diff(kinks) > 1e-9]) if len(kinks) else np.zeros(0, dtype=bool)
         still, y = self._projected()
@@ -228,80 +165,91 @@ class BranchAndBound:
             seconds: after which it ends.
             most: boxes after which it ends.
         """
-        moves, record, edges, kinks = self.compiled
         ends = [np.linspace(low, high, PIECES + 1) for low, high in zip(self.box.low, self.box.high)]
-        l1, a = (one.ravel() for one in np.meshgrid(ends[0][:-1], ends[1][:-1]))
-        l2, b = (one.ravel() for one in np.meshgrid(ends[0][1:], ends[1][1:]))
-        boxes, count, bound, begun = np.column_stack([l1, l2, a, b]), 0, np.inf, time.perf_counter()
-        best, point = np.inf, np.zeros(2)
-        while len(boxes):
-            if time.perf_counter() - begun > seconds or count > most:
+        lows, highs = (np.meshgrid(*(end[part] for end in ends)) for part in (slice(None, -1), slice(1, None)))
+        boxes = np.column_stack([side.ravel() for pair in zip(lows, highs) for side in pair])
+        count, bound, begun, best, point = 0, np.inf, time.thread_time(), np.inf, self.box.low
+        while len(boxes := self._different(boxes)):
+            if time.thread_time() - begun > seconds or count > most:
                 break
             part, boxes = boxes[-2000:], boxes[:-2000]
-            inside = np.searchsorted(kinks, part[:, 3] - 1e-10) - np.searchsorted(kinks, part[:, 2] + 1e-10)
-            found = box_bounds(part, inside == 0, record, moves, edges)
+            found, middles = self._bounded(part)
             count += len(part)
             k = int(np.argmin(found[:, 1]))
             if found[k, 1] < best:
-                best, point = float(found[k, 1]), np.array([part[k, :2].mean(), part[k, 2:].mean()])
+                best, point = float(found[k, 1]), part[k].reshape(-1, 2).mean(axis=1)
             out = found[:, 0] >= min(value, best) * (1 - gap)
             bound = min(bound, float(np.min(found[out, 0], initial=np.inf)))
-            boxes = np.vstack([boxes, _halves(part[~out], found[~out], inside[~out], kinks)])
+            boxes = np.vstack([boxes, _halves(part[~out], np.argmax(found[~out, 2:], axis=1), middles[~out])])
         return Search(min(bound, value), best, point, boxes, count)
+
+    def _different(self, boxes: Array) -> Array:
+        """Leave out boxes in which the second time constant is the larger one everywhere: they are mirrored."""
+        low, high = self.box.low, self.box.high
+        if len(low) == 2 or low[0] != low[1] or high[0] != high[1]:
+            return boxes
+        return boxes[boxes[:, 1] > boxes[:, 2]]
+
+    def _bounded(self, boxes: Array) -> tuple[Array, Array]:
+        """Return what the kernel says of boxes, and where every unknown is halved: a dead time at a kink near there."""
+        moves, record, edges, kinks = self.compiled
+        middles = boxes.reshape(len(boxes), boxes.shape[1] // 2, 2).mean(axis=2)
+        if middles.shape[1] == 3:
+            return two_pole_bounds(boxes, record, moves, edges), middles
+        early, late = boxes[:, 2], boxes[:, 3]
+        inside = np.searchsorted(kinks, late - 1e-10) - np.searchsorted(kinks, early + 1e-10)
+        if len(kinks):
+            at = np.searchsorted(kinks, middles[:, 1])
+            before, after = kinks[np.maximum(at - 1, 0)], kinks[np.minimum(at, len(kinks) - 1)]
+            near = np.where(np.abs(before - middles[:, 1]) < np.abs(after - middles[:, 1]), before, after)
+            kink = (inside > 0) & (near > early + 1e-10) & (near < late - 1e-10)
+            middles[:, 1] = np.where(kink, near, middles[:, 1])
+        return box_bounds(boxes, inside == 0, record, moves, edges), middles
 
     def certify(self, value: float) -> Bound:
         """Return the lower bound on V within the box for a point with this value."""
-        if self.work > MOST:
+        if self.work > MOST[len(self.box.low)]:
             return Bound.none(f"{self.work:.1e} pairs of a sample and a move of the input: a proof would take too "
                               "long; several starts are compared")
-        begun = time.perf_counter()
-        found = self.search(value, GAP, SECONDS)
-        words = f"{found.boxes} boxes in {time.perf_counter() - begun:.2g} s"
+        begun = time.thread_time()
+        found = self.search(value, GAP, SECONDS[len(self.box.low)])
+        words = f"{found.boxes} boxes in {time.thread_time() - begun:.2g} s"
         if len(found.left):
             return Bound(0.0, False, METHOD, f"given up after {words}: {len(found.left)} boxes are left, down to a "
-                         f"dead time of {self._time(found.left[:, 2].min())}")
+                         f"dead time of {self._time(found.left[:, -2].min())}")
         gap = max(0.0, 1 - found.bound / value) if value > 0 else 0.0
         if found.best < value * (1 - GAP):
             return Bound(found.bound, False, METHOD, f"a better point was found by the proof ({words}): time constant "
-                         f"{self._time(np.exp(found.point[0]))}, dead time {self._time(found.point[1])}; hold it by "
-                         "constraints, or fit again from there")
+                         f"{', '.join(self._time(np.exp(one)) for one in found.point[:-1])}, dead time "
+                         f"{self._time(found.point[-1])}; hold it by constraints, or fit again from there")
         return Bound(found.bound, True, METHOD, "proved up to rounding for time constants from "
                      f"{self._time(np.exp(self.box.low[0]))} to {self._time(np.exp(self.box.high[0]))} and dead times "
-                     f"from {self._time(self.box.low[1])} to {self._time(self.box.high[1])}: {words}, relative gap "
+                     f"from {self._time(self.box.low[-1])} to {self._time(self.box.high[-1])}: {words}, relative gap "
                      f"{gap:.1e}")
 
     def _time(self, samples: float) -> str:
         return f"{samples * self.errors.data.dt:.4g} {self.errors.data.time_unit}".rstrip()
 
 
-def _halves(boxes: Array, found: Array, inside: NDArray[np.intp], kinks: Array) -> Array:
-    """Return both halves of boxes: of the unknown that changes more, a dead time at the kink next to the middle."""
-    if not len(boxes):
-        return boxes
-    l1, l2, a, b = boxes.T
-    wide = found[:, 2] >= found[:, 3]
-    middle = (a + b) / 2
-    if len(kinks):
-        at = np.searchsorted(kinks, middle)
-        before, after = kinks[np.maximum(at - 1, 0)], kinks[np.minimum(at, len(kinks) - 1)]
-        near = np.where(np.abs(before - middle) < np.abs(after - middle), before, after)
-        middle = np.where((inside > 0) & (near > a + 1e-10) & (near < b - 1e-10), near, middle)
-    log = (l1 + l2) / 2
-    first = np.column_stack([l1, np.where(wide, log, l2), a, np.where(wide, b, middle)])
-    second = np.column_stack([np.where(wide, log, l1), l2, np.where(wide, a, middle), b])
-    return np.vstack([first, second])
+def _halves(boxes: Array, wide: NDArray[np.intp], middles: Array) -> Array:
+    """Return both halves of boxes (B, 2 d): of the unknown (B,) that changes more, at its middle (B, d)."""
+    ends = boxes.reshape(len(boxes), boxes.shape[1] // 2, 2)
+    split = np.equal.outer(wide, np.arange(ends.shape[1]))
+    first = np.stack([ends[:, :, 0], np.where(split, middles, ends[:, :, 1])], axis=2)
+    second = np.stack([np.where(split, middles, ends[:, :, 0]), ends[:, :, 1]], axis=2)
+    return np.vstack([first.reshape(boxes.shape), second.reshape(boxes.shape)])
 
 
 def applies(errors: ProcessErrors) -> bool:
-    """Whether a lower bound is known: one pole with dead time, straight f, held input, start at rest."""
-    one = errors.unknowns.structures
-    return (one == (ProcessStructure(),) and errors.unknowns.sizes == (1,) and not errors.unknowns.free
+    """Whether a lower bound is known: one or two real poles with dead time, straight f, held input, start at rest."""
+    u, known = errors.unknowns, (ProcessStructure(1), ProcessStructure(2))
+    return (len(u.structures) == 1 and u.structures[0] in known and u.sizes == (1,) and not u.free
             and not errors.straight and type(errors.bases[0]).__name__ == "Linear")
 
 
 def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array | None:
     """Return a point (log tau, theta) with a smaller sum of squares than a value, where a coarse search finds one."""
-    if not applies(errors):
+    if not applies(errors) or len(box.low) > 2:  # where it would take longer than all descents
         return None
     bound = BranchAndBound(errors, box)
     if bound.work > WORK / LEAST:
@@ -310,13 +258,9 @@ def better_start(errors: ProcessErrors, box: ProcessBox, value: float) -> Array 
     return found.point if found.best < value * (1 - GAP) else None
 
 
-def certificate(errors: ProcessErrors) -> Callable[[ProcessErrors, ProcessBox, float], Bound]:
-    """Return what bounds the errors of a fit within a box from below."""
+def certify(errors: ProcessErrors, box: ProcessBox, value: float) -> Bound:
+    """Bound the errors of a fit within a box from below, in units of the record, where there is a method."""
     if not applies(errors):
-        return lambda *_: Bound.none(REASON)
-
-    def certify(errors: ProcessErrors, box: ProcessBox, value: float) -> Bound:
-        found = BranchAndBound(errors, box).certify(value)
-        return replace(found, value=errors.unit * found.value)
-
-    return certify
+        return Bound.none(REASON)
+    found = BranchAndBound(errors, box).certify(value)
+    return replace(found, value=errors.unit * found.value)

@@ -14,6 +14,8 @@ from optid.identify.process.starts import usual_box
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
 MOVING, EXACT = 1e-4, 1e-12  # p value, and share of the energy of the output, below which a motion counts as none
 NEAR = 0.02  # of a logarithm from its bound that counts as none
+MANYFOLD = 3.0  # standard error of a logarithm from which on a time constant is not determined
+SHARE = 0.1  # of a direction from which on a parameter takes part in it
 ALIKE = 1e-7  # singular value of the scaled derivatives, relative to the largest, at which parameters are not separable
 
 
@@ -61,7 +63,7 @@ def refuse_inseparable(errors: ProcessErrors, box: ProcessBox, best: ProcessPoin
     if values[-1] > ALIKE * values[0]:
         return
     kept = [name for name, there in zip(names, inner & (sizes > 0)) if there]
-    parts = [name for name, part in zip(kept, np.abs(vectors[-1])) if part > 0.1]
+    parts = [name for name, part in zip(kept, np.abs(vectors[-1])) if part > SHARE]
     raise RankError(f"{', '.join(parts)} can change together without any effect on this record: it does not separate "
                     f"them. {_determined(errors, best)}")
 
@@ -89,10 +91,10 @@ def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
     p = float(fisher.sf(gain / left.shape[1] / max((best.value - gain) / dof, 1e-300), left.shape[1], dof))
     if p >= MOVING or gain <= EXACT * errors.energy:
         return ""
-    found = f"not at rest (p = {p:.1g})"
-    warnings.warn(f"the record does not begin at rest under its first inputs (p = {p:.1g}): initial='free' estimates a "
-                  "motion of its own for every experiment; gain and time constants are biased without it", DataWarning,
-                  stacklevel=2)
+    found, of = f"not at rest (p = {p:.1g})", errors.data.outputs[0]
+    warnings.warn(f"output {of!r} does not begin at rest under its first inputs (p = {p:.1g}): initial='free' "
+                  "estimates a motion of its own for every experiment; gain and time constants are biased without it",
+                  DataWarning, stacklevel=2)
     return found
 
 
@@ -110,6 +112,33 @@ def describe_bounds(errors: ProcessErrors, best: ProcessPoint) -> str:
                              f"{size}: {means if name not in ('zeta', 'tau_zero') else 'it is not determined'}")
             j += 1
     return "; ".join(found)
+
+
+def describe_flatness(errors: ProcessErrors, best: ProcessPoint) -> str:
+    """Return which parameters may change manyfold, together, without an effect beyond the noise; "" for none.
+
+    Those at a bound are not among them: see `describe_bounds`.
+    """
+    box, at = usual_box(errors), errors.unknowns.dynamic
+    basis = np.linalg.qr(best.columns)[0]
+    slopes = _with_equal_ones_together(errors, best)
+    slopes = slopes - basis @ (basis.T @ slopes)
+    names = [errors.key(name, c) for c, one in enumerate(errors.unknowns.structures) for name in one.names]
+    logs = np.concatenate([one.logarithmic for one in errors.unknowns.structures])
+    sizes, gap = np.linalg.norm(slopes, axis=0), np.where(logs, NEAR, 1e-9)
+    free = np.flatnonzero((best.x[at] > box.low + gap) & (best.x[at] < box.high - gap) & (sizes > 0))
+    if len(free) < 1:
+        return ""
+    noise = np.sqrt(best.value / max(len(errors.y) - errors.unknowns.size, 1))
+    values, vectors = np.linalg.svd(slopes[:, free] / sizes[free], full_matrices=False)[1:]
+    # by how much the noise lets every number change in the direction that the record shows least
+    moves = np.abs(vectors[-1]) * noise / sizes[free] / max(values[-1], 1e-300)
+    loose = moves > np.where(logs[free], MANYFOLD, errors.length)
+    if not loose.any():
+        return ""
+    found = [names[free[i]] for i in np.flatnonzero(np.abs(vectors[-1]) > SHARE)]
+    return (f"{', '.join(found)}: {'together they' if found[1:] else 'it'} may change manyfold without visible effect; "
+            "a simpler type may do")
 
 
 def _with_equal_ones_together(errors: ProcessErrors, best: ProcessPoint) -> Array:

@@ -5,6 +5,7 @@ of squares follows from it. Responses to all dead times are run by one kernel.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -17,6 +18,7 @@ from optid.models.process_dynamics import ProcessDynamics, ProcessStructure
 from optid.models.process_kernel import run
 
 SCALES, DELAYS = 12, 24  # time scales and dead times of the grid
+FASTEST = 0.05  # samples of the smallest time constant
 RATIOS = (1.0, 0.4, 0.16)  # time constants over the scale
 DAMPINGS, ZEROS = (0.2, 0.5, 1.0), (0.5, -0.5)  # of the grid; zeros over the scale
 COARSE, CHANGES = 400, 1000  # samples of every experiment, and changes of its input, on which starts are compared
@@ -39,7 +41,8 @@ def gram_matrices(F, C, instants, course, thetas, still, settings):  # noqa: N80
     for i in range(len(thetas)):
         for j in range(len(changes)):
             later[j] = changes[j] + thetas[i]
-        response = run(F, C, instants, later, inputs, (settings[m] > 0, True), start)
+        sides = settings[m] > 0.0, settings[m] >= 0.0  # a literal True would have the kernel compiled once more
+        response = run(F, C, instants, later, inputs, sides, start)
         for k in range(len(instants)):
             for c in range(m):
                 row[c] = response[k, 0, c] + settings[c]
@@ -63,7 +66,7 @@ def usual_box(errors: ProcessErrors) -> ProcessBox:
         ends = {"zeta": (np.log(0.02), np.log(20.0)), "tau_zero": (-3 * span, 3 * span),
                 "dead_time": (0.0, 0.75 * after)}
         for name in structure.names:
-            one = ends.get(name, (np.log(0.05), np.log(10 * span)))
+            one = ends.get(name, (np.log(FASTEST), np.log(10 * span)))
             low.append(one[0])
             high.append(one[1])
     return ProcessBox(np.array(low), np.array(high))
@@ -154,11 +157,37 @@ def starts(errors: ProcessErrors, box: ProcessBox) -> list[Array]:
     return chosen
 
 
-def best_descents(errors: ProcessErrors, box: ProcessBox, more: tuple[Array, ...] = ()) -> list[ProcessPoint]:
+def simpler(errors: ProcessErrors, box: ProcessBox) -> list[Array]:
+    """Return the best processes of at most one real pole, without a zero, as points of types with more of them.
+
+    A richer type then fits no worse: the poles that it adds are the fastest that are tried.
+    """
+    structures = errors.unknowns.structures
+    fewer = tuple(replace(one, real=min(one.real + 2 * one.pair, 1), pair=False, zero=False) for one in structures)
+    if fewer == structures:
+        return []
+    plain = replace(errors, unknowns=replace(errors.unknowns, structures=fewer))
+    inner = usual_box(plain)
+    found = []
+    for point in (descend(plain, x, inner, steps=30, tolerance=1e-7)[0] for x in starts(plain, inner)[:2]):
+        x = np.zeros(errors.unknowns.size)
+        for c, (one, less, process) in enumerate(zip(structures, fewer, plain.processes(point.x))):
+            fast, tau = 2 * FASTEST, process.value("tau")
+            pair = (tau, fast) if not one.real else (fast, fast)
+            value = {"tau": tau, "tau1": tau, "tau2": fast, "tau3": fast, "T": np.sqrt(np.prod(pair)),
+                     "zeta": sum(pair) / 2 / np.sqrt(np.prod(pair)), "tau_zero": 0.0,
+                     "dead_time": max(process.dead_time - fast * (one.order - less.order), 0.0)}
+            x[errors.unknowns.slices[f"dynamics{c}"]] = one.numbers(np.array([value[name] for name in one.names]))
+        x[errors.unknowns.dynamic] = np.clip(x[errors.unknowns.dynamic], box.low, box.high)
+        found.append(x)
+    return found
+
+
+def best_descents(errors: ProcessErrors, box: ProcessBox) -> list[ProcessPoint]:
     """Descend from all starts, on part of a long record first, and return different ends, the best first."""
     coarse = errors.first_part(COARSE, CHANGES)
-    ends = sorted((descend(coarse, x, box, steps=30, tolerance=1e-7)[0] for x in (*starts(coarse, box), *more)),
-                  key=lambda one: one.value)
+    ends = sorted((descend(coarse, x, box, steps=30, tolerance=1e-7)[0]
+                   for x in (*starts(coarse, box), *simpler(coarse, box))), key=lambda one: one.value)
     kept: list[ProcessPoint] = []
     for end in ends:
         if end.value <= 3 * ends[0].value and all(

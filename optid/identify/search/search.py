@@ -143,6 +143,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
     clock = time.monotonic()
     if not isinstance(data, Data):
         raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
+    data.refuse_irregular("a search")
     most = effort_of(effort)
     if budget is not None and (not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf):
         raise StructureError(f"budget is a number of seconds above 0; got {shown(budget)}")

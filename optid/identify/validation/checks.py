@@ -165,7 +165,8 @@ def _residual_tests(model: Any, data: Data, residuals: Sequence[Array], lags: in
     """
     columns = {name: [r[:, o] for r in residuals] for o, name in enumerate(data.outputs)}
     inputs = {name: [e.u[:, c] for e in data.experiments] for c, name in enumerate(data.inputs)}
-    claimed, least, slight = describes_noise(model), informativity(data).least, {}
+    claimed, slight = describes_noise(model), {}
+    least = informativity(data).least if data.is_regular else 0
     for o, (name, errors) in enumerate(columns.items()):
         explained = np.nanstd(np.concatenate([e.y[:, o] - r for e, r in zip(data.experiments, errors)]))
         slight[name] = SLIGHT * float(explained / max(float(np.nanstd(np.concatenate(errors))), 1e-300))
@@ -237,6 +238,9 @@ def record_structure(model: Any, data: Data, notes: list[str] | None = None) -> 
     if not beyond and not static_functions(model):
         return None
     notes = [] if notes is None else notes
+    if not data.is_regular:
+        notes.append(f"{NOT_TESTED}the samples were taken at irregular times.")
+        return None
     known = informativity(data)
     runs = simulated_or_nan(model, data) if beyond else None
     reason = known.reason or known.untested
