@@ -39,6 +39,7 @@ from optid.arrays import Array, as_list
 from optid.data.record import Data, Experiment
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
+from optid.faults.screening import check_causality
 from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
@@ -138,8 +139,8 @@ class ModelUncertainty:
         if not self.deviation:
             return ""
         return (f"The parameters are {self.deviation:.0f} standard deviations from the most likely ones, so that small "
-                "faults stay hidden: fit the model by its prediction errors (hammerstein_ss.exact with "
-                "criterion=prediction).")
+                "faults stay hidden: fit the model by its prediction errors (hammerstein_ss.exact or ss.exact with "
+                "criterion=prediction, behind a controller with feedthrough=false).")
 
     def distance(self, y: Array) -> Array:
         """Return how far readings (N, l) are from the middle of their identified range, in half ranges, at least one.
@@ -212,9 +213,11 @@ def model_uncertainty(
         decoupled: a predictor decoupled from declared disturbances, in place of that of the model.
 
     Raises:
-        DataError: fewer than two readings for each direction of the parameters that changes the predictions.
+        DataError: fewer than two readings for each direction of the parameters that changes the predictions; a model
+            of the inverse of a controller.
         StructureError: no noise covariances.
     """
+    check_causality(model, data)
     count = sum(len(part.y) for part in data.experiments)
     steady = decoupled
     if steady is None:
