@@ -1,15 +1,18 @@
 """The decisions of a monitor: raise an alarm, isolate, carry and clear a fault."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.faults.monitor.actuator_kinds import groups_of, has_constants, kinds, likeliest
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT
+from optid.faults.signatures import Candidate
 
 RULES = {
     "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
@@ -45,10 +48,12 @@ class Decisions:
     columns: Columns  # of the candidates
     labels: tuple[str, ...]  # of the candidates
     q: Array  # (C,) their thresholds
+    spreads: Array  # (C,) factors of the variances of their sizes, because the model is uncertain
     rules: dict[str, float]  # numbers, see `RULES`
     outputs: tuple[str, ...]  # names of the sensors
     testable: np.ndarray  # (C,) whether a total loss is detectable
     passing: list[list[int]]  # [candidate, sample at which it has faded] of transients
+    listed: tuple[Candidate, ...]  # candidates of the dictionary
     phase: int = WATCHING
     alarm: int = 0  # sample of the alarm
     named: int = NOTHING  # isolated candidate
@@ -57,9 +62,21 @@ class Decisions:
     begun: int = 0  # first sample after the last unknown input
     # [sample, factor of the thresholds] of inputs outside their range in the last window, the factors falling
     raised: list[list[float]] = field(default_factory=list)
+    # [candidate, labels] of carried actuators whose kind is not decided yet
+    undecided: list[list[Any]] = field(default_factory=list)
+    told: list[str] = field(default_factory=list)  # labels of the last isolated fault
     kept: list[Array] | None = None  # the statistics (T, C) of all samples, where they are requested
 
-    KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing"
+    KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing", "undecided", "told"
+
+    @cached_property
+    def groups(self) -> tuple[int, ...]:
+        """Number of the first candidate of the group of each."""
+        return groups_of(self.columns.candidates)
+
+    def group(self, number: int) -> list[int]:
+        """Return the candidates of the group of one."""
+        return [c for c, first in enumerate(self.groups) if first == self.groups[number]]
 
     @property
     def thresholds(self) -> Array:
@@ -134,38 +151,81 @@ class Decisions:
         rule, noise = self.rules, self._noisy_sensor(now, window)
         # increased noise is an answer, too, and the likely one where no candidate explained the alarm before
         louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.min()) * (self.named != AGAIN)
-        share = np.exp(np.clip(np.append(gains, louder) - gains[best], -700, 700) / 2)
+        rivals = [gains[self.group(c)].max() for c in sorted(set(self.groups))]
+        share = np.exp(np.clip(np.append(rivals, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
         chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is isolated
         if self.phase == NAMING:
             odd, free = self._left_over(best, window)
             waited = now - self.alarm
             late = waited >= rule["patience"] or (waited >= rule["settle"] and old + rule["settle"] >= window.length)
-            testable = self.columns.candidates[best].additive or self.testable[best]
             if self.quiet >= rule["still"] or (late and gains[best] <= 0):
                 return self._clear(now)
             if louder > gains[best] and (late or share[-1] >= rule["certainty"] * share.sum()):
                 return self._lost(now, best, window, noise)
-            if not late and not (sure and gains[best] > 0 and free >= 4 and testable):
+            if not late and not (sure and gains[best] > 0 and free >= 4 and self._is_testable(best)):
                 return None
         else:
             if now - self.named_at < rule["settle"] and old < window.length:
                 return None
-            chosen = best if sure else self.named
+            chosen = best if sure or self.groups[best] == self.groups[self.named] else self.named
             if window.peak[chosen] == 0:
                 return self._clear(now)
             odd, free = self._left_over(chosen, window)
         if odd > rule["odd"]:
             return self._lost(now, chosen, window, noise)
-        if self.phase == NAMING or chosen != self.named:
+        if self.phase == NAMING or self.groups[chosen] != self.groups[self.named]:
             self.phase, self.named, self.named_at = SETTLING, chosen, now
-            return self._event("isolated", now, chosen, gains, window)
+            event = self._event("isolated", now, chosen, gains, window)
+            self.told = [label for label, _ in event.candidates]
+            return event
+        return self._carry(now, chosen, window, plant)
+
+    def label_of(self, owner: int) -> str:
+        """Return the likeliest label of a carried candidate."""
+        return next((labels[0] for number, labels in self.undecided if number == owner), self.labels[owner])
+
+    def _is_testable(self, number: int) -> bool:
+        return any(self.columns.candidates[c].additive or self.testable[c] for c in self.group(number))
+
+    def _carry(self, now: int, chosen: int, window: Window, plant: RunningFilter) -> Event | None:
+        """Compensate a fault from now on, an actuator of undecided kind with share and constants."""
+        weights, event = self._kinds(chosen, window), None
+        said = likeliest(weights)
+        labels = [label for label, _ in said]
+        if labels != [label for label in self.told if label in weights]:
+            event = self._told("revised", now, said, chosen, window)
+        family = [c for c in self.group(chosen) if has_constants(self.columns.candidates[c]) and window.peak[c]]
+        if family and (len(labels) > 1 or self.columns.candidates[chosen].kind != "bias"):
+            chosen = family[0]
+            self.undecided = [one for one in self.undecided if one[0] != chosen] + [[chosen, labels]]
         plant.room(2 * int(self.columns.size.max()))
         left = plant.carry(chosen, window)
         if np.isfinite(left):
-            self.passing.append([chosen, now + _fading(plant, left, rule["faded"])])
+            self.passing.append([chosen, now + _fading(plant, left, self.rules["faded"])])
         self.forgive(window)
-        return None
+        return event
+
+    def _kinds(self, number: int, window: Window) -> dict[str, float]:
+        """Return {label: likelihood} of the group of a candidate."""
+        logs: dict[str, float] = {}
+        for c in self.group(number):
+            if not window.peak[c]:
+                continue
+            sizes, covariance, _ = window.estimate(c)
+            for label, log in self._evidence(c, sizes, covariance).items():
+                logs[label] = max(log, logs.get(label, -np.inf))
+        most = max(logs.values())
+        return {label: float(np.exp(log - most)) for label, log in logs.items()}
+
+    def _evidence(self, number: int, sizes: Array, covariance: Array) -> dict[str, float]:
+        """Return {label: logarithm of the likelihood} of an estimate in the order of the columns."""
+        candidate = self.columns.candidates[number]
+        if candidate.kind not in ("bias", "loss", "stuck"):
+            return {self.labels[number]: 0.0}
+        first = int(has_constants(candidate))
+        turned = np.roll(covariance, (first, first), axis=(0, 1))
+        return kinds(candidate, np.roll(sizes, first), self.spreads[number] * turned, self.listed)
 
     def forgive(self, window: Window) -> None:
         """Discard the alarm from the next sample on."""
@@ -194,19 +254,31 @@ class Decisions:
         return float(excess(max(energy - float(window.statistic[number]), 0.0), free)), free
 
     def _event(self, kind: str, now: int, best: int, gains: Array, window: Window) -> Event:
-        weight = np.exp((gains - gains.max()) / 2)
-        weight /= weight.sum()
-        order = [best, *(int(c) for c in np.argsort(-weight, kind="stable") if c != best)]
-        kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
-        note = ""
-        if kind == "isolated" and not (self.columns.candidates[best].additive or self.testable[best]):
+        weights: dict[str, float] = {}
+        for first in sorted(set(self.groups), key=lambda c: c != self.groups[best]):
+            top = gains[self.group(first)].max() - gains[best]
+            own = self._kinds(first, window) if np.isfinite(top) else {}
+            for label, weight in own.items():
+                weights[label] = float(np.exp(top / 2)) * weight / sum(own.values())
+        said, note = likeliest(weights), ""
+        hidden = [c for c in self.group(best) if not (self.columns.candidates[c].additive or self.testable[c])]
+        if kind == "isolated" and hidden and (best in hidden or len(said) > 1):
             note = "the actuator hardly moves: its loss is not isolable from a constant"
-        elif kind == "isolated" and kept > 1:
+        elif kind == "isolated" and len(said) > 1:
             note = "not isolated in time"
-        sizes, _, _ = window.estimate(best)
-        return Event(kind, now, tuple((self.labels[c], float(weight[c])) for c in order[:kept]),
-                     now - int(window.peak[best]) + 1, self.columns.in_order(best, sizes),
-                     float(window.statistic[best]), note)
+        return self._told(kind, now, said, best, window, note)
+
+    def _told(self, kind: str, now: int, said: tuple[tuple[str, float], ...], best: int, window: Window, note: str = ""
+              ) -> Event:
+        """Return an event with onset and size of its first label, in the group of the best candidate."""
+        own = [c for c in self.group(best) if window.peak[c]]
+        family = [c for c in own if has_constants(self.columns.candidates[c])]
+        same = [c for c in own if self.labels[c] == said[0][0]]
+        number = (same or [best])[0] if not family or (same and self.columns.candidates[same[0]].kind == "bias") else (
+            family[0])
+        sizes, _, _ = window.estimate(number)
+        return Event(kind, now, said, now - int(window.peak[number]) + 1, self.columns.in_order(number, sizes),
+                     float(window.statistic[number]), note)
 
     def _review(self, now: int, window: Window, plant: RunningFilter) -> Event | None:
         """Clear carried faults that have vanished, hold those that have converged; return the first one cleared."""
@@ -227,12 +299,29 @@ class Decisions:
             energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
             if energy < self.rules["forgiven"] * self.q[owner]:
                 plant.release(rows, own, window)
+                self.undecided = [one for one in self.undecided if one[0] != owner]
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
+            if event := self._revise(now, owner, sizes, covariance):
+                return event
             left = sum(window.length * plant.directions[p].power * plant.P[n + p, n + p] for p in rows)
             seen = min(plant.directions[p].age for p in rows) >= window.length
             if seen and 0 < left < self.rules["learned"]:
                 for p in reversed(rows):
                     plant.forget(p, window)
+        return None
+
+    def _revise(self, now: int, owner: int, sizes: Array, covariance: Array) -> Event | None:
+        """Return the event of a carried actuator whose kind has become clearer."""
+        for one in self.undecided:
+            if one[0] != owner or len(one[1]) < 2:
+                continue
+            logs = self._evidence(owner, sizes, covariance)
+            most = max(logs.values())
+            said = likeliest({label: float(np.exp(log - most)) for label, log in logs.items()})
+            labels = [label for label, _ in said]
+            if set(labels) < set(one[1]) or said[0][1] >= self.rules["certainty"]:
+                one[1] = labels
+                return Event("revised", now, said, size=self.columns.in_order(owner, sizes))
         return None
 
     def _noisy_sensor(self, now: int, window: Window) -> Event | None:

@@ -9,7 +9,8 @@ class Event:
     """An event reported by the monitor.
 
     Attributes:
-        kind: "alarm", "isolated" (one candidate is left, or several after the time allowed), "cleared", "untestable"
+        kind: "alarm", "isolated" (one candidate is left, or several after the time allowed), "revised" (fewer
+            kinds of an isolated actuator are left, or another one), "cleared", "untestable"
             (a total loss of the actuator is not detectable, or not isolable from a constant), "testable" (again),
             "outside" (an input left the identified range) or "inside" (again).
         sample: counted from the first sample of the stream.
@@ -57,7 +58,7 @@ class Carried:
 
     label: str  # the candidate
     size: tuple[float, ...]  # its magnitudes
-    deviation: tuple[float, ...]  # their standard deviations; zero once they are held and no longer estimated
+    deviation: tuple[float, ...]  # their standard deviations
 
     def __str__(self) -> str:
         """Return the fault in one line."""

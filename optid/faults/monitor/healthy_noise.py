@@ -209,4 +209,5 @@ def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calib
     if np.sum(largest > base.common) > bdtrik(CONFIDENCE, len(largest), COMMON):
         factor = max(factor, float(np.quantile(largest, 1 - COMMON)) / base.common)
     _check_rise(factor, "the thresholds", levels, 1.0, window)
-    return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.y) for part in records))
+    return replace(base, q=factor * base.q, spreads=factor * base.spreads,
+                   samples=base.samples + sum(len(part.y) for part in records))

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.monitor.actuator_kinds import searched
 from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
@@ -126,7 +127,7 @@ class Monitor:
             self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
                 self.calibration = calibrated_on(self, healthy, self.calibration)
-        self.decisions.q = self.calibration.q
+        self.decisions.q, self.decisions.spreads = self.calibration.q, self.calibration.spreads
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
         elif not (isinstance(x0, str) and x0 == "zero"):
@@ -135,14 +136,14 @@ class Monitor:
     def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float]) -> None:
         """Set up everything but the thresholds."""
         self.dictionary, self.window, self.seed, self.source = found, window, seed, None
-        chosen = tuple(c for c in found.candidates if c.kind in COURSES and not (c.kind == "loss" and not c.columns))
+        chosen = searched([c for c in found.candidates if c.kind in COURSES and (c.kind != "loss" or c.columns)])
         if not chosen:
             raise StructureError("No candidate has a signature that a monitor can search for: add the kind 'bias'.")
         self.labels = tuple(c.label for c in chosen)
         self.skipped = {
             c.label: "it is detected from the readings in any case" if c.kind in ("frozen", "noise") else
             "it has no signature that a running search can search for"
-            for c in found.candidates if c not in chosen
+            for c in found.candidates if c.label not in self.labels
         }
         model, steady = found.model, found.predictor
         if not model.parts.tables.compiled:
@@ -152,8 +153,8 @@ class Monitor:
         self.search = Window(self.columns, window, model.nx + SPARE + 2 * int(self.columns.size.max()), steady)
         self.plant = RunningFilter(model, steady, self.columns)
         self.checks = ReadingChecks(model)
-        self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), rules, model.outputs,
-                                   np.ones(len(chosen), dtype=bool), [])
+        self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), np.ones(len(chosen)), rules,
+                                   model.outputs, np.ones(len(chosen), dtype=bool), [], found.candidates)
         self.samples = 0
         self._functions = tabulated(model.nonlinearities)
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
@@ -185,7 +186,7 @@ class Monitor:
         q = np.array(thresholds, dtype=float)
         if q.shape != (len(self.labels),) or not np.all(q > 0):
             raise StructureError(f"thresholds: give one positive number for each of {', '.join(self.labels)}.")
-        return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None)
+        return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None, np.ones(len(q)))
 
     def _rehearsed(self, u: ArrayLike | None) -> Array:
         model = self.dictionary.model
@@ -351,16 +352,17 @@ class Monitor:
     def carried(self) -> tuple[Carried, ...]:
         """The isolated faults whose effect is compensated."""
         plant, size, found = self.plant, self.plant.held.copy(), []
-        variance = np.zeros(len(size))
+        variance = plant.held_variance.copy()
         for at, one in enumerate(plant.directions, self.dictionary.model.nx):
             if self.columns.course[one.column] != DRIFT or one.growth > 0:
                 size[one.column] += plant.x[at]
                 variance[one.column] += plant.P[at, at]
-        for number, label in enumerate(self.labels):
+        for number in range(len(self.labels)):
             own = self.columns.of(number)
             if size[own].any() or any(one.owner == number for one in plant.directions):
-                found.append(Carried(label, *(self.columns.in_order(number, part[own])
-                                              for part in (size, np.sqrt(variance)))))
+                spread = np.sqrt(self.decisions.spreads[number] * variance[own])
+                found.append(Carried(self.decisions.label_of(number), self.columns.in_order(number, size[own]),
+                                     self.columns.in_order(number, spread)))
         return tuple(found)
 
     @property
