@@ -1,11 +1,16 @@
 """Faults of a plant under control: what is identified, named, sized and promised there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from fault_plants import noisy, refused
 
 import optid
-from optid.errors import DataError, RankError
-from optid.faults import Monitor, model_uncertainty
+from optid.bases import Linear, Polynomial
+from optid.errors import DataError, DataWarning, RankError, StructureError
+from optid.faults import Monitor, dictionary, model_uncertainty
+from optid.models import Nonlinearity
 
 
 def regulated(count=1500, seed=0):
@@ -32,9 +37,8 @@ def test_the_inverse_of_a_controller_is_not_fitted_by_prediction_errors():
 def test_the_inverse_of_a_controller_is_not_monitored():
     record = regulated()
     inverse = optid.fit(record, "hammerstein_ss.sid", basis="linear", nx=2).model
-    for refused in (lambda: Monitor(inverse, uncertainty=record), lambda: model_uncertainty(inverse, record)):
-        with pytest.raises(DataError, match="answer of a controller .* feedthrough=false"):
-            refused()
+    refused(*((DataError, "answer of a controller .* feedthrough=false", call) for call in (
+        lambda: Monitor(inverse, uncertainty=record), lambda: model_uncertainty(inverse, record))))
 
 
 @pytest.mark.filterwarnings("ignore:The model is unstable")
@@ -49,3 +53,99 @@ def test_a_regulated_plant_is_fitted_without_feedthrough_and_the_advice_is_taken
     y[700:, 0] += 0.6
     alarms = [e for e in monitor.run(later.u, y) if e.kind == "alarm"]
     assert alarms and alarms[0].sample >= 700
+
+
+A, B, C = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.5, 0.1], [0.2, 0.6]]), np.eye(2)
+
+
+def controlled(share=0.0, zero=(-2.0, 0.0), seed=0, count=400, onset=150, stuck=False, offset=0.0):
+    """A linear plant under PI control; from the onset on its first actuator is broken."""
+    rng = np.random.default_rng(seed)
+    model = noisy(A, B, C, 4e-4 * np.eye(2), 4e-4 * np.eye(2))
+    x, total, u, y = np.zeros(2), np.zeros(2), np.zeros((count, 2)), np.zeros((count, 2))
+    gain = np.linalg.inv(C @ np.linalg.solve(np.eye(2) - A, B))
+    targets = np.repeat(rng.uniform(-1, 1, (-(-count // 15), 2)), 15, axis=0)
+    for k in range(count):
+        y[k] = C @ x + 0.02 * rng.standard_normal(2)
+        total += targets[k] - y[k]
+        u[k] = gain @ (0.3 * (targets[k] - y[k]) + 0.08 * total)
+        v = u[k].copy()
+        if k >= onset:
+            held = u[onset, 0]
+            v[0] = held if stuck else (1 - share) * (v[0] - zero[0]) + zero[0] + offset
+        x = A @ x + B @ v + 0.02 * rng.standard_normal(2)
+    return model, u, y
+
+
+def watching(model, found, level=30.0, **how):
+    count = sum(c.kind != "loss" or bool(c.columns) for c in found.candidates)
+    return Monitor(model, found, window=60, thresholds=np.full(count, level), x0="zero", **how)
+
+
+def told(events, until):
+    named = [e for e in events if e.kind in ("isolated", "revised") and e.sample < until]
+    return {label for label, _ in named[-1].candidates}, named[-1]
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+@pytest.mark.parametrize("listed", [("bias", "loss"), ("bias", "loss", "stuck")])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_loss_about_another_zero_is_a_loss_with_its_share(listed, seed):
+    model, u, y = controlled(0.3, seed=seed)
+    monitor = watching(model, dictionary(model, kinds=listed))
+    labels, last = told(monitor.run(u, y), 210)
+    assert "actuator:u1 loss" in labels and len(labels) <= 2
+    (one,) = (c for c in monitor.carried if c.label == "actuator:u1 loss")
+    assert abs(one.size[0] - 0.3) < 3 * one.deviation[0] < 0.1
+    assert abs(one.size[1] - 0.3 * -2.0) < 3 * one.deviation[1] + 0.05
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+@pytest.mark.parametrize("seed", range(2))
+def test_stuck_offset_and_small_losses_are_told_as_far_as_they_are_decided(seed):
+    for how, kind in (({"stuck": True}, "actuator:u1 stuck"), ({"offset": 0.4}, "actuator:u1"),
+                      ({"share": 0.06}, "actuator:u1 loss")):
+        model, u, y = controlled(seed=seed, **how)
+        monitor = watching(model, dictionary(model, kinds=["bias", "loss", "stuck"]))
+        events = monitor.run(u, y)
+        labels, _ = told(events, 210)
+        assert kind in labels and len(labels) <= 2, (how, labels)
+        sizes = [e.size[0] for e in events if e.size and e.candidates[0][0].endswith(("loss", "stuck"))]
+        assert all(0 <= size <= 1 for size in sizes)  # a share
+
+
+def test_the_monitor_takes_stated_zeros_as_diagnose_does():
+    model, u, y = controlled(0.3, count=300)
+    found = dictionary(model, kinds=["loss"], actuators=["u1"], sensors=[], state_jump=False, zeros={"u1": -2.0})
+    monitor = watching(model, found)
+    labels, last = told(monitor.run(u, y), 300)
+    assert labels == {"actuator:u1 loss"} and last.size == pytest.approx([0.3], abs=0.06)
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+def test_a_declared_disturbance_is_no_alarm():
+    model, u, y = controlled()
+    wind = 0.3 * np.sin(np.arange(len(u)) / 7) + (np.arange(len(u)) > 200)
+    x = np.zeros(2)
+    for k in range(len(u)):
+        y[k] += C @ x
+        x = A @ x + np.array([0.4, 0.0]) * wind[k]
+    direction = {"wind": [0.4, 0.0]}
+    assert any(e.kind == "alarm" for e in watching(model, dictionary(model)).run(u, y))
+    found = dictionary(model, process=direction, disturbances=["wind"])
+    monitor = Monitor(model, found, window=60, thresholds=np.full(len(found.labels), 30.0), x0="unknown")
+    assert not [e for e in monitor.run(u, y) if e.kind == "alarm"]
+    y[300:, 1] += 0.5
+    monitor = Monitor(model, found, window=60, thresholds=np.full(len(found.labels), 30.0), x0="unknown")
+    alarms = [e for e in monitor.run(u, y) if e.kind == "alarm"]
+    assert alarms and 300 <= alarms[0].sample < 330
+
+
+def test_a_zero_where_the_function_is_not_known_is_refused_or_said():
+    model, _, _ = controlled()
+    line = Nonlinearity(Linear((-1.0, 1.0)), np.ones(1))
+    curve = Nonlinearity(Polynomial(2, (-1.0, 1.0)), np.array([1.0, 0.1]))
+    refused((StructureError, "zero 3 of u1 lies outside .* Leave the zero out", lambda: dictionary(
+        replace(model, nonlinearities=(curve, curve)), kinds=["loss"], sensors=[], zeros={"u1": 3.0})))
+    with pytest.warns(DataWarning, match="as far as the actuator is linear"):
+        dictionary(replace(model, nonlinearities=(line, line)), kinds=["loss"], sensors=[], zeros={"u1": 3.0})

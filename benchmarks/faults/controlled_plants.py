@@ -23,9 +23,20 @@ SAMPLES, START = 4000, 300
 """Samples of the record of the identification, the start-up of so many included."""
 
 
+WIDER = 1.5
+"""Range of the set-points in the record of the identification, relative to that of operation."""
+
+
 class Failure(NamedTuple):
-    """A fault: "loss" (size: share of the effect), "stuck" (at the input of the onset), "offset" (size: of the input,
-    in its range), or "bias", "drift" (per sample), "frozen" of a sensor (sizes in standard deviations of its noise)."""
+    """A fault.
+
+    Attributes:
+        part: "actuator:NAME" or "sensor:NAME".
+        kind: loss, stuck (where it is at the onset) or offset of an actuator; bias, drift or frozen of a sensor.
+        onset: first sample with it.
+        size: share of the effect lost, offset as a share of the usual effect, bias or slope in standard deviations of
+            the noise.
+    """
 
     part: str
     kind: str
@@ -103,8 +114,8 @@ def _drive(x: np.ndarray, v: np.ndarray, weather: np.ndarray) -> np.ndarray:
 PLANTS = {p.name: p for p in (
     Plant("reactor", ("coolant", "feed"), ("c", "T"), 5.0, (0.6, 45.0), (0.0, 0.0),
           lambda u: (30.0**u - 1) / 29 * [3.0, 3.0], lambda v: np.log1p(29 * v / [3.0, 3.0]) / np.log(30.0), _reactor,
-          (0, 1), ((1, 0, 58.0, 62.0), (0, 1, 0.75, 0.85)), ((-0.02, -0.002), (0.5, 0.03)), (0.75, 0.7), 80, (0.004, 0.1),
-          (0.001, 0.03), 0.0, 2, "polynomial:2"),
+          (0, 1), ((1, 0, 58.0, 62.0), (0, 1, 0.75, 0.85)), ((-0.02, -0.002), (0.5, 0.03)), (0.75, 0.7), 80,
+          (0.004, 0.1), (0.001, 0.03), 0.0, 2, "polynomial:2"),
     Plant("greenhouse", ("heater", "fan"), ("air", "humidity"), 10.0, (12.0, 12.0, 12.0), (0.0, 0.1),
           lambda u: np.stack([np.clip(u[:, 0], 0, 1) ** 1.5 * 3, 1.6 * np.maximum(u[:, 1] - 0.1, 0.0)], axis=1),
           lambda v: np.stack([(v[:, 0] / 3) ** (2 / 3), v[:, 1] / 1.6 + 0.1], axis=1), _greenhouse, (0, 2),
@@ -163,7 +174,7 @@ def simulate(plant: str, samples: int, seed: int, failures: Sequence[Failure | t
         if k >= lead:
             given[:, k - lead], readings[:, k - lead] = u, y
         acting = u.copy()
-        lost = np.zeros((M, m))
+        lost, added = np.zeros((2, M, m))
         for run, several in enumerate(failures):
             for f in _listed(several):
                 if f.part.startswith("actuator") and k - lead >= f.onset:
@@ -172,10 +183,10 @@ def simulate(plant: str, samples: int, seed: int, failures: Sequence[Failure | t
                         held[run, c] = u[run, c] if np.isnan(held[run, c]) else held[run, c]
                         acting[run, c] = held[run, c]
                     elif f.kind == "offset":
-                        acting[run, c] += f.size
+                        added[run, c] = f.size * p.effect(np.array([p.warm]))[0, c]
                     else:
                         lost[run, c] = f.size
-        v = (1 - lost) * p.effect(acting)
+        v = (1 - lost) * p.effect(acting) + added
         weather = np.full(M, season * np.sin(2 * np.pi * (k - lead) / 3000))
         for _ in range(p.steps):
             x = x + p.dt / p.steps * p.flow(x, v, weather)
@@ -205,7 +216,7 @@ def record(plant: str, u: np.ndarray, y: np.ndarray) -> optid.Data:
 @cache
 def identified(plant: str, seed: int = 0) -> tuple[Any, optid.Data]:
     """Identify a plant from a healthy record that begins with its start-up, of which the first samples are left out."""
-    u, y = simulate(plant, SAMPLES, 100 + seed, start=True)
+    u, y = simulate(plant, SAMPLES, 100 + seed, start=True, reach=WIDER)
     data = record(plant, u[0, START:], y[0, START:])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -10,6 +10,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from optid.cli.faults import ZERO
 from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
@@ -33,9 +34,10 @@ KEPT = 10_000  # samples after which the state is saved, events or not
 
 def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: dict[str, Any],
             fill_gaps: int | None = None, strict: bool = False, kinds: Words = None,
-            load: Words = None, state_jump: bool = True, arl0: float | None = None, window: int = 100,
-            identified: Paths = None, healthy: Paths = None, thresholds: File = None, extrapolate: bool = False,
-            seed: int = 0, state: File = None, lines: bool = False) -> None:
+            load: Words = None, disturbance: Words = None, zero: Words = None, state_jump: bool = True,
+            arl0: float | None = None, window: int = 100, identified: Paths = None, healthy: Paths = None,
+            thresholds: File = None, extrapolate: bool = False, seed: int = 0, state: File = None,
+            lines: bool = False) -> None:
     """Monitor a stream of samples: print one line per alarm, isolated fault and end of a fault.
 
     Unreadable rows are reported on the error stream and count as missing samples. A file that is rotated, truncated
@@ -51,6 +53,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         strict: Stop at the first unreadable row.
     The model:
         kinds (-k NAME...): Kinds of faults: bias, loss, stuck, drift, spike. [dim]bias, loss, spike[/]
+        zero (INPUT=VALUE...): Input at which an actuator has no effect; a loss is a share of the distance from it.
+            [dim]unknown[/]
         arl0 (N): Mean number of samples between false alarms (ARL0). [dim]10000, or that of --thresholds[/]
         window (-w N): Length of the window in samples.
         identified (FILE...): The record from which the model was identified; accounts for its uncertainty.
@@ -67,6 +71,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     from optid.data.reading.format import Format
     from optid.data.reading.rows import RowReader
     from optid.errors import DataError
+    from optid.faults import dictionary
+    from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
 
     check_folders(thresholds)
     check_folders(state, writable=False)
@@ -88,10 +94,12 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                 origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
                 if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
                     origin = sound = _identified_from(model)
-                watcher = _new(
-                    plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
-                    window=window, seed=seed, healthy=sound, uncertainty=origin, extrapolate=extrapolate,
-                )
+                found = dictionary(
+                    plant, kinds=words.listed(kinds) or list(KINDS_BY_DEFAULT), state_jump=state_jump,
+                    process=words.directions(load, "--process", plant), disturbances=words.listed(disturbance) or (),
+                    zeros=words.pairs(words.listed(zero), "--zero", ZERO, float))
+                watcher = _new(found, thresholds, arl0=arl0, window=window, seed=seed, healthy=sound,
+                               uncertainty=origin, extrapolate=extrapolate)
                 if sound is None and origin is not None:
                     _doubt(plant, origin)
                 elif sound is None and thresholds is None:
@@ -99,6 +107,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                          "was identified (--identified FILE...) and a later healthy record (--healthy FILE...)")
         for sentence in heard:
             note(sentence)
+        watcher.source = watcher.source or {"model": plant.to_dict()}
         _Watch(watcher, reader, follow, kept, strict=strict, as_json=lines).run(until_end)
 
 
@@ -133,14 +142,11 @@ def _doubt(plant: Any, origin: Any) -> None:
              "later healthy record: --healthy FILE...")
 
 
-def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | None, arl0: float | None, **how: Any
-         ) -> Any:
+def _new(found: Any, path: Path | None, arl0: float | None, **how: Any) -> Any:
     from optid.errors import ModelFileError, StructureError
-    from optid.faults import Calibration, Monitor, dictionary
-    from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
+    from optid.faults import Calibration, Monitor
     from optid.models.files import complete
 
-    found = dictionary(plant, kinds=kinds or list(KINDS_BY_DEFAULT), process=process, state_jump=state_jump)
     if path is not None and path.exists():
         try:
             known = Calibration.from_dict(json.loads(path.read_text(encoding="utf-8")))
@@ -149,8 +155,8 @@ def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | No
         if arl0 is not None and arl0 != known.arl0:
             raise StructureError(f"{path} holds thresholds for a false alarm every {known.arl0:g} samples, --arl0 asks "
                                  f"for {arl0:g}: leave --arl0 out, or name another file")
-        return Monitor(plant, found, thresholds=known, **how)
-    made = Monitor(plant, found, ARL0 if arl0 is None else arl0, **how)
+        return Monitor(found.model, found, thresholds=known, **how)
+    made = Monitor(found.model, found, ARL0 if arl0 is None else arl0, **how)
     if path is not None:
         with complete(path) as part:
             part.write_text(json.dumps(made.calibration.to_dict(), indent=1), encoding="utf-8")
@@ -223,7 +229,7 @@ class _Watch:
 
         self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
         source = watcher.source or {}
-        self.plant = source.get("model") or watcher.dictionary.model.to_dict()
+        self.plant = source["model"]
         self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
         self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
         self.lines: list[str] = []  # of events that are not printed yet

@@ -181,7 +181,7 @@ class Window:
         recent = np.arange(max(done - self.length, 0), done)
         at = (start + recent) % self.length
         self.whitened[at] = r[recent]
-        self.readings[at] = r.shape[1] if matrices is None else shown
+        self.readings[at] = r.shape[1] - self.steady.silent if matrices is None else shown
         self.statistic, self.weight = statistic[-1].copy(), weight[-1].copy()
         return done, statistic, weight
 

@@ -1,5 +1,6 @@
 """The decisions of a monitor: raise an alarm, isolate, carry and clear a fault."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -34,8 +35,12 @@ what a model of a smooth plant lacks grows with the square of the distance, and 
 FEWEST = 4
 """Fewest samples of increased noise."""
 
-WATCHING, NAMING, SETTLING, LOST = range(4)
-"""Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains."""
+WATCHING, NAMING, SETTLING, LOST, UNTRUSTED = range(5)
+"""Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains; the
+plant is where the model was not identified, and the model does not describe it there."""
+
+Excursion = Callable[[int, int], tuple[str, int] | None]
+"""(since, before) -> channel that was far outside its range after `since`, and when it left it, `before` a sample."""
 
 NOTHING, AGAIN = -1, -2
 """No candidate is isolated; no candidate has explained the alarm before."""
@@ -128,11 +133,20 @@ class Decisions:
                               Event("untestable", now + t, label, now + t - window + 1, statistic=float(line[t])))
         return sorted(events, key=lambda e: e.sample)
 
-    def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
+    def judge(self, now: int, window: Window, plant: RunningFilter, excursion: Excursion, *, hold: bool = False
+              ) -> Event | None:
         """Return the event of the last sample; no fault is isolated while a sensor repeats its reading (`hold`)."""
+        if self.phase == UNTRUSTED:
+            if excursion(now - window.length, now + 1) is None:
+                window.restart()
+                return self._clear(now)
+            return None
         gains = np.where(window.peak > 0, window.statistic - self.thresholds, -np.inf)
         best, watching = int(np.argmax(gains)), self.phase == WATCHING
         if self.phase in (WATCHING, LOST) and gains[best] > 0:
+            onset = now - int(window.peak[best]) + 1
+            if left := excursion(onset - window.length, onset):  # a fault drives channels out after its onset only
+                return self._distrust(now, left)
             self.phase, self.alarm = NAMING, now
             return self._event("alarm", now, best, gains, window) if watching else None
         if watching:
@@ -141,7 +155,18 @@ class Decisions:
             return None
         if self.phase == LOST:
             return self._clear(now) if self.quiet >= self.rules["still"] else None
-        return None if hold else self._name(now, best, gains, window, plant)
+        if hold:
+            return None
+        event = self._name(now, best, gains, window, plant)
+        if self.phase == LOST and (left := excursion(self.alarm - window.length, now + 1)):
+            return self._distrust(now, left)  # what no fault explains is an error of the model
+        return event
+
+    def _distrust(self, now: int, left: tuple[str, int]) -> Event:
+        name, since = left
+        self.phase, self.named, self.quiet = UNTRUSTED, NOTHING, 0
+        return Event("untrusted", now, ((name, 1.0),), since,
+                     note="the model does not describe the plant there; no fault is named until it is back")
 
     def _clear(self, now: int) -> Event:
         self.phase, self.named = WATCHING, NOTHING
@@ -209,13 +234,17 @@ class Decisions:
     def _kinds(self, number: int, window: Window) -> dict[str, float]:
         """Return {label: likelihood} of the group of a candidate."""
         logs: dict[str, float] = {}
-        for c in self.group(number):
-            if not window.peak[c]:
-                continue
-            sizes, covariance, _ = window.estimate(c)
-            for label, log in self._evidence(c, sizes, covariance).items():
-                logs[label] = max(log, logs.get(label, -np.inf))
+        here = self.group(number)
+        family = [c for c in here if has_constants(self.columns.candidates[c]) and window.peak[c]]
+        for c in here:
+            if window.peak[c] and (c in family or not (family and self.columns.candidates[c].kind == "bias")):
+                sizes, covariance, _ = window.estimate(c)
+                for label, log in self._evidence(c, sizes, covariance).items():
+                    logs[label] = max(log, logs.get(label, -np.inf))
         most = max(logs.values())
+        for c in here:  # too few samples for a share: it may be anything
+            if not window.peak[c]:
+                logs[self.labels[c]] = most
         return {label: float(np.exp(log - most)) for label, log in logs.items()}
 
     def _evidence(self, number: int, sizes: Array, covariance: Array) -> dict[str, float]:
@@ -313,13 +342,13 @@ class Decisions:
     def _revise(self, now: int, owner: int, sizes: Array, covariance: Array) -> Event | None:
         """Return the event of a carried actuator whose kind has become clearer."""
         for one in self.undecided:
-            if one[0] != owner or len(one[1]) < 2:
+            if one[0] != owner:
                 continue
             logs = self._evidence(owner, sizes, covariance)
             most = max(logs.values())
             said = likeliest({label: float(np.exp(log - most)) for label, log in logs.items()})
             labels = [label for label, _ in said]
-            if set(labels) < set(one[1]) or said[0][1] >= self.rules["certainty"]:
+            if set(labels) < set(one[1]) or (said[0][1] >= self.rules["certainty"] and labels != one[1]):
                 one[1] = labels
                 return Event("revised", now, said, size=self.columns.in_order(owner, sizes))
         return None

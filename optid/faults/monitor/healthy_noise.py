@@ -76,6 +76,8 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     innovations are states beside those of the plant.
     """
     steady = found.predictor
+    if steady.silent:  # the innovations along declared disturbances are not judged; thresholds are raised instead
+        return found, ""
     whole: list[Any] = as_list(whiten(found.model, healthy, scale=steady))
     parts = [replace(part, present=part.present & ~unsure_since(found.model, record.u, steady.settling)[:, None])
              for part, record in zip(whole, healthy.raw().experiments)]

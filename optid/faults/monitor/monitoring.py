@@ -94,7 +94,7 @@ class Monitor:
                 a model whose parameters are not the most likely ones.
         """
         found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
-        if found.model is not model:
+        if not found.belongs_to(model):
             raise StructureError("faults: the dictionary belongs to another model; build it from this one.")
         least = 2 * model.nx + 2
         if isinstance(window, bool) or int(window) != window or window < least:
@@ -104,7 +104,9 @@ class Monitor:
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
         effect, inputs, known, remarks = None, None, uncertainty, []
         if known is not None:
-            known = known if isinstance(known, ModelUncertainty) else model_uncertainty(model, known)
+            silent = found.predictor if found.predictor.silent else None
+            known = known if isinstance(known, ModelUncertainty) else model_uncertainty(found.model, known,
+                                                                                        decoupled=silent)
             found = replace(found, predictor=known.predictor)
             remarks.append(known.remark)
         if healthy is not None:
@@ -116,7 +118,8 @@ class Monitor:
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
         rules = {**RULES, **({"beyond": 1.0} if known is None else {}), **rules}  # an exact model has no errors
-        self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}))
+        self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}),
+                  None if known is None else known.levels)
         for c in found.candidates:
             if c.label in self.skipped and c.kind != "loss":  # the gains of sensors are among the kinds by default
                 warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
@@ -133,7 +136,8 @@ class Monitor:
         elif not (isinstance(x0, str) and x0 == "zero"):
             self.plant.x[:] = state_like(x0, (model.nx,))
 
-    def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float]) -> None:
+    def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float],
+             levels: Array | None = None) -> None:
         """Set up everything but the thresholds."""
         self.dictionary, self.window, self.seed, self.source = found, window, seed, None
         chosen = searched([c for c in found.candidates if c.kind in COURSES and (c.kind != "loss" or c.columns)])
@@ -152,7 +156,7 @@ class Monitor:
         self.columns = columns_of(model, chosen)
         self.search = Window(self.columns, window, model.nx + SPARE + 2 * int(self.columns.size.max()), steady)
         self.plant = RunningFilter(model, steady, self.columns)
-        self.checks = ReadingChecks(model)
+        self.checks = ReadingChecks(model, levels)
         self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), np.ones(len(chosen)), rules,
                                    model.outputs, np.ones(len(chosen), dtype=bool), [], found.candidates)
         self.samples = 0
@@ -277,7 +281,7 @@ class Monitor:
         plant.x, plant.before = x[done].copy(), f[done - 1].copy()
         self.samples += done
         decisions.count_quiet(statistic)
-        last = decisions.judge(self.samples - 1, self.search, plant, hold=False)
+        last = decisions.judge(self.samples - 1, self.search, plant, self.checks.excursion)
         events += decisions.excitation(weight if last is None else weight[:-1], now, self.window)
         events += [] if last is None else [last]
         return done
@@ -300,7 +304,7 @@ class Monitor:
             decisions.begun = now + 1
         decisions.count_quiet(statistic)
         watching = decisions.phase == WATCHING
-        event = decisions.judge(now, self.search, plant, hold=repeating)
+        event = decisions.judge(now, self.search, plant, self.checks.excursion, hold=repeating)
         if event is not None:
             events.append(event)
         elif watching and decisions.phase == WATCHING:
