@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 from controlled_plants import PLANTS, Failure, identified, record, simulate
 
-from optid.faults import Monitor, diagnose, dictionary, model_uncertainty
+from optid.faults import Monitor, diagnose, dictionary, model_uncertainty, reformulate
+from optid.faults.repair.promise import errors, rms
 
 ONSET, SOON, LATE, ARL0 = 300, 60, 200, 10_000
 KINDS = "bias", "loss", "stuck", "spike"
@@ -124,7 +125,46 @@ def sizes(plant: str, runs: int) -> None:
                   f"{np.mean(widths) if widths else np.nan:.2f}; monitor {late} of {carried}", flush=True)
 
 
-FIGURES: dict[str, Callable[[str, int], None]] = {"kinds": kinds, "parts": parts, "alarms": alarms, "sizes": sizes}
+def repairs(plant: str, runs: int) -> None:
+    fit, data = identified(plant)
+    found, known = dictionary(fit.model, kinds=KINDS), model_uncertainty(fit.model, data)
+    said: Counter[str] = Counter()
+    kept = bounds = worse = 0
+    for name in PLANTS[plant].inputs:
+        cases = [Failure(f"actuator:{name}", *BROKEN[r % len(BROKEN)]) for r in range(runs)]
+        broken = simulate(plant, ONSET + LATE, 5000, cases)
+        c = PLANTS[plant].inputs.index(name)
+        same = [case._replace(onset=0, size=u[ONSET, c] if case.kind == "stuck" else case.size)
+                for case, u in zip(cases, broken[0])]
+        later = simulate(plant, LATE + 100, 6000, same)
+        for case, u, y, u_later, y_later in zip(cases, *broken, *later):
+            answer = diagnose(fit.model, record(plant, u, y), found, model_uncertainty=known)
+            if not answer.candidates:
+                said[answer.verdict] += 1
+                continue
+            repair = reformulate(fit.model, answer, record(plant, u[: answer.window], y[: answer.window]))
+            said[repair.status] += 1
+            if repair.status != "refitted":
+                continue
+            fresh = record(plant, u_later[100:], y_later[100:])
+            bound = np.array(list(repair.error_bound.values()))
+            got, usual = rms(errors(repair.model, fresh)), rms(errors(fit.model, fresh))
+            scale = np.array(PLANTS[plant].noise)
+            lost = np.linalg.norm(got / scale) > np.linalg.norm(usual / scale)
+            worse += lost
+            if np.isfinite(bound).all():
+                bounds += 1
+                kept += bool(np.all(got <= bound))
+            if lost or not np.all(got <= bound):
+                print(f"    {case.part} {case.kind} {case.size:g}: rms {got.round(3)}, bound {bound.round(3)}, "
+                      f"unrepaired {usual.round(3)}; {repair.members[0].label}")
+    print(f"repairs {plant}: bound kept {kept} of {bounds}, worse than unrepaired {worse}; {dict(said)}", flush=True)
+
+
+BROKEN = ("loss", ONSET, 0.1), ("loss", ONSET, 0.2), ("stuck", ONSET, 0.0), ("offset", ONSET, 0.1), (
+    "offset", ONSET, -0.1)
+FIGURES: dict[str, Callable[[str, int], None]] = {"kinds": kinds, "parts": parts, "alarms": alarms, "sizes": sizes,
+                                                       "repairs": repairs}
 
 
 def main() -> None:

@@ -32,7 +32,7 @@ class Failure(NamedTuple):
 
     Attributes:
         part: "actuator:NAME" or "sensor:NAME".
-        kind: loss, stuck (where it is at the onset) or offset of an actuator; bias, drift or frozen of a sensor.
+        kind: loss, stuck (at the size, or where it is at the onset) or offset of an actuator; bias, drift or frozen of a sensor.
         onset: first sample with it.
         size: share of the effect lost, offset as a share of the usual effect, bias or slope in standard deviations of
             the noise.
@@ -180,7 +180,7 @@ def simulate(plant: str, samples: int, seed: int, failures: Sequence[Failure | t
                 if f.part.startswith("actuator") and k - lead >= f.onset:
                     c = p.inputs.index(f.part.partition(":")[2])
                     if f.kind == "stuck":
-                        held[run, c] = u[run, c] if np.isnan(held[run, c]) else held[run, c]
+                        held[run, c] = (f.size or u[run, c]) if np.isnan(held[run, c]) else held[run, c]
                         acting[run, c] = held[run, c]
                     elif f.kind == "offset":
                         added[run, c] = f.size * p.effect(np.array([p.warm]))[0, c]

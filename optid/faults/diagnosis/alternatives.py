@@ -4,10 +4,10 @@ A broken actuator contributes (1 - gamma) f(u) + c. It is *stuck* where gamma = 
 0 < gamma < 1; c is free unless the input without effect is known, because an identified f is known up to a constant
 only. The probability of gamma = 1 relative to all other shares (Savage-Dickey ratio) decides between them.
 
-A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary (nor is one that
-drifts). It competes with all entries: a fault has to explain the record as well as the best direction does, given its
-number of magnitudes. What an actuator adds to the states alone, a leak at the same place does, too: no record isolates
-them, and the leak has the prior of what is not listed.
+A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary, nor is one
+that drifts. It competes with all entries: a fault has to explain the record as well as the best direction does, given
+its number of magnitudes. What an actuator adds to the states alone, a leak at the same place does, too: no record
+isolates them, and the leak has the prior of what is not listed.
 """
 
 from collections.abc import Sequence
