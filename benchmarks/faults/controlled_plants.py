@@ -32,7 +32,8 @@ class Failure(NamedTuple):
 
     Attributes:
         part: "actuator:NAME" or "sensor:NAME".
-        kind: loss, stuck (at the size, or where it is at the onset) or offset of an actuator; bias, drift or frozen of a sensor.
+        kind: loss, stuck (at the size, or where it is at the onset) or offset of an actuator; bias, drift or frozen of
+            a sensor.
         onset: first sample with it.
         size: share of the effect lost, offset as a share of the usual effect, bias or slope in standard deviations of
             the noise.

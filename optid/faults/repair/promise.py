@@ -6,8 +6,9 @@ repair removes, that of the repair on samples after the fault that it did not se
     bound^2 = max(healthy, held out)^2 + spread^2
 
 Errors are those of the free run, in units of the outputs; of one-step predictions where a plant is not stable. A mean
-square of correlated errors is worth as many independent ones as the squares of their correlations leave (M. S. Bartlett,
-J. R. Stat. Soc. 8, 1946). That of a later run as long varies as much: the limit of their ratio, of the F law, counts.
+square of correlated errors is worth as many independent ones as the squares of their correlations leave (M. S.
+Bartlett, J. R. Stat. Soc. 8, 1946). That of a later run as long varies as much: the limit of their ratio, of the F law,
+counts.
 """
 
 from dataclasses import dataclass
