@@ -149,3 +149,55 @@ def test_a_zero_where_the_function_is_not_known_is_refused_or_said():
         replace(model, nonlinearities=(curve, curve)), kinds=["loss"], sensors=[], zeros={"u1": 3.0})))
     with pytest.warns(DataWarning, match="as far as the actuator is linear"):
         dictionary(replace(model, nonlinearities=(line, line)), kinds=["loss"], sensors=[], zeros={"u1": 3.0})
+
+
+def test_what_operators_do_to_a_monitor(tmp_path):
+    model, u, y = controlled(count=600, onset=10_000)
+    y[200:, 1] += 0.5
+    found = dictionary(model)
+    monitor = watching(model, found)
+    monitor.run(u[:205], y[:205])
+    assert monitor.alarmed
+    monitor.acknowledge()
+    assert not monitor.alarmed and monitor.samples == 205
+    monitor = watching(model, found)
+    monitor.run(u[:300], y[:300])
+    assert [c.label for c in monitor.carried] == ["sensor:y2"]
+    restored = Monitor.load(monitor.save(tmp_path / "m.npz"))
+    for one in (monitor, restored):
+        one.rebase()  # the sensor was exchanged
+        y[300:, 1] -= 0.5 * (one is monitor)
+        assert one.carried == () and not [e for e in one.run(u[300:400], y[300:400]) if e.kind == "alarm"]
+        one.skip(100)
+        assert one.samples == 500 and not one.run(u[500:], y[500:])
+
+
+def test_a_slow_disturbance_is_followed_and_a_fault_is_still_found():
+    model, u, y = controlled(count=4000, onset=10_000)
+    y += 0.5 * np.sin(2 * np.pi * np.arange(4000) / 2000)[:, None]
+    plain, slow = (Monitor(model, dictionary(model), arl0=20_000, window=60, drift=drift) for drift in (None, 2000.0))
+    assert any(e.kind == "alarm" for e in plain.run(u[:3000], y[:3000]))
+    assert not [e for e in slow.run(u[:3000], y[:3000]) if e.kind == "alarm"]
+    y[3000:, 0] += 0.3
+    alarms = [e for e in slow.run(u[3000:], y[3000:]) if e.kind == "alarm"]
+    assert alarms and alarms[0].sample < 3030 and alarms[0].candidates[0][0] == "sensor:y1"
+    refused((StructureError, "600 samples at least", lambda: Monitor(model, dictionary(model), drift=100.0)))
+
+
+def test_thresholds_adapt_to_colour_with_a_price_and_alike_by_steps_and_blocks():
+    model, u, y = controlled(count=6000, onset=10_000)
+    rng, noise = np.random.default_rng(3), np.zeros(2)
+    for k in range(len(y)):
+        noise = 0.9 * noise + 0.012 * rng.standard_normal(2)
+        y[k] += noise
+    found, alarms = dictionary(model), []
+    base = Monitor(model, found, arl0=10_000, window=60)
+    for most in (1.0, 5.0):
+        monitor = Monitor(model, found, window=60, thresholds=base.calibration, adapt=most)
+        events = monitor.run(u, y)
+        alarms.append(sum(e.kind == "alarm" for e in events))
+    assert alarms[1] < alarms[0] / 2
+    assert "times as large" in next(e.note for e in events if e.kind == "adapted")
+    steps = Monitor(model, found, window=60, thresholds=base.calibration, adapt=5.0)
+    assert [e for k in range(0, 2000, 7) for e in steps.run(u[k : k + 7], y[k : k + 7])] == [
+        e for e in events if e.sample < steps.samples]

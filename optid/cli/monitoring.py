@@ -23,6 +23,8 @@ LOUD = 20  # unreadable rows reported individually per block read; the others ar
 ARL0 = 10_000
 """Default mean number of samples between false alarms."""
 
+HOUR = 3600.0  # seconds
+
 REMEMBERED = 1000  # samples whose time stamps are kept, for the time of an onset
 
 Part = tuple[list[bytes], str]  # lines, and a remark where another file begins
@@ -36,7 +38,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
             fill_gaps: int | None = None, strict: bool = False, kinds: Words = None,
             load: Words = None, disturbance: Words = None, zero: Words = None, state_jump: bool = True,
             arl0: float | None = None, window: int = 100, identified: Paths = None, healthy: Paths = None,
-            thresholds: File = None, extrapolate: bool = False, seed: int = 0, state: File = None,
+            thresholds: File = None, extrapolate: bool = False, drift: float | None = None, adapt: float = 1.0,
+            ack: bool = False, rebase: bool = False, maintenance: bool = False, seed: int = 0, state: File = None,
             lines: bool = False) -> None:
     """Monitor a stream of samples: print one line per alarm, isolated fault and end of a fault.
 
@@ -61,7 +64,13 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         healthy (FILE...): A later healthy record, from which noise and thresholds are calibrated.
         thresholds (FILE): Read the thresholds from this file (.json), or write them if it does not exist.
         extrapolate: Allow thresholds extrapolated beyond the simulated run lengths.
+        drift (HOURS): Follow disturbances that change over so many hours, such as a season; slower faults stay hidden.
+        adapt (FACTOR): Multiply the thresholds by this factor at most where the noise has another colour.
         seed: Seed of the simulated thresholds.
+    The operator (the state of a stopped monitor):
+        ack: Acknowledge the alarm: discard it and go on.
+        rebase: Take a new baseline after a repair: discard the alarm and all carried faults.
+        maintenance: Count the rows without a search.
     The result:
         state (FILE): Resume from this state (.npz) if it exists, and save the state to it.
         lines (--json): Print one JSON object per line.
@@ -74,6 +83,9 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     from optid.faults import dictionary
     from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
 
+    if (ack or rebase or maintenance) and (state is None or not state.is_file()):
+        raise DataError("--ack, --rebase and --maintenance go on from the state of a stopped monitor: name it with "
+                        "--state FILE")
     check_folders(thresholds)
     check_folders(state, writable=False)
     with nullcontext() if state is None else StateFile(state) as kept:
@@ -89,6 +101,10 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                                label="standard input" if follow is None else follow.name)
             if kept is not None and not kept.is_empty:
                 watcher = _resumed(kept.path, plant, model)
+                if rebase:
+                    watcher.rebase()
+                elif ack:
+                    watcher.acknowledge()
             else:
                 waiting.step("simulating healthy plants for the thresholds")
                 origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
@@ -99,7 +115,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                     process=words.directions(load, "--process", plant), disturbances=words.listed(disturbance) or (),
                     zeros=words.pairs(words.listed(zero), "--zero", ZERO, float))
                 watcher = _new(found, thresholds, arl0=arl0, window=window, seed=seed, healthy=sound,
-                               uncertainty=origin, extrapolate=extrapolate)
+                               uncertainty=origin, extrapolate=extrapolate, adapt=adapt,
+                               drift=None if drift is None else drift * HOUR / plant.dt)
                 if sound is None and origin is not None:
                     _doubt(plant, origin)
                 elif sound is None and thresholds is None:
@@ -108,7 +125,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         for sentence in heard:
             note(sentence)
         watcher.source = watcher.source or {"model": plant.to_dict()}
-        _Watch(watcher, reader, follow, kept, strict=strict, as_json=lines).run(until_end)
+        _Watch(watcher, reader, follow, kept, strict=strict, as_json=lines, skips=maintenance).run(until_end)
 
 
 def _identified_from(path: Path) -> Any:
@@ -223,12 +240,12 @@ class _Watch:
     """
 
     def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: "StateFile | None", *, strict: bool,
-                 as_json: bool) -> None:
+                 as_json: bool, skips: bool = False) -> None:
         from optid.cli.following import Followed
         from optid.errors import DataError
 
         self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
-        source = watcher.source or {}
+        self.skips, source = skips, watcher.source or {}
         self.plant = source["model"]
         self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
         self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
@@ -283,7 +300,9 @@ class _Watch:
             _note(text)
         self.bad += len({number for number, _ in rows.bad})
         self._remember(first, rows.stamps)
-        events = self.watcher.run(rows.u, rows.y)
+        if self.skips:
+            self.watcher.skip(len(rows.u))
+        events = [] if self.skips else self.watcher.run(rows.u, rows.y)
         for event in events:
             self._tell(event, int(rows.lines[event.sample - first]))
         if self.file is not None:  # a line that ends the stream is the first to be read when it is resumed

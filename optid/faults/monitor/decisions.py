@@ -9,15 +9,17 @@ import numpy as np
 
 from optid.arrays import Array
 from optid.faults.monitor.actuator_kinds import groups_of, has_constants, kinds, likeliest
+from optid.faults.monitor.arl import COMMON
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT
+from optid.faults.nuisance import CONFIDENCE
 from optid.faults.signatures import Candidate
 
 RULES = {
     "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
-    "forgiven": 0.3, "odd": 4.3, "beyond": 2.0,
+    "forgiven": 0.3, "odd": 4.3, "beyond": 2.0, "adapt": 1.0,
 }
 """Numbers of the decisions.
 
@@ -27,6 +29,10 @@ A transient ends when its energy falls to `faded`. A carried fault is no longer 
 the energy `learned` in a window, and is cleared when its significance falls below the share `forgiven` of the
 threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
 
+Where more windows than a tenth reach the energies that a tenth of the simulated ones reach, the noise has another
+colour than that of the calibration: the thresholds are then multiplied by the ratio of these energies, by `adapt` at
+most.
+
 While an input was outside its identified range in the last window, the thresholds of an uncertain model are multiplied
 by the fourth power of its distance from the middle of the range, relative to half the range, and by `beyond` at most:
 what a model of a smooth plant lacks grows with the square of the distance, and its energy with the fourth power.
@@ -34,6 +40,9 @@ what a model of a smooth plant lacks grows with the square of the distance, and 
 
 FEWEST = 4
 """Fewest samples of increased noise."""
+
+WINDOWS, CHANGED = 40, 0.2
+"""Windows from which the colour of the noise is taken, and the least change, of the logarithm, of the thresholds."""
 
 WATCHING, NAMING, SETTLING, LOST, UNTRUSTED = range(5)
 """Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains; the
@@ -72,7 +81,13 @@ class Decisions:
     told: list[str] = field(default_factory=list)  # labels of the last isolated fault
     kept: list[Array] | None = None  # the statistics (T, C) of all samples, where they are requested
 
-    KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing", "undecided", "told"
+    common: float = float("nan")  # energy over its threshold that a tenth of the simulated windows reach
+    highest: float = 0.0  # energy over its threshold since the last multiple of the window
+    windows: list[float] = field(default_factory=list)  # those of the last windows
+    adapted: float = 1.0  # factor of the thresholds for the colour of the noise
+
+    KEPT = ("phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing", "undecided", "told",
+            "highest", "windows", "adapted")
 
     @cached_property
     def groups(self) -> tuple[int, ...]:
@@ -86,7 +101,7 @@ class Decisions:
     @property
     def thresholds(self) -> Array:
         """(C,) thresholds at this sample."""
-        return self.q * (self.raised[0][1] if self.raised else 1.0)
+        return self.q * (self.raised[0][1] if self.raised else 1.0) * self.adapted
 
     @property
     def limit(self) -> Array:
@@ -114,8 +129,26 @@ class Decisions:
         """Count the samples at the end of a block with all statistics (T, C) below the release level."""
         loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.thresholds, axis=1))
         self.quiet = self.quiet + len(statistic) if not loud.size else len(statistic) - 1 - int(loud[-1])
+        self.highest = max(self.highest, float(np.max(statistic / self.q)))
         if self.kept is not None:
             self.kept.append(statistic)
+
+    def adapt(self, now: int) -> list[Event]:
+        """Adapt the thresholds to the colour of the noise at the end of a window; return what has changed."""
+        from scipy.special import bdtrik
+
+        if self.phase == WATCHING or self.highest > 1:
+            self.windows = [*self.windows, self.highest][-WINDOWS:]
+        self.highest, found, before = 0.0, np.array(self.windows), self.adapted
+        factor = 1.0
+        if len(found) >= WINDOWS // 2 and np.sum(found > self.common) > bdtrik(CONFIDENCE, len(found), COMMON):
+            factor = float(np.clip(np.quantile(found, 1 - COMMON) / self.common, 1.0, self.rules["adapt"]))
+        if abs(np.log(factor / before)) < CHANGED:
+            return []
+        self.adapted = factor
+        note = (f"thresholds times {factor:.2f} for the colour of the noise: a fault must be {np.sqrt(factor):.2f} "
+                f"times as large, or is found about {factor:.1f} times as late")
+        return [Event("adapted", now, note=note)]
 
     def excitation(self, weight: Array, now: int, window: int) -> list[Event]:
         """Return the events "testable" and "untestable" of weights (T, C) of samples from `now` on."""

@@ -76,7 +76,7 @@ def load(monitor: "Monitor", path: str | Path, functions: dict[str, Any] | None 
         monitor.plant.certain = head["certain"]
         monitor.plant.directions = [Direction(**one) for one in head["directions"]]
         monitor.checks.memory = head["readings"]
-        monitor.decisions.q, monitor.decisions.spreads = monitor.calibration.q, monitor.calibration.spreads
+        monitor._use(monitor.calibration)
         monitor.decisions.testable = np.array(head["decisions"]["testable"], dtype=bool)
         for name in Decisions.KEPT:
             setattr(monitor.decisions, name, head["decisions"][name])

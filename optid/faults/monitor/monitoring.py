@@ -18,7 +18,7 @@ from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
-from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect
+from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect, without_drift
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT, expand
@@ -63,7 +63,7 @@ class Monitor:
         self, model: "HammersteinSS", faults: Dictionary | None = None, arl0: float = 10_000, window: int = 100,
         seed: int | None = 0, thresholds: Any = None, *, x0: Any = "unknown", healthy: Data | None = None,
         uncertainty: Data | ModelUncertainty | None = None, u: ArrayLike | None = None, samples: int | None = None,
-        extrapolate: bool = False, **rules: float,
+        extrapolate: bool = False, drift: float | None = None, **rules: float,
     ) -> None:
         """Set up a monitor; the thresholds are simulated unless they are known.
 
@@ -83,6 +83,8 @@ class Monitor:
                 the intervals of the nonlinearities by default.
             samples: length of the simulation.
             extrapolate: whether thresholds may be extrapolated beyond what the simulation supports.
+            drift: samples over which slow disturbances that are no faults change, such as those of a season; a fault
+                that grows as slowly is not found.
             rules: numbers of the decisions, see `RULES`.
 
         Raises:
@@ -109,6 +111,8 @@ class Monitor:
                                                                                         decoupled=silent)
             found = replace(found, predictor=known.predictor)
             remarks.append(known.remark)
+        if drift is not None:
+            found = without_drift(found, drift)
         if healthy is not None:
             found, remark = observed(found, healthy)
             remarks.append(remark)
@@ -130,7 +134,7 @@ class Monitor:
             self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
                 self.calibration = calibrated_on(self, healthy, self.calibration)
-        self.decisions.q, self.decisions.spreads = self.calibration.q, self.calibration.spreads
+        self._use(self.calibration)
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
         elif not (isinstance(x0, str) and x0 == "zero"):
@@ -162,6 +166,14 @@ class Monitor:
         self.samples = 0
         self._functions = tabulated(model.nonlinearities)
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
+
+    def _use(self, found: Calibration) -> None:
+        """Decide by a calibration."""
+        self.calibration, own = found, self.decisions
+        own.q, own.spreads, own.common = found.q, found.spreads, found.common
+        if own.rules["adapt"] > 1 and not np.isfinite(found.common):
+            raise StructureError("adapt: thresholds that are given have no simulated windows to compare with; leave "
+                                 "either out.")
 
     def _simulated(self, f: Array, effect: Array | None, arl0: float, **how: Any) -> Calibration:
         c = self.columns
@@ -261,14 +273,19 @@ class Monitor:
             clean = int(stops[np.searchsorted(stops, k)])
             if self.decisions.raised:  # the thresholds stay the same up to here
                 clean = min(clean, k + int(self.decisions.raised[0][0]) + self.window + 1 - self.samples)
+            adapts = self.decisions.rules["adapt"] > 1
+            if adapts:  # at multiples of the window
+                clean = min(clean, k + self.window - self.samples % self.window)
             if clean > k and self.plant.certain and self.decisions.waiting:
                 k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
+                events += self._adapt() if adapts else []
                 continue
             if k in screened.frozen:
                 self._excuse(screened.frozen[k])
             if screened.distance[k] > 1:
                 self.decisions.leave_range(self.samples, float(screened.distance[k]))
             self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
+            events += self._adapt() if adapts else []
             k += 1
         return sorted(events, key=lambda e: e.sample)
 
@@ -309,6 +326,29 @@ class Monitor:
             events.append(event)
         elif watching and decisions.phase == WATCHING:
             events += decisions.excitation(weight, now, self.window)
+
+    def _adapt(self) -> list[Event]:
+        return [] if self.samples % self.window else self.decisions.adapt(self.samples - 1)
+
+    # -- operators -------------------------------------------------------------------------------------------------
+
+    def acknowledge(self) -> None:
+        """Discard the alarm, and search again from the next sample on."""
+        self.decisions.forgive(self.search)
+
+    def rebase(self) -> None:
+        """Take a new baseline, after a repair: discard the alarm and all carried faults."""
+        plant = self.plant
+        plant.release(list(range(len(plant.directions))), slice(0, len(plant.held)), self.search)
+        self.decisions.passing, self.decisions.undecided, self.decisions.windows = [], [], []
+        self.acknowledge()
+        plant.lose()
+
+    def skip(self, count: int) -> None:
+        """Count samples without a search, during maintenance; the state of the plant is unknown after them."""
+        self.samples += count
+        self.acknowledge()
+        self.plant.lose()
 
     def _excuse(self, onset: int) -> None:
         """Discard the effects of a sensor that has been found frozen."""
