@@ -7,7 +7,8 @@ only. The probability of gamma = 1 relative to all other shares (Savage-Dickey r
 A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary, nor is one
 that drifts. It competes with all entries: a fault has to explain the record as well as the best direction does, given
 its number of magnitudes. What an actuator adds to the states alone, a leak at the same place does, too: no record
-isolates them, and the leak has the prior of what is not listed.
+isolates them, and the leak has the prior of what is not listed. Where directions of the process are declared, the leaks
+are among them: then neither one that drifts nor one beside an actuator is added.
 """
 
 from collections.abc import Sequence
@@ -49,10 +50,16 @@ def extended(found: Dictionary) -> Dictionary | None:
     ]
     known = found.model.l > 1 or any(c.kind != "frozen" for c in found.candidates)
     if found.unknown and known and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
-        kinds = ["bias", *(["drift"] if any(c.kind == "drift" for c in found.candidates) else [])]
+        drifts = any(c.kind == "drift" for c in found.candidates) and not declares_process(found)
+        kinds = ["bias", *(["drift"] if drifts else [])]
         more += [candidate_of(found.model, UNKNOWN_DIRECTION, kind) for kind in kinds]
     sines = np.full((len(more), len(more)), np.nan)
     return replace(found, candidates=tuple(more), excluded={}, sines=sines) if more else None
+
+
+def declares_process(found: Dictionary) -> bool:
+    """Whether a dictionary has directions of the process."""
+    return any(c.name.startswith(f"{UNKNOWN_DIRECTION}:") for c in found.candidates)
 
 
 def same_at_process(found: Explanation) -> list[Explanation]:

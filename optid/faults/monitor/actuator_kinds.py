@@ -36,8 +36,13 @@ def searched(candidates: Sequence[Candidate]) -> tuple[Candidate, ...]:
 def groups_of(candidates: Sequence[Candidate]) -> tuple[int, ...]:
     """Return the number of the first candidate of the group of each."""
     first: dict[str, int] = {}
-    return tuple(first.setdefault(c.name, i) if c.name.startswith("actuator:") and c.kind in GROUPED else i
+    return tuple(first.setdefault(c.name, i) if c.name.startswith("actuator:") and is_grouped(c) else i
                  for i, c in enumerate(candidates))
+
+
+def is_grouped(candidate: Candidate) -> bool:
+    """Whether the kind of a candidate is decided by likelihood."""
+    return candidate.kind in GROUPED
 
 
 def kinds(candidate: Candidate, sizes: Array, covariance: Array, listed: Sequence[Candidate]) -> dict[str, float]:
@@ -52,7 +57,7 @@ def kinds(candidate: Candidate, sizes: Array, covariance: Array, listed: Sequenc
         listed: the candidates of the dictionary.
     """
     energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
-    if candidate.kind == "bias":
+    if candidate.additive:
         return {candidate.label: float(marginal(np.array([energy]), sizes.size)[0])}
     share, variance = float(sizes[0]), max(float(covariance[0, 0]), EXACT)
     offset = float(marginal(np.array([energy - share**2 / variance]), sizes.size - 1)[0])

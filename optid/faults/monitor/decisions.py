@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from optid.arrays import Array
-from optid.faults.monitor.actuator_kinds import groups_of, has_constants, kinds, likeliest
+from optid.faults.monitor.actuator_kinds import groups_of, has_constants, is_grouped, kinds, likeliest
 from optid.faults.monitor.arl import COMMON
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
@@ -254,7 +254,7 @@ class Decisions:
         if labels != [label for label in self.told if label in weights]:
             event = self._told("revised", now, said, chosen, window)
         family = [c for c in self.group(chosen) if has_constants(self.columns.candidates[c]) and window.peak[c]]
-        if family and (len(labels) > 1 or self.columns.candidates[chosen].kind != "bias"):
+        if family and (len(labels) > 1 or not self.columns.candidates[chosen].additive):
             chosen = family[0]
             self.undecided = [one for one in self.undecided if one[0] != chosen] + [[chosen, labels]]
         plant.room(2 * int(self.columns.size.max()))
@@ -270,7 +270,7 @@ class Decisions:
         here = self.group(number)
         family = [c for c in here if has_constants(self.columns.candidates[c]) and window.peak[c]]
         for c in here:
-            if window.peak[c] and (c in family or not (family and self.columns.candidates[c].kind == "bias")):
+            if window.peak[c] and (c in family or not (family and self.columns.candidates[c].additive)):
                 sizes, covariance, _ = window.estimate(c)
                 for label, log in self._evidence(c, sizes, covariance).items():
                     logs[label] = max(log, logs.get(label, -np.inf))
@@ -283,7 +283,7 @@ class Decisions:
     def _evidence(self, number: int, sizes: Array, covariance: Array) -> dict[str, float]:
         """Return {label: logarithm of the likelihood} of an estimate in the order of the columns."""
         candidate = self.columns.candidates[number]
-        if candidate.kind not in ("bias", "loss", "stuck"):
+        if not is_grouped(candidate):
             return {self.labels[number]: 0.0}
         first = int(has_constants(candidate))
         turned = np.roll(covariance, (first, first), axis=(0, 1))
@@ -336,8 +336,8 @@ class Decisions:
         own = [c for c in self.group(best) if window.peak[c]]
         family = [c for c in own if has_constants(self.columns.candidates[c])]
         same = [c for c in own if self.labels[c] == said[0][0]]
-        number = (same or [best])[0] if not family or (same and self.columns.candidates[same[0]].kind == "bias") else (
-            family[0])
+        is_offset = bool(same) and self.columns.candidates[same[0]].additive
+        number = family[0] if family and not is_offset else (same or [best])[0]
         sizes, _, _ = window.estimate(number)
         return Event(kind, now, said, now - int(window.peak[number]) + 1, self.columns.in_order(number, sizes),
                      float(window.statistic[number]), note)
