@@ -49,9 +49,14 @@ class ReadingChecks:
             self.low[c], self.high[c] = max(self.low[c], low), min(self.high[c], high)
             self._lowest[c], self._highest[c] = max(self._lowest[c], lowest), min(self._highest[c], highest)
         self.sensors, self._outside = SensorChecks(l), [-1] * m
-        self.levels, self.excursions = levels, []
+        self.excursions: list[Any] = []
+        self._use(levels)
+
+    def _use(self, levels: Array | None) -> None:
+        """Take the ranges of inputs and outputs beyond which a channel is far outside."""
+        l = self.model.l  # noqa: E741
         low, high = np.full((2, l), np.inf) * [[-1.0], [1.0]] if levels is None else levels
-        ends = [_widened(self.low, self.high), _widened(low, high)]
+        ends, self.levels = [_widened(self.low, self.high), _widened(low, high)], levels
         self._least = np.concatenate([np.fmin(ends[0][0], self._lowest), ends[1][0]])
         self._most = np.concatenate([np.fmax(ends[0][1], self._highest), ends[1][1]])
 
@@ -63,7 +68,7 @@ class ReadingChecks:
 
     @memory.setter
     def memory(self, kept: dict[str, Any]) -> None:
-        self.__init__(self.model, None if kept["levels"] is None else np.array(kept["levels"]))  # type: ignore[misc]
+        self._use(None if kept["levels"] is None else np.array(kept["levels"]))
         self.sensors.memory, self._outside = {word: kept[word] for word in self.sensors.memory}, kept["outside"]
         self.excursions = kept["excursions"]
 
