@@ -571,8 +571,7 @@ def test_printing_drawing_and_the_page(healthy, faults, tmp_path):
     both = answer(estimate(faults, "actuator:u2 loss", 0.5), estimate(faults, "sensor:y1", 0.3))
     found = reformulate(healthy, diagnosis(healthy, both), data)
     assert max(map(len, str(found).splitlines())) <= 80
-    low, high = found.fit_interval
-    assert 50 < low < high <= 100
+    assert set(found.error_bound) == {"y1", "y2"} and "rms error of the simulation at most: y1 " in str(found)
     assert len(found.plot().axes) == 4
     page = write(found, tmp_path / "r.html", record="faulty").read_text()
     assert "actuator:u2 loss" in page and "http" not in page.replace("http://www.w3.org", "")

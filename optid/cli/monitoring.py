@@ -10,6 +10,7 @@ from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from optid.cli.faults import ZERO
 from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
@@ -22,6 +23,8 @@ LOUD = 20  # unreadable rows reported individually per block read; the others ar
 ARL0 = 10_000
 """Default mean number of samples between false alarms."""
 
+HOUR = 3600.0  # seconds
+
 REMEMBERED = 1000  # samples whose time stamps are kept, for the time of an onset
 
 Part = tuple[list[bytes], str]  # lines, and a remark where another file begins
@@ -33,9 +36,11 @@ KEPT = 10_000  # samples after which the state is saved, events or not
 
 def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: dict[str, Any],
             fill_gaps: int | None = None, strict: bool = False, kinds: Words = None,
-            load: Words = None, state_jump: bool = True, arl0: float | None = None, window: int = 100,
-            identified: Paths = None, healthy: Paths = None, thresholds: File = None, extrapolate: bool = False,
-            seed: int = 0, state: File = None, lines: bool = False) -> None:
+            load: Words = None, disturbance: Words = None, zero: Words = None, state_jump: bool = True,
+            arl0: float | None = None, window: int = 100, identified: Paths = None, healthy: Paths = None,
+            thresholds: File = None, extrapolate: bool = False, drift: float | None = None, adapt: float = 1.0,
+            ack: bool = False, rebase: bool = False, maintenance: bool = False, seed: int = 0, state: File = None,
+            lines: bool = False) -> None:
     """Monitor a stream of samples: print one line per alarm, isolated fault and end of a fault.
 
     Unreadable rows are reported on the error stream and count as missing samples. A file that is rotated, truncated
@@ -51,13 +56,21 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         strict: Stop at the first unreadable row.
     The model:
         kinds (-k NAME...): Kinds of faults: bias, loss, stuck, drift, spike. [dim]bias, loss, spike[/]
+        zero (INPUT=VALUE...): Input at which an actuator has no effect; a loss is a share of the distance from it.
+            [dim]unknown[/]
         arl0 (N): Mean number of samples between false alarms (ARL0). [dim]10000, or that of --thresholds[/]
         window (-w N): Length of the window in samples.
         identified (FILE...): The record from which the model was identified; accounts for its uncertainty.
         healthy (FILE...): A later healthy record, from which noise and thresholds are calibrated.
         thresholds (FILE): Read the thresholds from this file (.json), or write them if it does not exist.
         extrapolate: Allow thresholds extrapolated beyond the simulated run lengths.
+        drift (HOURS): Follow disturbances that change over so many hours, such as a season; slower faults stay hidden.
+        adapt (FACTOR): Multiply the thresholds by this factor at most where the noise has another colour.
         seed: Seed of the simulated thresholds.
+    The operator (the state of a stopped monitor):
+        ack: Acknowledge the alarm: discard it and go on.
+        rebase: Take a new baseline after a repair: discard the alarm and all carried faults.
+        maintenance: Count the rows without a search.
     The result:
         state (FILE): Resume from this state (.npz) if it exists, and save the state to it.
         lines (--json): Print one JSON object per line.
@@ -67,7 +80,12 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     from optid.data.reading.format import Format
     from optid.data.reading.rows import RowReader
     from optid.errors import DataError
+    from optid.faults import dictionary
+    from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
 
+    if (ack or rebase or maintenance) and (state is None or not state.is_file()):
+        raise DataError("--ack, --rebase and --maintenance go on from the state of a stopped monitor: name it with "
+                        "--state FILE")
     check_folders(thresholds)
     check_folders(state, writable=False)
     with nullcontext() if state is None else StateFile(state) as kept:
@@ -83,15 +101,22 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                                label="standard input" if follow is None else follow.name)
             if kept is not None and not kept.is_empty:
                 watcher = _resumed(kept.path, plant, model)
+                if rebase:
+                    watcher.rebase()
+                elif ack:
+                    watcher.acknowledge()
             else:
                 waiting.step("simulating healthy plants for the thresholds")
                 origin, sound = (words.read_record(files, how) if files else None for files in (identified, healthy))
                 if origin is None and sound is None and (thresholds is None or not thresholds.exists()):
                     origin = sound = _identified_from(model)
-                watcher = _new(
-                    plant, words.listed(kinds), words.directions(load, "--load"), state_jump, thresholds, arl0=arl0,
-                    window=window, seed=seed, healthy=sound, uncertainty=origin, extrapolate=extrapolate,
-                )
+                found = dictionary(
+                    plant, kinds=words.listed(kinds) or list(KINDS_BY_DEFAULT), state_jump=state_jump,
+                    process=words.directions(load, "--process", plant), disturbances=words.listed(disturbance) or (),
+                    zeros=words.pairs(words.listed(zero), "--zero", ZERO, float))
+                watcher = _new(found, thresholds, arl0=arl0, window=window, seed=seed, healthy=sound,
+                               uncertainty=origin, extrapolate=extrapolate, adapt=adapt,
+                               drift=None if drift is None else drift * HOUR / plant.dt)
                 if sound is None and origin is not None:
                     _doubt(plant, origin)
                 elif sound is None and thresholds is None:
@@ -99,7 +124,8 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
                          "was identified (--identified FILE...) and a later healthy record (--healthy FILE...)")
         for sentence in heard:
             note(sentence)
-        _Watch(watcher, reader, follow, kept, strict=strict, as_json=lines).run(until_end)
+        watcher.source = watcher.source or {"model": plant.to_dict()}
+        _Watch(watcher, reader, follow, kept, strict=strict, as_json=lines, skips=maintenance).run(until_end)
 
 
 def _identified_from(path: Path) -> Any:
@@ -133,14 +159,11 @@ def _doubt(plant: Any, origin: Any) -> None:
              "later healthy record: --healthy FILE...")
 
 
-def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | None, arl0: float | None, **how: Any
-         ) -> Any:
+def _new(found: Any, path: Path | None, arl0: float | None, **how: Any) -> Any:
     from optid.errors import ModelFileError, StructureError
-    from optid.faults import Calibration, Monitor, dictionary
-    from optid.faults.monitor.monitoring import KINDS_BY_DEFAULT
+    from optid.faults import Calibration, Monitor
     from optid.models.files import complete
 
-    found = dictionary(plant, kinds=kinds or list(KINDS_BY_DEFAULT), process=process, state_jump=state_jump)
     if path is not None and path.exists():
         try:
             known = Calibration.from_dict(json.loads(path.read_text(encoding="utf-8")))
@@ -149,8 +172,8 @@ def _new(plant: Any, kinds: Any, process: Any, state_jump: bool, path: Path | No
         if arl0 is not None and arl0 != known.arl0:
             raise StructureError(f"{path} holds thresholds for a false alarm every {known.arl0:g} samples, --arl0 asks "
                                  f"for {arl0:g}: leave --arl0 out, or name another file")
-        return Monitor(plant, found, thresholds=known, **how)
-    made = Monitor(plant, found, ARL0 if arl0 is None else arl0, **how)
+        return Monitor(found.model, found, thresholds=known, **how)
+    made = Monitor(found.model, found, ARL0 if arl0 is None else arl0, **how)
     if path is not None:
         with complete(path) as part:
             part.write_text(json.dumps(made.calibration.to_dict(), indent=1), encoding="utf-8")
@@ -217,13 +240,13 @@ class _Watch:
     """
 
     def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: "StateFile | None", *, strict: bool,
-                 as_json: bool) -> None:
+                 as_json: bool, skips: bool = False) -> None:
         from optid.cli.following import Followed
         from optid.errors import DataError
 
         self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
-        source = watcher.source or {}
-        self.plant = source.get("model") or watcher.dictionary.model.to_dict()
+        self.skips, source = skips, watcher.source or {}
+        self.plant = source["model"]
         self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
         self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
         self.lines: list[str] = []  # of events that are not printed yet
@@ -277,7 +300,9 @@ class _Watch:
             _note(text)
         self.bad += len({number for number, _ in rows.bad})
         self._remember(first, rows.stamps)
-        events = self.watcher.run(rows.u, rows.y)
+        if self.skips:
+            self.watcher.skip(len(rows.u))
+        events = [] if self.skips else self.watcher.run(rows.u, rows.y)
         for event in events:
             self._tell(event, int(rows.lines[event.sample - first]))
         if self.file is not None:  # a line that ends the stream is the first to be read when it is resumed

@@ -18,7 +18,9 @@ Parameters that are not the most likely ones, such as those of a subspace fit, d
 innovations of the record of identification: d d' is added to P where it is significant.
 
 A plant outside the model class has no true parameters: those that fit best vary with the operating point, by more than
-P. The record of identification is therefore cut into sections. Let S be the sensitivity of a section. Parameters that
+P. The record of identification is therefore cut into sections, by time and by the operating point: behind a controller
+the curvature of the plant is attributed to the functions of the inputs, and a loss of effect, which moves the inputs
+but not the outputs, would seem too small. Let S be the sensitivity of a section. Parameters that
 vary between the sections with the covariance (c - 1) P give the innovations along S P S' (eigenvalues s^2 < 1) the
 variance 1 + (c - 2) s^2: one s^2 less than in a later record, because the parameters were fitted to this one. P is
 multiplied by the estimate of c (overdispersion) where c = 1 is rejected.
@@ -37,8 +39,10 @@ import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data, Experiment
+from optid.data.stretches import interpolated
 from optid.errors import DataError
 from optid.faults.ranges import outside, unknown_effects
+from optid.faults.screening import check_causality
 from optid.faults.whitening import Predictor, predictor, whiten
 from optid.models import state_simulation as simulation
 from optid.models.experiments import in_units_of
@@ -62,6 +66,9 @@ FACTORS = 1.0, 1000.0, 300
 
 SECTIONS = 10
 """Sections of the record of identification between which the parameters may vary."""
+
+SMOOTHED = 5
+"""Samples over which the operating point is averaged."""
 
 REJECTED = 3.0
 """Standard deviations of the score at which equal parameters of all sections are rejected."""
@@ -138,8 +145,8 @@ class ModelUncertainty:
         if not self.deviation:
             return ""
         return (f"The parameters are {self.deviation:.0f} standard deviations from the most likely ones, so that small "
-                "faults stay hidden: fit the model by its prediction errors (hammerstein_ss.exact with "
-                "criterion=prediction).")
+                "faults stay hidden: fit the model by its prediction errors (hammerstein_ss.exact or ss.exact with "
+                "criterion=prediction, behind a controller with feedthrough=false).")
 
     def distance(self, y: Array) -> Array:
         """Return how far readings (N, l) are from the middle of their identified range, in half ranges, at least one.
@@ -212,9 +219,11 @@ def model_uncertainty(
         decoupled: a predictor decoupled from declared disturbances, in place of that of the model.
 
     Raises:
-        DataError: fewer than two readings for each direction of the parameters that changes the predictions.
+        DataError: fewer than two readings for each direction of the parameters that changes the predictions; a model
+            of the inverse of a controller.
         StructureError: no noise covariances.
     """
+    check_causality(model, data)
     count = sum(len(part.y) for part in data.experiments)
     steady = decoupled
     if steady is None:
@@ -224,7 +233,7 @@ def model_uncertainty(
     gained = replace(model, K=steady.K)
     size = len(parameters(gained)[0])
     information, readings, energy = np.zeros((size, size)), 0, 0.0
-    sections: list[tuple[Array, Array]] = []
+    sections: tuple[list[tuple[Array, Array]], ...] = [], []
     levels = np.full((2, model.l), np.nan)
     length = max(count // SECTIONS, 1)
     for part, x0, present, white in _whitened_parts(gained, steady, data):
@@ -242,8 +251,12 @@ def model_uncertainty(
         sample = np.arange(len(present))
         gap = np.maximum.accumulate(np.where(present.all(axis=1), -steady.settling - 1, sample))
         rest[np.repeat(sample - gap <= steady.settling, present.shape[1])] = 0.0
-        edges = np.linspace(0, len(rest), max(round(len(part.y) / length), 1) + 1).astype(int)
-        sections += [(rest[a:b].T @ rest[a:b], rest[a:b].T @ left[a:b]) for a, b in zip(edges, edges[1:])]
+        count_here = max(round(len(part.y) / length), 1)
+        for which, order in enumerate((sample, np.argsort(_operating_point(part.y), kind="stable"))):
+            rows = (order[:, None] * present.shape[1] + np.arange(present.shape[1])).ravel()
+            edges = np.linspace(0, len(rest), count_here + 1).astype(int)
+            sections[which].extend((rest[own].T @ rest[own], rest[own].T @ left[own])
+                                   for own in (rows[a:b] for a, b in zip(edges, edges[1:])))
     sizes = np.sqrt(np.diag(information))
     sizes[sizes == 0] = 1.0
     values, axes = np.linalg.eigh(information / np.outer(sizes, sizes))
@@ -257,19 +270,32 @@ def model_uncertainty(
     root = scale * axes[:, known] / np.sqrt(values[known]) / sizes[:, None]
     steady = replace(steady, covariance=scale**2 * steady.covariance, root=steady.root / scale)
     unit = root / scale
-    grams = [unit.T @ gram @ unit for gram, _ in sections]
-    scores = [unit.T @ along / scale for _, along in sections]
-    score = np.sum(scores, axis=0)
-    moved = np.linalg.pinv(np.sum(grams, axis=0), rcond=KNOWN, hermitian=True) @ score
+    grams = [[unit.T @ gram @ unit for gram, _ in one] for one in sections]
+    scores = [[unit.T @ along / scale for _, along in one] for one in sections]
+    score = np.sum(scores[0], axis=0)
+    moved = np.linalg.pinv(np.sum(grams[0], axis=0), rcond=KNOWN, hermitian=True) @ score
     deviation = float(np.sqrt(max(score @ moved, 0.0)))
     if deviation**2 <= len(score) + REJECTED * np.sqrt(2 * len(score)):
         deviation, moved = 0.0, 0 * moved
     factor = 1.0
     if healthy is None:
-        factor = overdispersion(grams, [one - gram @ moved for one, gram in zip(scores, grams)])
+        factor = max(overdispersion(gram, [one - part @ moved for one, part in zip(along, gram)])
+                     for along, gram in zip(scores, grams))
     both = np.column_stack([np.sqrt(factor) * root, root @ moved]) if deviation else np.sqrt(factor) * root
     found = ModelUncertainty(gained, steady, both, readings, factor, levels, deviation)
     return found if healthy is None else _inflated(found, healthy)
+
+
+def _operating_point(y: Array) -> Array:
+    """Return the first principal component (N,) of the outputs, each over its spread, averaged over samples before.
+
+    It does not depend on the innovation of a sample, which an order by its output would select.
+    """
+    filled = interpolated(y)
+    scaled = filled - filled.mean(axis=0)
+    scaled /= np.where(scaled.std(axis=0) > 0, scaled.std(axis=0), 1.0)
+    along = scaled @ np.linalg.eigh(scaled.T @ scaled)[1][:, -1]
+    return np.convolve(np.append(0.0, along), np.full(SMOOTHED, 1 / SMOOTHED))[: len(along)]
 
 
 def overdispersion(grams: list[Array], correlations: list[Array]) -> float:

@@ -1,4 +1,4 @@
-"""Checks of a record before any statistics: flat lines, swapped channels, changes of unit."""
+"""Checks of a record before any statistics: flat lines, swapped channels, changes of unit, inverses of controllers."""
 
 from collections.abc import Callable
 from itertools import permutations, product
@@ -11,6 +11,9 @@ from optid.data.record import Data
 from optid.errors import DataError
 from optid.faults.readings import LostReadings, lost_readings
 from optid.faults.whitening import predictor, whiten
+from optid.identify.informativity import informativity
+from optid.identify.informativity.feedback import TIED, outside
+from optid.identify.informativity.signals import RecordSignals
 from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
@@ -69,6 +72,31 @@ def check_channels(model: "HammersteinSS", data: Data) -> None:
                 f"{where}the unit of output {name!r} seems to change at sample {found[0]}: from there on the readings "
                 f"fit the model when divided by {found[1]:g}. Convert them."
             )
+
+
+def check_causality(model: "HammersteinSS", data: Data) -> None:
+    """Refuse a model of the inverse of a controller.
+
+    Where an input is the answer of a controller and nothing else, a model in which it acts on the outputs at once
+    explains the record best as the inverse of the controller, and knows nothing about the plant.
+
+    Args:
+        model: the model.
+        data: the record it was identified from.
+
+    Raises:
+        DataError: such an input acts at once.
+    """
+    direct = {model.input_of[column] for column in np.flatnonzero(model.D.any(axis=0))}
+    tied = [c for c in direct if outside(RecordSignals.of(data), c) < TIED]
+    loops = informativity(data).loops if tied else ()
+    for c in tied:
+        if loops and loops[c].word == "regulated":
+            raise DataError(
+                f"In the record of the identification input {data.inputs[c]!r} is the answer of a controller to output "
+                f"{loops[c].output!r}, and nothing else moved it; in the model it acts on the outputs at once: that is "
+                "the inverse of the controller. Fit the plant with its noise and without feedthrough: formulation "
+                "ss.exact with criterion=prediction, feedthrough=false.")
 
 
 def _check_order(what: str, names: tuple[str, ...], energy: float, of: Callable[[list[int]], float]) -> None:

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optid.arrays import Array
+from optid.bases import Linear
 from optid.errors import DataError, DataWarning, LookupFailed, StructureError, nearest
 from optid.faults.directions import decoupled
 from optid.faults.faults import Fault, channel_of, place_of
+from optid.faults.ranges import known_range
 from optid.faults.whitening import Predictor, predictor
 
 if TYPE_CHECKING:
@@ -139,6 +141,12 @@ class Dictionary:
         rows, columns = np.nonzero(np.triu(np.nan_to_num(self.sines, nan=1.0) < NEAR, 1))
         return [(self.labels[i], self.labels[j], float(self.sines[i, j])) for i, j in zip(rows, columns)]
 
+    def belongs_to(self, model: "HammersteinSS") -> bool:
+        """Whether it is a dictionary of a model, with disturbances declared or not."""
+        same = self.model is model or all(
+            np.array_equal(getattr(self.model, name), getattr(model, name)) for name in "ABCDEL")
+        return same and self.model.inputs == model.inputs and self.model.outputs == model.outputs
+
     def with_candidates(self, more: Sequence[Candidate]) -> "Dictionary":
         """Return the dictionary with further candidates appended."""
         count = len(self.candidates) + len(more)
@@ -258,16 +266,17 @@ def dictionary(
         schedules: known changes of A and B by name.
         unknown: whether "none of these" is a possible answer; a constant disturbance of unknown direction is then, too.
         zeros: {input: the value at which its actuator has no effect}. A loss reduces the effect beyond that value to
-            the share (1 - gamma); without it any constant may be added.
+            the share (1 - gamma); without it any constant may be added. It must lie where f is known: a linear function
+            is extrapolated to it, with a warning.
         disturbances: names, as in `Fault`, of inputs, outputs and directions of `process` with disturbances of any
             course. The predictor is decoupled from them (`optid.faults.directions`), and they are not candidates.
 
     Raises:
         LookupFailed: an unknown kind or channel.
-        StructureError: no noise covariances, no candidate left.
+        StructureError: no noise covariances, no candidate left, a zero outside the range of a nonlinear function.
 
     Warns:
-        DataWarning: faults that were merged or excluded.
+        DataWarning: faults that were merged or excluded; a zero to which a linear function is extrapolated.
     """
     wanted = [kinds] if isinstance(kinds, str) else list(kinds)
     unknown_kinds = [kind for kind in wanted if kind not in KINDS]
@@ -283,6 +292,8 @@ def dictionary(
     names = [name for name in names if name.partition(":")[2] not in apart]
     names += [f"process:{c}" for c in process or {} if c not in apart]
     at_rest = {_chosen([name], model.inputs)[0]: float(value) for name, value in (zeros or {}).items()}
+    for name, value in at_rest.items():
+        _check_zero(model, name, value)
     raw = [candidate_of(model, name, kind, process, at_rest) for kind in wanted if kind != "jump" for name in names
            if name.partition(":")[0] in KINDS[kind]]
     if state_jump or "jump" in wanted:
@@ -326,6 +337,20 @@ def candidate_of(
         columns = tuple(i for i, of in enumerate(model.input_of) if of == c)
         new = replace(new, columns=columns, zero=(zeros or {}).get(name.partition(":")[2]))
     return replace(new, members=(new.own_label,))
+
+
+def _check_zero(model: "HammersteinSS", name: str, value: float) -> None:
+    """Refuse an input without effect that lies where its function is not known."""
+    for column, (low, high) in enumerate(zip(*known_range(model))):
+        if model.inputs[model.input_of[column]] != name or low <= value <= high:
+            continue
+        where = f"the zero {value:g} of {name} lies outside [{low:.4g}, {high:.4g}], the range over which its function "
+        where += "was identified"
+        if not isinstance(model.nonlinearities[column].basis, Linear):
+            raise StructureError(f"{where}: a share lost would be measured from a value that is not known. Leave the "
+                                 "zero out (any constant may then be added), or identify f down to it.")
+        warnings.warn(f"{where}: the share lost is true as far as the actuator is linear down to it.", DataWarning,
+                      stacklevel=3)
 
 
 def _horizon(steady: Predictor) -> int:

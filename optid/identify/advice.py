@@ -32,6 +32,8 @@ SLOW = 0.9  # real poles from here on are compared with 1
 FEW = 8  # moves of the inputs below which a record determines a process, and little more
 LONG = 20_000  # samples beyond which no neighbouring structure is tried
 NOISE_MODELS = ("arx", "hammerstein_arx", "armax", "hammerstein_armax", "bj", "hammerstein_bj")
+# what a state-space model of a closed loop is fitted by
+PREDICTOR = "--formulation ss.exact --set criterion=prediction --set feedthrough=false"
 # formulations with a static function of the input, by those without
 STATIC = {"arx": "hammerstein_arx.exact", "oe.exact": "hammerstein_oe.exact", "ss.exact": "hammerstein_ss.exact"}
 
@@ -83,12 +85,14 @@ def _in_a_loop(fit: Any, told: Informativity) -> Iterator[Advice]:
     """Advise a noise model and lags from 1 on where an output acts on an input."""
     if told.loop.word == "open" or not told.processes:
         return
-    direct = hasattr(fit.model, "nk") and min(fit.model.nk) == 0
-    if direct or not fit.formulation.startswith(NOISE_MODELS):
+    states = hasattr(fit.model, "D")
+    direct = bool(np.any(fit.model.D)) if states else hasattr(fit.model, "nk") and min(fit.model.nk) == 0
+    described = states and fit.arguments.get("criterion") == "prediction"
+    if direct or not (described or fit.formulation.startswith(NOISE_MODELS)):
         na = max(r.poles.size for p in told.processes for r in p.responses)
         nk = " ".join(str(max(lag, 1)) for lag in told.lags)
-        step = (f"--formulation bj.exact --na {na} --nb 1 --nk {nk} --set nc=1 --set nd=1" if fit.data.l == 1 else
-                "--formulation ss.exact --set criterion=prediction --set feedthrough=false")
+        step = (f"--formulation bj.exact --na {na} --nb 1 --nk {nk} --set nc=1 --set nd=1"
+                if fit.data.l == 1 and not states else PREDICTOR)
         what = "an input that acts at once is the controller's answer" if direct else (
             f"{fit.formulation} assumes that the inputs do not depend on the noise")
         yield Advice(f"the loop was closed, and {what}: use a noise model and lags from 1 on", step)

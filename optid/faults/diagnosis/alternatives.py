@@ -4,8 +4,11 @@ A broken actuator contributes (1 - gamma) f(u) + c. It is *stuck* where gamma = 
 0 < gamma < 1; c is free unless the input without effect is known, because an identified f is known up to a constant
 only. The probability of gamma = 1 relative to all other shares (Savage-Dickey ratio) decides between them.
 
-A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary. It competes
-with all entries: a fault has to explain the record as well as the best direction does, given its number of magnitudes.
+A constant disturbance of unknown direction in the state equation, a leak, is no entry of the dictionary, nor is one
+that drifts. It competes with all entries: a fault has to explain the record as well as the best direction does, given
+its number of magnitudes. What an actuator adds to the states alone, a leak at the same place does, too: no record
+isolates them, and the leak has the prior of what is not listed. Where directions of the process are declared, the leaks
+are among them: then neither one that drifts nor one beside an actuator is added.
 """
 
 from collections.abc import Sequence
@@ -38,7 +41,7 @@ def extended(found: Dictionary) -> Dictionary | None:
     """Return the candidates beside those of a dictionary; None for none.
 
     They are actuators with a loss without a stated zero and without a stuck candidate, and, where "none of these" is a
-    possible answer, the constant disturbance of unknown direction.
+    possible answer, the disturbance of unknown direction.
     """
     stuck = {c.name for c in found.candidates if c.kind == "stuck"}
     more = [
@@ -47,9 +50,26 @@ def extended(found: Dictionary) -> Dictionary | None:
     ]
     known = found.model.l > 1 or any(c.kind != "frozen" for c in found.candidates)
     if found.unknown and known and all(c.name != UNKNOWN_DIRECTION for c in found.candidates):
-        more.append(candidate_of(found.model, UNKNOWN_DIRECTION, "bias"))
+        drifts = any(c.kind == "drift" for c in found.candidates) and not declares_process(found)
+        kinds = ["bias", *(["drift"] if drifts else [])]
+        more += [candidate_of(found.model, UNKNOWN_DIRECTION, kind) for kind in kinds]
     sines = np.full((len(more), len(more)), np.nan)
     return replace(found, candidates=tuple(more), excluded={}, sines=sines) if more else None
+
+
+def declares_process(found: Dictionary) -> bool:
+    """Whether a dictionary has directions of the process."""
+    return any(c.name.startswith(f"{UNKNOWN_DIRECTION}:") for c in found.candidates)
+
+
+def same_at_process(found: Explanation) -> list[Explanation]:
+    """Return the disturbance of the process that has the same effect as an actuator; none for other explanations."""
+    (c,) = found.candidates
+    if c.kind not in ("bias", "drift") or not c.name.startswith("actuator:") or c.into_output.any():
+        return []
+    label = UNKNOWN_DIRECTION + " drift" * (c.kind == "drift")
+    other = replace(c, name=UNKNOWN_DIRECTION, members=(label,), places=(UNKNOWN_DIRECTION,))
+    return [found._replace(logs=found.logs + np.log(UNLISTED), candidates=(other,), entries=found.entries or (c,))]
 
 
 def parted(found: Explanation, listed: Sequence[Candidate]) -> list[Explanation]:

@@ -103,10 +103,7 @@ def _dictionary(model: "HammersteinSS", faults: Dictionary | None) -> Dictionary
         raise StructureError(
             f"faults is a {type(faults).__name__}: pass the dictionary of optid.faults.dictionary(model, kinds=[...])."
         )
-    same = faults.model is model or all(
-        np.array_equal(getattr(faults.model, name), getattr(model, name)) for name in ("A", "B", "C", "D")
-    )
-    if not same or faults.model.inputs != model.inputs or faults.model.outputs != model.outputs:
+    if not faults.belongs_to(model):
         raise StructureError("The dictionary is of another model: build it with optid.faults.dictionary(model, ...).")
     return faults
 

@@ -9,7 +9,7 @@ from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import SolverFailed, StructureError
 from optid.faults.consistency.leftover import UNFIT, further_fault, left_over
-from optid.faults.diagnosis.alternatives import UNLISTED, parted
+from optid.faults.diagnosis.alternatives import UNLISTED, declares_process, parted, same_at_process
 from optid.faults.diagnosis.answers import Certificate, Remaining
 from optid.faults.diagnosis.counting import recounted
 from optid.faults.diagnosis.posterior import Explanation, several, single, smallest_set
@@ -151,6 +151,8 @@ def singles(seen: RecordSearch) -> list[Explanation]:
         if found is not None:
             counted = recounted(found._replace(logs=found.logs + prior), seen.noise.get("uncertainty"))
             result += parted(counted, seen.dictionary.candidates)
+            if seen.dictionary.unknown and not declares_process(seen.dictionary):
+                result += same_at_process(counted)
     return result + seen.gains_of_sensors + seen.courses
 
 

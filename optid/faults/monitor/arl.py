@@ -55,6 +55,8 @@ class Calibration:
         samples: samples simulated.
         alarms: false alarms among them at these thresholds.
         seed: of the simulation.
+        spreads: (C,) factors of the energies of the candidates, and of the variances of their sizes, because the
+            parameters of the model are uncertain or the healthy record is noisier than the model.
         extrapolated: whether the simulation was too short for this ARL0 and the tail was extrapolated.
         common: largest energy over its threshold that a tenth of the simulated blocks reach; NaN without a simulation.
     """
@@ -66,6 +68,7 @@ class Calibration:
     samples: int
     alarms: int
     seed: int | None
+    spreads: Array
     extrapolated: bool = False
     common: float = float("nan")
 
@@ -79,12 +82,14 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Describe it in JSON types."""
-        return {**self.__dict__, "labels": list(self.labels), "q": [float(q) for q in self.q]}
+        return {**self.__dict__, "labels": list(self.labels), "q": [float(q) for q in self.q],
+                "spreads": [float(spread) for spread in self.spreads]}
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> "Calibration":
         """Return the calibration of a description by `to_dict`."""
-        return cls(**{**content, "labels": tuple(content["labels"]), "q": np.array(content["q"], dtype=float)})
+        arrays = {word: np.array(content[word], dtype=float) for word in ("q", "spreads")}
+        return cls(**{**content, "labels": tuple(content["labels"]), **arrays})
 
 
 def calibrate(
@@ -116,14 +121,14 @@ def calibrate(
     length = max(min(CHUNK, wanted) // window, 1) * window
     count = max(1, -(-wanted // (RUNS * length)))
 
-    def run(seeds: np.random.SeedSequence) -> Array:
+    def run(seeds: np.random.SeedSequence, parts: int = count, scale: float = 1.0) -> Array:
         found, place = [], int(np.random.default_rng(seeds).integers(period))
-        for part in seeds.spawn(count):
+        for part in np.random.SeedSequence(seeds.entropy, spawn_key=seeds.spawn_key).spawn(count)[:parts]:
             rng = np.random.default_rng(part)
             rows = (place + np.arange(-1, length + window)) % period
             r = rng.standard_normal((length + window, l))
             if effect is not None:  # every stretch has a model of its own
-                r += effect[rows[1:]] @ np.append(rng.standard_normal(effect.shape[2] - 1), 1.0)
+                r += scale * effect[rows[1:]] @ np.append(rng.standard_normal(effect.shape[2] - 1), 1.0)
             inputs = f[rows] if len(f) else np.zeros((len(rows), f.shape[1]))
             _, statistic, _ = Window(columns, window, len(steady.A), steady).advance(
                 columns.signals(inputs[:-1], inputs[1:]), r, np.full(len(columns.size), np.inf))
@@ -131,12 +136,20 @@ def calibrate(
             place = int(rows[-1]) + 1
         return np.vstack(found)
 
+    seeds = np.random.SeedSequence(seed).spawn(RUNS)
     with ThreadPoolExecutor(min(RUNS, os.cpu_count() or 1)) as pool:
-        largest = np.vstack(list(pool.map(run, np.random.SeedSequence(seed).spawn(RUNS))))
+        exact = pool.map(lambda one: run(one, 1, 0.0), seeds if effect is not None else [])
+        largest = np.vstack(list(pool.map(run, seeds)))
+        without = list(exact)
+    spreads = np.ones(len(columns.size))
+    if without:
+        spreads = np.maximum(np.quantile(largest, 1 - COMMON, axis=0) / np.quantile(np.vstack(without), 1 - COMMON,
+                                                                                     axis=0), 1.0)
     q, alarms = equalised(largest, window, arl0)
     labels = tuple(c.label for c in columns.candidates)
     common = float(np.quantile(np.max(largest / q, axis=1), 1 - COMMON))
-    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, extrapolated, common)
+    return Calibration(labels, q, float(arl0), window, len(largest) * window, alarms, seed, spreads, extrapolated,
+                       common)
 
 
 def equalised(largest: Array, length: int, arl0: float) -> tuple[Array, int]:

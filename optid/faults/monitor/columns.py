@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optid.arrays import Array, compact
+from optid.faults.monitor.actuator_kinds import has_constants
 from optid.faults.monitor.search_kernel import DRIFT, DRIVEN, JUMP, LASTING, SearchMemory, Signatures, search
 from optid.faults.signatures import Candidate
 from optid.faults.whitening import Predictor
@@ -25,6 +26,7 @@ class Columns:
 
     candidates: tuple[Candidate, ...]  # (C,)
     losses: tuple[tuple[Array, Array], ...]  # per loss (n, r) and (l, r), from the functions of the inputs
+    rest: tuple[Array, ...]  # per loss (r,) the functions at the input without effect
     into_state: Array  # (D, n) what a column adds to the state, per unit of its course
     into_output: Array  # (D, l) what it adds to the output
     course: np.ndarray  # (D,) of `search_kernel`
@@ -56,9 +58,9 @@ class Columns:
         """
         state, output = (np.empty((len(f), len(self.losses), part.shape[1]))
                          for part in (self.into_state, self.into_output))
-        for number, (into_state, into_output) in enumerate(self.losses):
-            np.einsum("ir,tr->ti", into_state, before, out=state[:, number])
-            np.einsum("or,tr->to", into_output, f, out=output[:, number])
+        for number, ((into_state, into_output), rest) in enumerate(zip(self.losses, self.rest)):
+            np.einsum("ir,tr->ti", into_state, before - rest, out=state[:, number])
+            np.einsum("or,tr->to", into_output, f - rest, out=output[:, number])
         return state, output
 
     def units(self, before: Array, f: Array) -> tuple[Array, Array]:
@@ -70,17 +72,21 @@ class Columns:
 
     def in_order(self, number: int, sizes: Array) -> tuple[float, ...]:
         """Return magnitudes in the order of `Dictionary.signature`: the share lost first."""
-        return tuple(np.roll(sizes, int(self.candidates[number].kind == "stuck")).tolist())
+        first = int(has_constants(self.candidates[number]))
+        found = np.roll(sizes, first)
+        if self.candidates[number].kind in ("loss", "stuck"):  # a share lost lies between 0 and 1
+            found[0] = np.clip(found[0], 0.0, 1.0)
+        return tuple(found.tolist())
 
 
 def columns_of(model: HammersteinSS, candidates: tuple[Candidate, ...]) -> Columns:
     """Tabulate the candidates of a dictionary of a model."""
-    into_state, into_output, course, driven, losses = [], [], [], [], []
+    into_state, into_output, course, driven, losses, rest = [], [], [], [], [], []
     for c in candidates:
-        if c.kind != "loss":
+        if c.kind != "loss" or c.constants:
             into_state += list(c.into_state.T)
             into_output += list(c.into_output.T)
-            course += [COURSES[c.kind]] * c.into_state.shape[1]
+            course += [LASTING if c.constants else COURSES[c.kind]] * c.into_state.shape[1]
             driven += [-1] * c.into_state.shape[1]
         if c.columns:
             into_state.append(np.zeros(model.nx))
@@ -90,10 +96,12 @@ def columns_of(model: HammersteinSS, candidates: tuple[Candidate, ...]) -> Colum
             lost = np.zeros((model.nx + model.l, model.B.shape[1]))
             lost[:, list(c.columns)] = -np.vstack([c.into_state, c.into_output])
             losses.append((lost[: model.nx], lost[model.nx :]))
+            rest.append(model.expanded(np.full((1, model.m), c.zero))[0] if c.zero is not None and c.kind == "loss" else
+                        np.zeros(model.B.shape[1]))
     size = np.array([c.dimension for c in candidates])
     moving = np.repeat([bool(c.columns) for c in candidates], size)
-    return Columns(candidates, tuple(losses), np.array(into_state), np.array(into_output), np.array(course),
-                   np.array(driven), moving, np.cumsum([0, *size[:-1]]), size, -(-size // model.l))
+    return Columns(candidates, tuple(losses), tuple(rest), np.array(into_state), np.array(into_output),
+                   np.array(course), np.array(driven), moving, np.cumsum([0, *size[:-1]]), size, -(-size // model.l))
 
 
 class Window:
@@ -173,7 +181,7 @@ class Window:
         recent = np.arange(max(done - self.length, 0), done)
         at = (start + recent) % self.length
         self.whitened[at] = r[recent]
-        self.readings[at] = r.shape[1] if matrices is None else shown
+        self.readings[at] = r.shape[1] - self.steady.silent if matrices is None else shown
         self.statistic, self.weight = statistic[-1].copy(), weight[-1].copy()
         return done, statistic, weight
 

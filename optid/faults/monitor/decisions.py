@@ -1,19 +1,25 @@
 """The decisions of a monitor: raise an alarm, isolate, carry and clear a fault."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from optid.arrays import Array
+from optid.faults.monitor.actuator_kinds import groups_of, has_constants, is_grouped, kinds, likeliest
+from optid.faults.monitor.arl import COMMON
 from optid.faults.monitor.columns import Columns, Window
 from optid.faults.monitor.events import Event
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT
+from optid.faults.nuisance import CONFIDENCE
+from optid.faults.signatures import Candidate
 
 RULES = {
     "certainty": 0.98, "release": 0.5, "patience": 40.0, "settle": 10.0, "still": 10.0, "faded": 1e-8, "learned": 0.02,
-    "forgiven": 0.3, "odd": 4.3, "beyond": 2.0,
+    "forgiven": 0.3, "odd": 4.3, "beyond": 2.0, "adapt": 1.0,
 }
 """Numbers of the decisions.
 
@@ -23,6 +29,10 @@ A transient ends when its energy falls to `faded`. A carried fault is no longer 
 the energy `learned` in a window, and is cleared when its significance falls below the share `forgiven` of the
 threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
 
+Where more windows than a tenth reach the energies that a tenth of the simulated ones reach, the noise has another
+colour than that of the calibration: the thresholds are then multiplied by the ratio of these energies, by `adapt` at
+most.
+
 While an input was outside its identified range in the last window, the thresholds of an uncertain model are multiplied
 by the fourth power of its distance from the middle of the range, relative to half the range, and by `beyond` at most:
 what a model of a smooth plant lacks grows with the square of the distance, and its energy with the fourth power.
@@ -31,8 +41,15 @@ what a model of a smooth plant lacks grows with the square of the distance, and 
 FEWEST = 4
 """Fewest samples of increased noise."""
 
-WATCHING, NAMING, SETTLING, LOST = range(4)
-"""Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains."""
+WINDOWS, CHANGED = 40, 0.2
+"""Windows from which the colour of the noise is taken, and the least change, of the logarithm, of the thresholds."""
+
+WATCHING, NAMING, SETTLING, LOST, UNTRUSTED = range(5)
+"""Phases: no alarm; alarm, not isolated; isolated, the size not yet settled; an alarm that no candidate explains; the
+plant is where the model was not identified, and the model does not describe it there."""
+
+Excursion = Callable[[int, int], tuple[str, int] | None]
+"""(since, before) -> channel that was far outside its range after `since`, and when it left it, `before` a sample."""
 
 NOTHING, AGAIN = -1, -2
 """No candidate is isolated; no candidate has explained the alarm before."""
@@ -45,10 +62,12 @@ class Decisions:
     columns: Columns  # of the candidates
     labels: tuple[str, ...]  # of the candidates
     q: Array  # (C,) their thresholds
+    spreads: Array  # (C,) factors of the variances of their sizes, because the model is uncertain
     rules: dict[str, float]  # numbers, see `RULES`
     outputs: tuple[str, ...]  # names of the sensors
     testable: np.ndarray  # (C,) whether a total loss is detectable
     passing: list[list[int]]  # [candidate, sample at which it has faded] of transients
+    listed: tuple[Candidate, ...]  # candidates of the dictionary
     phase: int = WATCHING
     alarm: int = 0  # sample of the alarm
     named: int = NOTHING  # isolated candidate
@@ -57,14 +76,32 @@ class Decisions:
     begun: int = 0  # first sample after the last unknown input
     # [sample, factor of the thresholds] of inputs outside their range in the last window, the factors falling
     raised: list[list[float]] = field(default_factory=list)
+    # [candidate, labels] of carried actuators whose kind is not decided yet
+    undecided: list[list[Any]] = field(default_factory=list)
+    told: list[str] = field(default_factory=list)  # labels of the last isolated fault
     kept: list[Array] | None = None  # the statistics (T, C) of all samples, where they are requested
 
-    KEPT = "phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing"
+    common: float = float("nan")  # energy over its threshold that a tenth of the simulated windows reach
+    highest: float = 0.0  # energy over its threshold since the last multiple of the window
+    windows: list[float] = field(default_factory=list)  # those of the last windows
+    adapted: float = 1.0  # factor of the thresholds for the colour of the noise
+
+    KEPT = ("phase", "alarm", "named", "named_at", "quiet", "begun", "raised", "passing", "undecided", "told",
+            "highest", "windows", "adapted")
+
+    @cached_property
+    def groups(self) -> tuple[int, ...]:
+        """Number of the first candidate of the group of each."""
+        return groups_of(self.columns.candidates)
+
+    def group(self, number: int) -> list[int]:
+        """Return the candidates of the group of one."""
+        return [c for c, first in enumerate(self.groups) if first == self.groups[number]]
 
     @property
     def thresholds(self) -> Array:
         """(C,) thresholds at this sample."""
-        return self.q * (self.raised[0][1] if self.raised else 1.0)
+        return self.q * (self.raised[0][1] if self.raised else 1.0) * self.adapted
 
     @property
     def limit(self) -> Array:
@@ -92,8 +129,26 @@ class Decisions:
         """Count the samples at the end of a block with all statistics (T, C) below the release level."""
         loud = np.flatnonzero(np.any(statistic > self.rules["release"] * self.thresholds, axis=1))
         self.quiet = self.quiet + len(statistic) if not loud.size else len(statistic) - 1 - int(loud[-1])
+        self.highest = max(self.highest, float(np.max(statistic / self.q)))
         if self.kept is not None:
             self.kept.append(statistic)
+
+    def adapt(self, now: int) -> list[Event]:
+        """Adapt the thresholds to the colour of the noise at the end of a window; return what has changed."""
+        from scipy.special import bdtrik
+
+        if self.phase == WATCHING or self.highest > 1:
+            self.windows = [*self.windows, self.highest][-WINDOWS:]
+        self.highest, found, before = 0.0, np.array(self.windows), self.adapted
+        factor = 1.0
+        if len(found) >= WINDOWS // 2 and np.sum(found > self.common) > bdtrik(CONFIDENCE, len(found), COMMON):
+            factor = float(np.clip(np.quantile(found, 1 - COMMON) / self.common, 1.0, self.rules["adapt"]))
+        if abs(np.log(factor / before)) < CHANGED:
+            return []
+        self.adapted = factor
+        note = (f"thresholds times {factor:.2f} for the colour of the noise: a fault must be {np.sqrt(factor):.2f} "
+                f"times as large, or is found about {factor:.1f} times as late")
+        return [Event("adapted", now, note=note)]
 
     def excitation(self, weight: Array, now: int, window: int) -> list[Event]:
         """Return the events "testable" and "untestable" of weights (T, C) of samples from `now` on."""
@@ -111,11 +166,20 @@ class Decisions:
                               Event("untestable", now + t, label, now + t - window + 1, statistic=float(line[t])))
         return sorted(events, key=lambda e: e.sample)
 
-    def judge(self, now: int, window: Window, plant: RunningFilter, *, hold: bool) -> Event | None:
+    def judge(self, now: int, window: Window, plant: RunningFilter, excursion: Excursion, *, hold: bool = False
+              ) -> Event | None:
         """Return the event of the last sample; no fault is isolated while a sensor repeats its reading (`hold`)."""
+        if self.phase == UNTRUSTED:
+            if excursion(now - window.length, now + 1) is None:
+                window.restart()
+                return self._clear(now)
+            return None
         gains = np.where(window.peak > 0, window.statistic - self.thresholds, -np.inf)
         best, watching = int(np.argmax(gains)), self.phase == WATCHING
         if self.phase in (WATCHING, LOST) and gains[best] > 0:
+            onset = now - int(window.peak[best]) + 1
+            if left := excursion(onset - window.length, onset):  # a fault drives channels out after its onset only
+                return self._distrust(now, left)
             self.phase, self.alarm = NAMING, now
             return self._event("alarm", now, best, gains, window) if watching else None
         if watching:
@@ -124,7 +188,18 @@ class Decisions:
             return None
         if self.phase == LOST:
             return self._clear(now) if self.quiet >= self.rules["still"] else None
-        return None if hold else self._name(now, best, gains, window, plant)
+        if hold:
+            return None
+        event = self._name(now, best, gains, window, plant)
+        if self.phase == LOST and (left := excursion(self.alarm - window.length, now + 1)):
+            return self._distrust(now, left)  # what no fault explains is an error of the model
+        return event
+
+    def _distrust(self, now: int, left: tuple[str, int]) -> Event:
+        name, since = left
+        self.phase, self.named, self.quiet = UNTRUSTED, NOTHING, 0
+        return Event("untrusted", now, ((name, 1.0),), since,
+                     note="the model does not describe the plant there; no fault is named until it is back")
 
     def _clear(self, now: int) -> Event:
         self.phase, self.named = WATCHING, NOTHING
@@ -134,38 +209,85 @@ class Decisions:
         rule, noise = self.rules, self._noisy_sensor(now, window)
         # increased noise is an answer, too, and the likely one where no candidate explained the alarm before
         louder = (0.0 if noise is None else noise.statistic) - float(self.thresholds.min()) * (self.named != AGAIN)
-        share = np.exp(np.clip(np.append(gains, louder) - gains[best], -700, 700) / 2)
+        rivals = [gains[self.group(c)].max() for c in sorted(set(self.groups))]
+        share = np.exp(np.clip(np.append(rivals, louder) - gains[best], -700, 700) / 2)
         sure = 1 / share.sum() >= rule["certainty"]
         chosen, old = best, int(window.peak[best]) + 1  # an onset must not leave the window before it is isolated
         if self.phase == NAMING:
             odd, free = self._left_over(best, window)
             waited = now - self.alarm
             late = waited >= rule["patience"] or (waited >= rule["settle"] and old + rule["settle"] >= window.length)
-            testable = self.columns.candidates[best].additive or self.testable[best]
             if self.quiet >= rule["still"] or (late and gains[best] <= 0):
                 return self._clear(now)
             if louder > gains[best] and (late or share[-1] >= rule["certainty"] * share.sum()):
                 return self._lost(now, best, window, noise)
-            if not late and not (sure and gains[best] > 0 and free >= 4 and testable):
+            if not late and not (sure and gains[best] > 0 and free >= 4 and self._is_testable(best)):
                 return None
         else:
             if now - self.named_at < rule["settle"] and old < window.length:
                 return None
-            chosen = best if sure else self.named
+            chosen = best if sure or self.groups[best] == self.groups[self.named] else self.named
             if window.peak[chosen] == 0:
                 return self._clear(now)
             odd, free = self._left_over(chosen, window)
         if odd > rule["odd"]:
             return self._lost(now, chosen, window, noise)
-        if self.phase == NAMING or chosen != self.named:
+        if self.phase == NAMING or self.groups[chosen] != self.groups[self.named]:
             self.phase, self.named, self.named_at = SETTLING, chosen, now
-            return self._event("isolated", now, chosen, gains, window)
+            event = self._event("isolated", now, chosen, gains, window)
+            self.told = [label for label, _ in event.candidates]
+            return event
+        return self._carry(now, chosen, window, plant)
+
+    def label_of(self, owner: int) -> str:
+        """Return the likeliest label of a carried candidate."""
+        return next((labels[0] for number, labels in self.undecided if number == owner), self.labels[owner])
+
+    def _is_testable(self, number: int) -> bool:
+        return any(self.columns.candidates[c].additive or self.testable[c] for c in self.group(number))
+
+    def _carry(self, now: int, chosen: int, window: Window, plant: RunningFilter) -> Event | None:
+        """Compensate a fault from now on, an actuator of undecided kind with share and constants."""
+        weights, event = self._kinds(chosen, window), None
+        said = likeliest(weights)
+        labels = [label for label, _ in said]
+        if labels != [label for label in self.told if label in weights]:
+            event = self._told("revised", now, said, chosen, window)
+        family = [c for c in self.group(chosen) if has_constants(self.columns.candidates[c]) and window.peak[c]]
+        if family and (len(labels) > 1 or not self.columns.candidates[chosen].additive):
+            chosen = family[0]
+            self.undecided = [one for one in self.undecided if one[0] != chosen] + [[chosen, labels]]
         plant.room(2 * int(self.columns.size.max()))
         left = plant.carry(chosen, window)
         if np.isfinite(left):
-            self.passing.append([chosen, now + _fading(plant, left, rule["faded"])])
+            self.passing.append([chosen, now + _fading(plant, left, self.rules["faded"])])
         self.forgive(window)
-        return None
+        return event
+
+    def _kinds(self, number: int, window: Window) -> dict[str, float]:
+        """Return {label: likelihood} of the group of a candidate."""
+        logs: dict[str, float] = {}
+        here = self.group(number)
+        family = [c for c in here if has_constants(self.columns.candidates[c]) and window.peak[c]]
+        for c in here:
+            if window.peak[c] and (c in family or not (family and self.columns.candidates[c].additive)):
+                sizes, covariance, _ = window.estimate(c)
+                for label, log in self._evidence(c, sizes, covariance).items():
+                    logs[label] = max(log, logs.get(label, -np.inf))
+        most = max(logs.values())
+        for c in here:  # too few samples for a share: it may be anything
+            if not window.peak[c]:
+                logs[self.labels[c]] = most
+        return {label: float(np.exp(log - most)) for label, log in logs.items()}
+
+    def _evidence(self, number: int, sizes: Array, covariance: Array) -> dict[str, float]:
+        """Return {label: logarithm of the likelihood} of an estimate in the order of the columns."""
+        candidate = self.columns.candidates[number]
+        if not is_grouped(candidate):
+            return {self.labels[number]: 0.0}
+        first = int(has_constants(candidate))
+        turned = np.roll(covariance, (first, first), axis=(0, 1))
+        return kinds(candidate, np.roll(sizes, first), self.spreads[number] * turned, self.listed)
 
     def forgive(self, window: Window) -> None:
         """Discard the alarm from the next sample on."""
@@ -194,19 +316,31 @@ class Decisions:
         return float(excess(max(energy - float(window.statistic[number]), 0.0), free)), free
 
     def _event(self, kind: str, now: int, best: int, gains: Array, window: Window) -> Event:
-        weight = np.exp((gains - gains.max()) / 2)
-        weight /= weight.sum()
-        order = [best, *(int(c) for c in np.argsort(-weight, kind="stable") if c != best)]
-        kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
-        note = ""
-        if kind == "isolated" and not (self.columns.candidates[best].additive or self.testable[best]):
+        weights: dict[str, float] = {}
+        for first in sorted(set(self.groups), key=lambda c: c != self.groups[best]):
+            top = gains[self.group(first)].max() - gains[best]
+            own = self._kinds(first, window) if np.isfinite(top) else {}
+            for label, weight in own.items():
+                weights[label] = float(np.exp(top / 2)) * weight / sum(own.values())
+        said, note = likeliest(weights), ""
+        hidden = [c for c in self.group(best) if not (self.columns.candidates[c].additive or self.testable[c])]
+        if kind == "isolated" and hidden and (best in hidden or len(said) > 1):
             note = "the actuator hardly moves: its loss is not isolable from a constant"
-        elif kind == "isolated" and kept > 1:
+        elif kind == "isolated" and len(said) > 1:
             note = "not isolated in time"
-        sizes, _, _ = window.estimate(best)
-        return Event(kind, now, tuple((self.labels[c], float(weight[c])) for c in order[:kept]),
-                     now - int(window.peak[best]) + 1, self.columns.in_order(best, sizes),
-                     float(window.statistic[best]), note)
+        return self._told(kind, now, said, best, window, note)
+
+    def _told(self, kind: str, now: int, said: tuple[tuple[str, float], ...], best: int, window: Window, note: str = ""
+              ) -> Event:
+        """Return an event with onset and size of its first label, in the group of the best candidate."""
+        own = [c for c in self.group(best) if window.peak[c]]
+        family = [c for c in own if has_constants(self.columns.candidates[c])]
+        same = [c for c in own if self.labels[c] == said[0][0]]
+        is_offset = bool(same) and self.columns.candidates[same[0]].additive
+        number = family[0] if family and not is_offset else (same or [best])[0]
+        sizes, _, _ = window.estimate(number)
+        return Event(kind, now, said, now - int(window.peak[number]) + 1, self.columns.in_order(number, sizes),
+                     float(window.statistic[number]), note)
 
     def _review(self, now: int, window: Window, plant: RunningFilter) -> Event | None:
         """Clear carried faults that have vanished, hold those that have converged; return the first one cleared."""
@@ -227,12 +361,29 @@ class Decisions:
             energy = float(sizes @ np.linalg.pinv(covariance, rcond=1e-12, hermitian=True) @ sizes)
             if energy < self.rules["forgiven"] * self.q[owner]:
                 plant.release(rows, own, window)
+                self.undecided = [one for one in self.undecided if one[0] != owner]
                 return Event("cleared", now, ((self.labels[owner], 1.0),))
+            if event := self._revise(now, owner, sizes, covariance):
+                return event
             left = sum(window.length * plant.directions[p].power * plant.P[n + p, n + p] for p in rows)
             seen = min(plant.directions[p].age for p in rows) >= window.length
             if seen and 0 < left < self.rules["learned"]:
                 for p in reversed(rows):
                     plant.forget(p, window)
+        return None
+
+    def _revise(self, now: int, owner: int, sizes: Array, covariance: Array) -> Event | None:
+        """Return the event of a carried actuator whose kind has become clearer."""
+        for one in self.undecided:
+            if one[0] != owner:
+                continue
+            logs = self._evidence(owner, sizes, covariance)
+            most = max(logs.values())
+            said = likeliest({label: float(np.exp(log - most)) for label, log in logs.items()})
+            labels = [label for label, _ in said]
+            if set(labels) < set(one[1]) or (said[0][1] >= self.rules["certainty"] and labels != one[1]):
+                one[1] = labels
+                return Event("revised", now, said, size=self.columns.in_order(owner, sizes))
         return None
 
     def _noisy_sensor(self, now: int, window: Window) -> Event | None:

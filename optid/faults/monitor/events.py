@@ -9,9 +9,12 @@ class Event:
     """An event reported by the monitor.
 
     Attributes:
-        kind: "alarm", "isolated" (one candidate is left, or several after the time allowed), "cleared", "untestable"
-            (a total loss of the actuator is not detectable, or not isolable from a constant), "testable" (again),
-            "outside" (an input left the identified range) or "inside" (again).
+        kind: "alarm"; "isolated" (one candidate is left, or several after the time allowed); "revised" (fewer kinds of
+            an isolated actuator are left, or another one); "cleared"; "untestable" (a total loss of the actuator is not
+            detectable, or not isolable from a constant), "testable" (again); "outside" (an input left the identified
+            range), "inside" (again); "untrusted" (a channel is far outside the range of the identification since
+            before the onset, and the model does not describe the plant there: no fault is named until a window after
+            it is back, which is "cleared"); or "adapted" (the thresholds, to the colour of the noise).
         sample: counted from the first sample of the stream.
         candidates: (label, posterior) of the 95 % set, most probable first; ("unknown", 1.0) where none explains it.
         onset: first sample of the fault, of the first candidate; for "untestable" the first untestable sample.
@@ -57,7 +60,7 @@ class Carried:
 
     label: str  # the candidate
     size: tuple[float, ...]  # its magnitudes
-    deviation: tuple[float, ...]  # their standard deviations; zero once they are held and no longer estimated
+    deviation: tuple[float, ...]  # their standard deviations
 
     def __str__(self) -> str:
         """Return the fault in one line."""

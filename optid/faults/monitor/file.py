@@ -17,10 +17,10 @@ from optid.models.files import from_content, read_state, write_state
 if TYPE_CHECKING:
     from optid.faults.monitor.monitoring import Monitor
 
-VERSION = 4
+VERSION = 5
 """Version of the file."""
 
-WORDS = "name", "kind", "columns", "members", "places", "bounded_deflection"
+WORDS = "name", "kind", "columns", "members", "places", "bounded_deflection", "zero"
 PLACES = "into_state", "into_output"
 PREDICTOR = "A", "C", "L", "K", "covariance", "root"
 
@@ -76,7 +76,7 @@ def load(monitor: "Monitor", path: str | Path, functions: dict[str, Any] | None 
         monitor.plant.certain = head["certain"]
         monitor.plant.directions = [Direction(**one) for one in head["directions"]]
         monitor.checks.memory = head["readings"]
-        monitor.decisions.q = monitor.calibration.q
+        monitor._use(monitor.calibration)
         monitor.decisions.testable = np.array(head["decisions"]["testable"], dtype=bool)
         for name in Decisions.KEPT:
             setattr(monitor.decisions, name, head["decisions"][name])

@@ -8,7 +8,7 @@ import numpy as np
 
 from optid.arrays import Array, as_list
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning
+from optid.errors import DataError, DataWarning, StructureError
 from optid.faults.monitor.arl import COMMON, Calibration
 from optid.faults.nuisance import CONFIDENCE, ModelUncertainty, sensitivities
 from optid.faults.ranges import outside, unsure_since
@@ -29,6 +29,9 @@ ORDERS = 1, 2, 3, 4, 6, 8
 LONGEST = 3000
 """Samples of the identification along which the effect of uncertain parameters is simulated."""
 
+
+FOLLOWED, SLOWEST = 1 / 60, 600
+"""Time constant of a filter that follows slow disturbances, as a share of theirs, and their fewest samples."""
 
 RAISED, REFUSED = 3.0, 10.0
 """Factors by which a healthy record may raise energies: above the first one with a warning, above the second not."""
@@ -57,9 +60,12 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
                                   sensitivities(known.model, known.predictor, here, x0, there, known.root))
         by_parameter -= by_start @ np.linalg.lstsq(by_start, by_parameter, rcond=None)[0]
         raw_effect = np.linalg.pinv(known.predictor.root) @ by_parameter.reshape(*here.y.shape, -1)
-        effect, taps = raw_effect.copy(), steady.C[:, known.model.nx :]  # the last states are past innovations
-        for lag in range(1, taps.shape[1] // here.y.shape[1] + 1):
-            effect[lag:] -= taps[:, (lag - 1) * len(taps) : lag * len(taps)] @ raw_effect[:-lag]
+        n, l = known.model.nx, here.y.shape[1]  # noqa: E741
+        if steady.A.shape[0] > n:  # the last states shape the innovations of the model
+            shape = Predictor(steady.A[n:, n:], steady.C[:, n:], np.zeros((len(steady.A) - n, l)), steady.K[n:],
+                              steady.covariance, steady.root)
+            raw_effect = shape.respond(np.zeros((len(here.y), len(shape.A), raw_effect.shape[2])), raw_effect)
+        effect = raw_effect
         effects.append(steady.root @ effect)
         inputs.append(known.model.expanded(here.u))
     effect = np.concatenate(effects)
@@ -76,6 +82,8 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     innovations are states beside those of the plant.
     """
     steady = found.predictor
+    if steady.silent:  # the innovations along declared disturbances are not judged; thresholds are raised instead
+        return found, ""
     whole: list[Any] = as_list(whiten(found.model, healthy, scale=steady))
     parts = [replace(part, present=part.present & ~unsure_since(found.model, record.u, steady.settling)[:, None])
              for part, record in zip(whole, healthy.raw().experiments)]
@@ -119,17 +127,38 @@ def _autoregression(signals: list[Array], orders: tuple[int, ...]) -> tuple[list
 
 def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dictionary:
     """Augment the state by an autoregression of the innovations."""
-    model, steady = found.model, found.predictor
-    n, l, p = model.nx, model.l, len(taps)  # noqa: E741
-    more = p * l
+    l, p = found.model.l, len(taps)  # noqa: E741
     mix = np.hstack(taps) if taps else np.zeros((l, 0))
+    A, K = np.zeros((p * l, p * l)), np.eye(p * l, l)
+    A[:l], A[l:, : p * l - l] = mix, np.eye(max(p * l - l, 0))
+    return _shaped(found, A, mix, K, covariance)
+
+
+def without_drift(found: Dictionary, samples: float) -> Dictionary:
+    """Return a dictionary whose predictor follows slow disturbances of the outputs.
+
+    The innovations e of the model count as a line that changes slowly, s+ = s + v + a w, v+ = v + b w, and a white rest
+    w = e - s. Both poles of the filter are 1 - 1 / (`FOLLOWED` samples): a hundredth, (2 pi `FOLLOWED`)^2, is left of a
+    period of so many samples, and a constant fault is forgotten with the same poles.
+
+    Raises:
+        StructureError: fewer than `SLOWEST` samples.
+    """
+    if not samples >= SLOWEST:
+        raise StructureError(f"drift={samples!r}: slow disturbances must take {SLOWEST} samples at least.")
+    l, pole = found.model.l, 1 - 1 / (FOLLOWED * samples)  # noqa: E741
+    A = np.kron(np.array([[1.0, 1.0], [0.0, 1.0]]), np.eye(l))
+    K = np.kron([[1 - pole**2], [(1 - pole) ** 2]], np.eye(l))
+    return _shaped(found, A, np.kron([[1.0, 0.0]], np.eye(l)), K, found.predictor.covariance)
+
+
+def _shaped(found: Dictionary, A_s: Array, C_s: Array, K_s: Array, covariance: Array) -> Dictionary:
+    """Augment the state: the innovations of the model are e = C_s s + w, s+ = A_s s + K_s w, w of this covariance."""
+    model, steady = found.model, found.predictor
+    n, more = model.nx, len(A_s)
     A = np.zeros((n + more, n + more))
-    A[:n, :n], A[:n, n:] = model.A, steady.K @ mix
-    if more:
-        A[n : n + l, n:] = mix
-        A[n + l :, n : n + more - l] = np.eye(more - l)
-    C = np.hstack([model.C, mix])
-    K = np.vstack([steady.K, np.eye(l)[:, :l], np.zeros((max(more - l, 0), l))])[: n + more]
+    A[:n, :n], A[:n, n:], A[n:, n:] = model.A, steady.K @ C_s, A_s
+    C, K = np.hstack([model.C, C_s]), np.vstack([steady.K, K_s])
 
     def padded(part: Array) -> Array:
         return np.vstack([part, np.zeros((more, part.shape[1]))])
@@ -209,4 +238,5 @@ def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calib
     if np.sum(largest > base.common) > bdtrik(CONFIDENCE, len(largest), COMMON):
         factor = max(factor, float(np.quantile(largest, 1 - COMMON)) / base.common)
     _check_rise(factor, "the thresholds", levels, 1.0, window)
-    return replace(base, q=factor * base.q, samples=base.samples + sum(len(part.y) for part in records))
+    return replace(base, q=factor * base.q, spreads=factor * base.spreads,
+                   samples=base.samples + sum(len(part.y) for part in records))

@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike
 from optid.arrays import Array
 from optid.data.record import Data
 from optid.errors import DataError, DataWarning, StructureError
+from optid.faults.monitor.actuator_kinds import searched
 from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
-from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect
+from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect, without_drift
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT, expand
@@ -62,7 +63,7 @@ class Monitor:
         self, model: "HammersteinSS", faults: Dictionary | None = None, arl0: float = 10_000, window: int = 100,
         seed: int | None = 0, thresholds: Any = None, *, x0: Any = "unknown", healthy: Data | None = None,
         uncertainty: Data | ModelUncertainty | None = None, u: ArrayLike | None = None, samples: int | None = None,
-        extrapolate: bool = False, **rules: float,
+        extrapolate: bool = False, drift: float | None = None, **rules: float,
     ) -> None:
         """Set up a monitor; the thresholds are simulated unless they are known.
 
@@ -82,6 +83,8 @@ class Monitor:
                 the intervals of the nonlinearities by default.
             samples: length of the simulation.
             extrapolate: whether thresholds may be extrapolated beyond what the simulation supports.
+            drift: samples over which slow disturbances that are no faults change, such as those of a season; a fault
+                that grows as slowly is not found.
             rules: numbers of the decisions, see `RULES`.
 
         Raises:
@@ -93,7 +96,7 @@ class Monitor:
                 a model whose parameters are not the most likely ones.
         """
         found = dictionary(model, kinds=KINDS_BY_DEFAULT) if faults is None else faults
-        if found.model is not model:
+        if not found.belongs_to(model):
             raise StructureError("faults: the dictionary belongs to another model; build it from this one.")
         least = 2 * model.nx + 2
         if isinstance(window, bool) or int(window) != window or window < least:
@@ -103,9 +106,13 @@ class Monitor:
             raise StructureError(f"{', '.join(sorted(unknown))}: no such argument. Rules: {', '.join(RULES)}.")
         effect, inputs, known, remarks = None, None, uncertainty, []
         if known is not None:
-            known = known if isinstance(known, ModelUncertainty) else model_uncertainty(model, known)
+            silent = found.predictor if found.predictor.silent else None
+            known = known if isinstance(known, ModelUncertainty) else model_uncertainty(found.model, known,
+                                                                                        decoupled=silent)
             found = replace(found, predictor=known.predictor)
             remarks.append(known.remark)
+        if drift is not None:
+            found = without_drift(found, drift)
         if healthy is not None:
             found, remark = observed(found, healthy)
             remarks.append(remark)
@@ -115,7 +122,8 @@ class Monitor:
         if known is not None and isinstance(uncertainty, Data):
             effect, inputs = parameter_effect(known, uncertainty, found.predictor)
         rules = {**RULES, **({"beyond": 1.0} if known is None else {}), **rules}  # an exact model has no errors
-        self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}))
+        self._set(found, int(window), seed, rules | ({} if found.unknown else {"odd": np.inf}),
+                  None if known is None else known.levels)
         for c in found.candidates:
             if c.label in self.skipped and c.kind != "loss":  # the gains of sensors are among the kinds by default
                 warnings.warn(f"{c.label} is not monitored: {self.skipped[c.label]}.", DataWarning, stacklevel=2)
@@ -126,23 +134,24 @@ class Monitor:
             self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
                 self.calibration = calibrated_on(self, healthy, self.calibration)
-        self.decisions.q = self.calibration.q
+        self._use(self.calibration)
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
         elif not (isinstance(x0, str) and x0 == "zero"):
             self.plant.x[:] = state_like(x0, (model.nx,))
 
-    def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float]) -> None:
+    def _set(self, found: Dictionary, window: int, seed: int | None, rules: dict[str, float],
+             levels: Array | None = None) -> None:
         """Set up everything but the thresholds."""
         self.dictionary, self.window, self.seed, self.source = found, window, seed, None
-        chosen = tuple(c for c in found.candidates if c.kind in COURSES and not (c.kind == "loss" and not c.columns))
+        chosen = searched([c for c in found.candidates if c.kind in COURSES and (c.kind != "loss" or c.columns)])
         if not chosen:
             raise StructureError("No candidate has a signature that a monitor can search for: add the kind 'bias'.")
         self.labels = tuple(c.label for c in chosen)
         self.skipped = {
             c.label: "it is detected from the readings in any case" if c.kind in ("frozen", "noise") else
             "it has no signature that a running search can search for"
-            for c in found.candidates if c not in chosen
+            for c in found.candidates if c.label not in self.labels
         }
         model, steady = found.model, found.predictor
         if not model.parts.tables.compiled:
@@ -151,12 +160,20 @@ class Monitor:
         self.columns = columns_of(model, chosen)
         self.search = Window(self.columns, window, model.nx + SPARE + 2 * int(self.columns.size.max()), steady)
         self.plant = RunningFilter(model, steady, self.columns)
-        self.checks = ReadingChecks(model)
-        self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), rules, model.outputs,
-                                   np.ones(len(chosen), dtype=bool), [])
+        self.checks = ReadingChecks(model, levels)
+        self.decisions = Decisions(self.columns, self.labels, np.full(len(chosen), np.inf), np.ones(len(chosen)), rules,
+                                   model.outputs, np.ones(len(chosen), dtype=bool), [], found.candidates)
         self.samples = 0
         self._functions = tabulated(model.nonlinearities)
         self._input_of, self._output_of = (np.array(of, dtype=np.int64) for of in (model.input_of, model.output_of))
+
+    def _use(self, found: Calibration) -> None:
+        """Decide by a calibration."""
+        self.calibration, own = found, self.decisions
+        own.q, own.spreads, own.common = found.q, found.spreads, found.common
+        if own.rules["adapt"] > 1 and not np.isfinite(found.common):
+            raise StructureError("adapt: thresholds that are given have no simulated windows to compare with; leave "
+                                 "either out.")
 
     def _simulated(self, f: Array, effect: Array | None, arl0: float, **how: Any) -> Calibration:
         c = self.columns
@@ -185,7 +202,7 @@ class Monitor:
         q = np.array(thresholds, dtype=float)
         if q.shape != (len(self.labels),) or not np.all(q > 0):
             raise StructureError(f"thresholds: give one positive number for each of {', '.join(self.labels)}.")
-        return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None)
+        return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None, np.ones(len(q)))
 
     def _rehearsed(self, u: ArrayLike | None) -> Array:
         model = self.dictionary.model
@@ -256,14 +273,19 @@ class Monitor:
             clean = int(stops[np.searchsorted(stops, k)])
             if self.decisions.raised:  # the thresholds stay the same up to here
                 clean = min(clean, k + int(self.decisions.raised[0][0]) + self.window + 1 - self.samples)
+            adapts = self.decisions.rules["adapt"] > 1
+            if adapts:  # at multiples of the window
+                clean = min(clean, k + self.window - self.samples % self.window)
             if clean > k and self.plant.certain and self.decisions.waiting:
                 k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
+                events += self._adapt() if adapts else []
                 continue
             if k in screened.frozen:
                 self._excuse(screened.frozen[k])
             if screened.distance[k] > 1:
                 self.decisions.leave_range(self.samples, float(screened.distance[k]))
             self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
+            events += self._adapt() if adapts else []
             k += 1
         return sorted(events, key=lambda e: e.sample)
 
@@ -276,7 +298,7 @@ class Monitor:
         plant.x, plant.before = x[done].copy(), f[done - 1].copy()
         self.samples += done
         decisions.count_quiet(statistic)
-        last = decisions.judge(self.samples - 1, self.search, plant, hold=False)
+        last = decisions.judge(self.samples - 1, self.search, plant, self.checks.excursion)
         events += decisions.excitation(weight if last is None else weight[:-1], now, self.window)
         events += [] if last is None else [last]
         return done
@@ -299,11 +321,34 @@ class Monitor:
             decisions.begun = now + 1
         decisions.count_quiet(statistic)
         watching = decisions.phase == WATCHING
-        event = decisions.judge(now, self.search, plant, hold=repeating)
+        event = decisions.judge(now, self.search, plant, self.checks.excursion, hold=repeating)
         if event is not None:
             events.append(event)
         elif watching and decisions.phase == WATCHING:
             events += decisions.excitation(weight, now, self.window)
+
+    def _adapt(self) -> list[Event]:
+        return [] if self.samples % self.window else self.decisions.adapt(self.samples - 1)
+
+    # -- operators -------------------------------------------------------------------------------------------------
+
+    def acknowledge(self) -> None:
+        """Discard the alarm, and search again from the next sample on."""
+        self.decisions.forgive(self.search)
+
+    def rebase(self) -> None:
+        """Take a new baseline, after a repair: discard the alarm and all carried faults."""
+        plant = self.plant
+        plant.release(list(range(len(plant.directions))), slice(0, len(plant.held)), self.search)
+        self.decisions.passing, self.decisions.undecided, self.decisions.windows = [], [], []
+        self.acknowledge()
+        plant.lose()
+
+    def skip(self, count: int) -> None:
+        """Count samples without a search, during maintenance; the state of the plant is unknown after them."""
+        self.samples += count
+        self.acknowledge()
+        self.plant.lose()
 
     def _excuse(self, onset: int) -> None:
         """Discard the effects of a sensor that has been found frozen."""
@@ -351,16 +396,17 @@ class Monitor:
     def carried(self) -> tuple[Carried, ...]:
         """The isolated faults whose effect is compensated."""
         plant, size, found = self.plant, self.plant.held.copy(), []
-        variance = np.zeros(len(size))
+        variance = plant.held_variance.copy()
         for at, one in enumerate(plant.directions, self.dictionary.model.nx):
             if self.columns.course[one.column] != DRIFT or one.growth > 0:
                 size[one.column] += plant.x[at]
                 variance[one.column] += plant.P[at, at]
-        for number, label in enumerate(self.labels):
+        for number in range(len(self.labels)):
             own = self.columns.of(number)
             if size[own].any() or any(one.owner == number for one in plant.directions):
-                found.append(Carried(label, *(self.columns.in_order(number, part[own])
-                                              for part in (size, np.sqrt(variance)))))
+                spread = np.sqrt(self.decisions.spreads[number] * variance[own])
+                found.append(Carried(self.decisions.label_of(number), self.columns.in_order(number, size[own]),
+                                     self.columns.in_order(number, spread)))
         return tuple(found)
 
     @property

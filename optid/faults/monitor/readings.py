@@ -10,6 +10,13 @@ from optid.faults.ranges import known_range, usable_range
 from optid.faults.readings import SensorChecks
 from optid.models import HammersteinSS
 
+BEYOND = 1.1
+"""Distance from the middle of the range, in half ranges, from which a channel is far outside it; a linear function of
+an input is extrapolated further."""
+
+EXCURSIONS = 100
+"""Excursions that are kept."""
+
 
 class Screened(NamedTuple):
     """A block of samples after the checks."""
@@ -29,10 +36,12 @@ class ReadingChecks:
         model: the plant.
         low, high: (m,) identified range of the inputs, infinite where none is known.
         sensors: the checks of the readings.
+        levels: (2, l) lowest and highest readings of the identification; None where they are not known.
+        excursions: [channel, first sample, last sample or None] of channels far outside their range.
     """
 
-    def __init__(self, model: HammersteinSS) -> None:
-        """Begin a stream."""
+    def __init__(self, model: HammersteinSS, levels: Array | None = None) -> None:
+        """Begin a stream; `levels` (2, l) are the lowest and highest readings of the identification, if known."""
         m, l = model.m, model.l  # noqa: E741
         self.model, self.low, self.high = model, np.full(m, -np.inf), np.full(m, np.inf)
         self._lowest, self._highest = self.low.copy(), self.high.copy()
@@ -40,21 +49,61 @@ class ReadingChecks:
             self.low[c], self.high[c] = max(self.low[c], low), min(self.high[c], high)
             self._lowest[c], self._highest[c] = max(self._lowest[c], lowest), min(self._highest[c], highest)
         self.sensors, self._outside = SensorChecks(l), [-1] * m
+        self.excursions: list[Any] = []
+        self._use(levels)
+
+    def _use(self, levels: Array | None) -> None:
+        """Take the ranges of inputs and outputs beyond which a channel is far outside."""
+        l = self.model.l  # noqa: E741
+        low, high = np.full((2, l), np.inf) * [[-1.0], [1.0]] if levels is None else levels
+        ends, self.levels = [_widened(self.low, self.high), _widened(low, high)], levels
+        self._least = np.concatenate([np.fmin(ends[0][0], self._lowest), ends[1][0]])
+        self._most = np.concatenate([np.fmax(ends[0][1], self._highest), ends[1][1]])
 
     @property
     def memory(self) -> dict[str, Any]:
-        """Counters by sensor, and the samples at which inputs left their range, in JSON types."""
-        return {**self.sensors.memory, "outside": self._outside}
+        """Counters by sensor, and where channels left their range, in JSON types."""
+        return {**self.sensors.memory, "outside": self._outside, "excursions": self.excursions,
+                "levels": None if self.levels is None else np.asarray(self.levels).tolist()}
 
     @memory.setter
     def memory(self, kept: dict[str, Any]) -> None:
+        self._use(None if kept["levels"] is None else np.array(kept["levels"]))
         self.sensors.memory, self._outside = {word: kept[word] for word in self.sensors.memory}, kept["outside"]
+        self.excursions = kept["excursions"]
+
+    def excursion(self, since: int, before: int) -> tuple[str, int] | None:
+        """Return a channel that was far outside its range after `since`, having left it `before` a sample, and when."""
+        for name, first, last in self.excursions:
+            if first < before and (last is None or last >= since):
+                return name, first
+        return None
+
+    def _follow(self, u: Array, y: Array, start: int) -> None:
+        """Keep the excursions of channels far outside their range."""
+        both, kept = np.hstack([u, y]), []
+        names = [f"input:{name}" for name in self.model.inputs] + [f"output:{name}" for name in self.model.outputs]
+        far = np.asarray((both < self._least) | (both > self._most))
+        unknown, open_ = np.isnan(both), {one[0]: one for one in self.excursions if one[2] is None}
+        for c, name in enumerate(names):
+            if not far[:, c].any() and name not in open_:
+                continue
+            line, known = far[:, c], np.flatnonzero(~unknown[:, c])
+            changes = known[np.flatnonzero(np.diff(line[known], prepend=name in open_))]
+            for k in changes.tolist():
+                if line[k]:
+                    open_[name] = [name, start + k, None]
+                    kept.append(open_[name])
+                else:
+                    open_.pop(name)[2] = start + k - 1
+        self.excursions = (self.excursions + kept)[-EXCURSIONS:]
 
     def screen(self, u: Array, y: Array, start: int) -> Screened:
         """Check a block of inputs (T, m) and readings (T, l) that begins at the sample `start` of the stream."""
         outside, blind = np.asarray((u < self.low) | (u > self.high)), np.asarray(np.isnan(u).any(axis=1))
         distance, (at, c) = np.ones(len(u)), np.nonzero(outside)
         np.maximum.at(distance, at, np.abs(2 * u[at, c] - self.low[c] - self.high[c]) / (self.high[c] - self.low[c]))
+        self._follow(u, y, start)
         clean, repeating, findings = self.sensors.screen(y, blind, start)
         unsure = np.asarray((u < self._lowest) | (u > self._highest) | np.isnan(u))
         found = Screened(clean, unsure, distance, repeating, [], {})
@@ -84,3 +133,10 @@ class ReadingChecks:
             elif not outside[k] and since[c] >= 0 and not np.isnan(u[k]):
                 events.append(Event("inside", start + k, name, since[c]))
                 since[c] = -1
+
+
+def _widened(low: Array, high: Array) -> tuple[Array, Array]:
+    """Return ranges extended to `BEYOND`; infinite ones, and those of one value, are unlimited."""
+    span = np.subtract(high, low, where=np.isfinite(low) & np.isfinite(high), out=np.full(low.shape, np.inf))
+    room = np.where(span > 0, (BEYOND - 1) / 2 * span, np.inf)
+    return low - room, high + room

@@ -62,19 +62,21 @@ class RunningFilter:
         N: (n, d) combinations of states that are unknown, beside P.
         directions: (q,) the constants.
         held: (D,) magnitudes that are no longer estimated.
+        held_variance: (D,) of these.
         before: (r,) functions of the inputs of the sample before.
         certain: whether the steady predictor is exact.
         strength: largest energy of a state of unit size in one innovation.
         response: (n, n) whose product with a state has the norm of its effect on all later innovations.
     """
 
-    KEPT = "x", "P", "N", "held", "before"
+    KEPT = "x", "P", "N", "held", "held_variance", "before"
 
     def __init__(self, model: HammersteinSS, steady: Predictor, columns: Columns) -> None:
         """Start from a known state of zero."""
         self.model, self.steady, self.columns = model, steady, columns
         self.x, self.P = np.zeros(model.nx), np.zeros((model.nx, model.nx))
-        self.held, self.before = np.zeros(len(columns.course)), np.zeros(model.B.shape[1])
+        self.held, self.held_variance = np.zeros(len(columns.course)), np.zeros(len(columns.course))
+        self.before = np.zeros(model.B.shape[1])
         self.directions: list[Direction] = []
         self.certain = True
         self.strength = float(np.max(np.sum((steady.root @ steady.C) ** 2, axis=0), initial=1e-300))
@@ -96,8 +98,9 @@ class RunningFilter:
         for j in np.flatnonzero(self.held):
             number = self.columns.driven[j]
             if number >= 0:
-                add_product(self.held[j] * self.columns.losses[number][0], f, into_state)
-                add_product(self.held[j] * self.columns.losses[number][1], f, into_output)
+                used = np.ascontiguousarray(f - self.columns.rest[number])
+                add_product(self.held[j] * self.columns.losses[number][0], used, into_state)
+                add_product(self.held[j] * self.columns.losses[number][1], used, into_output)
             else:
                 into_state += self.held[j] * self.columns.into_state[j]
                 into_output += self.held[j] * self.columns.into_output[j]
@@ -238,6 +241,7 @@ class RunningFilter:
         """Stop estimating a constant; its estimate is held."""
         n, one = self.model.nx, self.directions.pop(p)
         self.held[one.column] += self.x[n + p] * one.grown
+        self.held_variance[one.column] += self.P[n + p, n + p] * one.grown**2
         self.x, self.P = np.delete(self.x, n + p), np.delete(np.delete(self.P, n + p, 0), n + p, 1)
         if window is not None:
             window.drop(n + p)
@@ -248,7 +252,7 @@ class RunningFilter:
             self.forget(p, window)
         later, _ = self.columns.units(self.before, self.before)
         self.x[: self.model.nx] -= self.held[own] @ later[own]
-        self.held[own] = 0.0
+        self.held[own] = self.held_variance[own] = 0.0
 
     def room(self, count: int) -> None:
         """Hold the oldest constants until there is room for so many new ones."""

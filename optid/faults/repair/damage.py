@@ -83,10 +83,18 @@ def damages(model: "HammersteinSS", answer: "Answer") -> list[Damage]:
     return [_damage(model, parts, answer.posterior / len(variants)) for parts in variants]
 
 
-def merged(broken: list[Damage]) -> list[Damage]:
+def _may_be_none(fault: "Estimate") -> bool:
+    """Whether no interval of the size of a fault that changes the plant excludes zero."""
+    lasting = fault.kind in ("bias", "drift", "loss", "stuck") and not fault.name.startswith("sensor:")
+    intervals = np.asarray(fault.size_interval, dtype=float)
+    return lasting and intervals.size > 0 and bool(np.all((intervals[:, 0] <= 0) & (intervals[:, 1] >= 0)))
+
+
+def merged(model: "HammersteinSS", broken: list[Damage]) -> list[Damage]:
     """Merge explanations that break the same parts, as a loss and a stuck actuator do, which are refitted alike.
 
-    The most probable one is kept, with the sum of their probabilities.
+    So are an actuator and a disturbance of the states where it enters. The most probable one is kept, with the sum of
+    their probabilities.
     """
     groups: dict[Any, list[Damage]] = {}
     for one in sorted(broken, key=lambda one: -one.posterior):
@@ -94,7 +102,22 @@ def merged(broken: list[Damage]) -> list[Damage]:
                frozenset(one.louder_sensors), bool(one.louder_states.any()))
         groups.setdefault(key, []).append(one)
     found = [replace(group[0], posterior=sum(one.posterior for one in group)) for group in groups.values()]
+    for one in list(found):  # what is added where an actuator enters, its refit adds, too
+        wider = next((w for w in found if w.columns and not w.offsets and w.sensors == one.sensors
+                      and _covers(model.B[:, list(w.columns)], one)), None)
+        if wider is not None:
+            found.remove(one)
+            at = found.index(wider)
+            found[at] = replace(wider, posterior=wider.posterior + one.posterior)
     return sorted(found, key=lambda one: -one.posterior)
+
+
+def _covers(into: Array, other: Damage) -> bool:
+    """Whether constants that enter along the columns of (n, r) have the effect of all that an explanation adds."""
+    if not other.offsets or other.columns or other.louder_sensors or other.louder_states.any():
+        return False
+    return all(not c.into_output.any() and np.linalg.matrix_rank(np.hstack([into, c.into_state]), tol=1e-9)
+               == np.linalg.matrix_rank(into, tol=1e-9) for c in other.offsets)
 
 
 def _damage(model: "HammersteinSS", parts: Sequence[tuple[str, "Estimate"]], posterior: float) -> Damage:
@@ -109,7 +132,9 @@ def _damage(model: "HammersteinSS", parts: Sequence[tuple[str, "Estimate"]], pos
         size = np.asarray(fault.size, dtype=float)
         known = bool(np.all(np.isfinite(size)))
         into_state = fault.candidate.into_state
-        if fault.kind == "spike":
+        if known and _may_be_none(fault):
+            notes.append(f"{place}: the interval of its size contains none: the plant stays as it was")
+        elif fault.kind == "spike":
             notes.append(f"{channel}: single readings were wrong; no part is broken")
         elif part == "actuator":
             mine = [i for i, of in enumerate(model.input_of) if of == channel_of(model.inputs, place)]

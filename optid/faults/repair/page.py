@@ -6,7 +6,6 @@ import numpy as np
 
 from optid.faults.page import write_page
 from optid.faults.repair.reformulation import HEADS, Reformulation
-from optid.faults.repair.schedule import fit_words
 from optid.show.wording import Table, number
 
 TONES = {"healthy": "good", "refitted": "good", "as diagnosed": "fair", "ambiguous": "bad"}
@@ -52,9 +51,8 @@ def _cards(found: Reformulation) -> list[tuple[str, str]]:
     cards = []
     if found.schedule is not None:
         cards.append(("samples after the fault", str(found.schedule.samples)))
-        low, high = found.fit_interval
-        if np.isfinite(low):
-            cards.append(("expected simulation fit", fit_words(low, high)))
+        cards += [(f"rms error of {name} at most", number(value, 3)) for name, value in found.error_bound.items()
+                  if np.isfinite(value)]
     cards += [(f"predicted RMSE of {name}", number(found.observer.rmse[name], 3)) for name in found.observer.lost]
     if found.allocation is not None:
         cards.append(("actuators that move", ", ".join(found.allocation.moving) or "none"))

@@ -32,6 +32,7 @@ HEADS = {
     "healthy": "healthy: the plant is as it was",
     "refitted": "one explanation; the model is refitted",
     "as diagnosed": "one explanation; the model is that of the diagnosis",
+    "not repaired": "one explanation; its refit is not offered, and the model stays the healthy one",
     "ambiguous": "several explanations; the model stays the healthy one until one is left",
 }
 """The statuses in words."""
@@ -74,7 +75,8 @@ class Reformulation:
     """The damaged system; `print` it, or ask `attainable`.
 
     Attributes:
-        status: "healthy" (unchanged), "refitted", "as diagnosed" (without a refit) or "ambiguous".
+        status: "healthy" (unchanged), "refitted", "as diagnosed" (without a refit), "not repaired" (the refit is no
+            better than the healthy model, or too uncertain) or "ambiguous".
         healthy: the model before the fault.
         model: the model to use: the healthy one while the diagnosis is ambiguous.
         observer: filter on the remaining sensors; of an ambiguous diagnosis those that no member suspects.
@@ -96,9 +98,10 @@ class Reformulation:
     notes: tuple[str, ...] = ()
 
     @property
-    def fit_interval(self) -> tuple[float, float]:
-        """90 % interval (%) of the simulation fit from the uncertainty of the refit; NaN without a refit."""
-        return (float("nan"), float("nan")) if self.schedule is None else self.schedule.fit_interval
+    def error_bound(self) -> dict[str, float]:
+        """{output: upper bound of the rms error of a later run}; empty without a refit."""
+        promise = None if self.schedule is None else self.schedule.promise
+        return {} if promise is None else dict(zip(promise.outputs, promise.bound.tolist()))
 
     def attainable(self, reference: ArrayLike) -> Target:
         """Return the steady state nearest to a reference (l,), its distance, and the actuators that limit it.
@@ -136,7 +139,7 @@ def reformulate(
     model: "HammersteinSS", diagnosis: "Diagnosis", data: Any = None, *,
     constraints: Sequence[Any] | str = "default", prior: Prior | None = None, nodes: int = NODES, stage: str = "auto",
     low: ArrayLike | None = None, high: ArrayLike | None = None, weights: ArrayLike | None = None,
-    route: str = "auto", if_ambiguous: str = "auto", solver: Any = "auto", seed: int = 0,
+    route: str = "auto", if_ambiguous: str = "auto", solver: Any = "auto", seed: int = 0, healthy: Any = None,
 ) -> Reformulation:
     """Return the damaged system from a healthy model and a diagnosis.
 
@@ -161,6 +164,8 @@ def reformulate(
         if_ambiguous: "wait", "probe", "robust", or "auto".
         solver: back end.
         seed: of draws and probes.
+        healthy: a later healthy record, whose error of the healthy model the promised error includes; the samples
+            before the fault by default.
 
     Raises:
         DataError: a record that does not go with the model or the diagnosis.
@@ -174,6 +179,7 @@ def reformulate(
     _check(model, diagnosis, stage, nodes, if_ambiguous)
     if data is not None and not isinstance(data, Data):
         data = record_of(model, data)
+    healthy = healthy if healthy is None else record_of(model, healthy)
     bounds: dict[str, Any] = {"low": low, "high": high, "weights": weights, "solver": solver}
 
     def allocated(plant: "HammersteinSS") -> tuple[Allocation | None, list[str]]:
@@ -187,14 +193,14 @@ def reformulate(
     if diagnosis.verdict == "healthy":
         allocation, notes = allocated(model)
         return Reformulation("healthy", model, model, observer(model), allocation, None, (), None, tuple(notes))
-    broken, members = merged([one for answer in diagnosis.candidates for one in damages(model, answer)]), []
+    broken, members = merged(model, [one for answer in diagnosis.candidates for one in damages(model, answer)]), []
     for damage in broken:
         watched, schedule = damage.with_noise(model), None
         plant = damage.believed(watched)
         if damage.needs_refit and data is not None:
             plant, schedule = refit(
                 watched, without_sensors(data, damage.sensors), damage, constraints=constraints, prior=prior,
-                nodes=nodes, stage=stage, solver=solver, seed=seed)
+                nodes=nodes, stage=stage, solver=solver, seed=seed, healthy=healthy)
         allocation, notes = allocated(plant)
         if damage.needs_refit and data is None:
             notes.append("no record: the plant has the sizes of the diagnosis")
@@ -202,8 +208,9 @@ def reformulate(
                                    (*damage.notes, *notes)))
     if len(members) == 1:
         only = members[0]
-        refitted = only.schedule is not None and only.schedule.stage != "prior"
-        return Reformulation("refitted" if refitted else "as diagnosed", model, only.model, only.observer,
+        stages = {"prior": "as diagnosed", "none": "not repaired"}
+        status = "as diagnosed" if only.schedule is None else stages.get(only.schedule.stage, "refitted")
+        return Reformulation(status, model, only.model, only.observer,
                              only.allocation, only.schedule, (only,), None, only.notes)
     distrusted = sorted({name for one in broken for name in one.sensors})
     allocation, notes = allocated(model)

@@ -12,7 +12,9 @@ from optid.data.record import Data
 from optid.errors import DataWarning, RankError
 from optid.faults.repair.curves import Curve
 from optid.faults.repair.damage import Damage
+from optid.faults.repair.promise import CONFIDENCE, Promise, errors, rms, upper_rms
 from optid.faults.repair.refitting import NODES, Prior, Refitting, refitting
+from optid.models.experiments import in_units_of
 
 if TYPE_CHECKING:
     from optid.models import HammersteinSS
@@ -39,48 +41,41 @@ STAGES = ("affected only", "all with prior")
 class Schedule:
     """How the model was refitted."""
 
-    stage: str  # "prior" (too few samples), "affected only" or "all with prior"
+    stage: str  # "prior" (too few samples), "affected only", "all with prior" or "none" (not offered)
     samples: int  # samples after the fault
     least: int  # fewest samples for a refit
     # {stage: mean squared whitened innovation of the samples held out}; empty where only one was tried
     held_out: dict[str, float]
     values: tuple[Curve, ...]  # the damaged nonlinearities
     offsets: dict[str, Array]  # {fault: estimated size}
-    # 90 % interval of the simulation fit (%) from the uncertainty of the refit; NaN without one
-    fit_interval: tuple[float, float]
+    promise: Promise | None  # what is known of its errors; None without a refit
     active: tuple[str, ...]  # constraints that bind
     solution: "Solution | None" = field(default=None, repr=False)  # of the last programme; None without one
     reason: str = ""  # why this stage
 
     def __str__(self) -> str:
-        """Return the stage, the reason, the fit expected and the values."""
+        """Return the stage, the reason, the error promised and the values."""
         lines = [f"refit: {self.stage}, {self.samples} samples after the fault ({self.reason})"]
         if self.solution is not None:
             proof = f"gap {self.solution.gap:.1e}" if self.solution.proof else "no proof of global optimality"
             lines.append(f"  {self.solution.solver}: {self.solution.status}, {proof}")
         if self.active:
             lines.append(f"  binding: {', '.join(self.active)}")
-        if np.isfinite(self.fit_interval[0]):
-            low, high = self.fit_interval
-            lines.append(f"  expected simulation fit {fit_words(low, high)}")
+        if self.promise is not None:
+            refusal = self.promise.refusal
+            lines.append(f"  not offered: {refusal}" if refusal else f"  {self.promise}")
         lines += [f"  {name}: {np.array2string(size, precision=4)}" for name, size in self.offsets.items()]
         return "\n".join([*lines, *(str(values) for values in self.values)])
-
-
-def fit_words(low: float, high: float) -> str:
-    """Return the words for an interval of a fit (%); below zero its value means nothing."""
-    if high <= 0:
-        return "none: the simulated outputs are smaller than the uncertainty of the refit"
-    return f"{max(low, 0.0):.1f} to {high:.1f} %"
 
 
 def refit(
     model: "HammersteinSS", data: Data, damage: Damage, *, constraints: Sequence[Any] | str = "default",
     prior: Prior | None = None, nodes: int = NODES, stage: str = "auto", solver: Any = "auto", seed: int = 0,
+    healthy: Data | None = None,
 ) -> tuple["HammersteinSS", Schedule]:
     """Refit what a fault broke, or all parameters where that predicts held-out samples better.
 
-    Arguments other than the damage are those of `reformulate`.
+    Arguments other than the damage are those of `reformulate`. A repair that is not offered leaves the model as it was.
 
     Warns:
         DataWarning: too few samples for a refit, with the least number; part of the input range that no sample visits.
@@ -92,31 +87,33 @@ def refit(
         counted = sum(1 if i in damage.dead else nodes for i in damage.columns) + sum(
             c.into_state.shape[1] for c in damage.offsets)
         after = max(0, data.experiments[0].y.shape[0] - damage.onset)
-        none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, (float("nan"), float("nan")), (), None,
+        none = Schedule("prior", after, -(-counted // model.l), {}, (), {}, None, (), None,
                         "too few for a refit: the model is that of the diagnosis")
         return damage.believed(model), none
     if prior is None and narrow.curves:  # of the curvatures the one that makes the record most probable
         tried = [replace(narrow, prior=replace(narrow.prior, curvature=curvature)) for curvature in BENDS]
         narrow = max(tried, key=Refitting.evidence)
     scores: dict[str, float] = {}
+    tried_on: dict[str, Any] = {}
+    last = narrow.windows[-1]
+    samples = max(3, int(HELD_OUT * (len(last.u) - int(last.held))))
     reason = "as asked for"
     if stage == "auto":
         stage, reason = "affected only", f"fewer than {FEWEST} samples: all parameters are not tried"
         if damage.dead:
             reason = "a dead actuator has one value" if narrow.samples >= FEWEST else reason
         elif narrow.samples >= FEWEST:
-            last = narrow.windows[-1]
-            samples = max(3, int(HELD_OUT * (len(last.u) - int(last.held))))
             readings = max(1, int(last.present[-samples:].sum()))
             for word in STAGES:
                 problem = replace(narrow, whole=word == "all with prior")
-                theta = _solved(problem.held_out(samples), constraints, solver).model.theta
+                tried_on[word] = _solved(problem.held_out(samples), constraints, solver)
+                theta = tried_on[word].model.theta
                 scores[word] = float(np.sum(problem.linearised(theta)[0][-readings:] ** 2)) / readings
             better = scores["affected only"] - scores["all with prior"] > MARGIN / readings
             stage, reason = STAGES[int(better)], "by hold-out"
     problem = replace(narrow, whole=stage == "all with prior")
     found = _solved(problem, constraints, solver)
-    theta, model = found.model.theta, found.model.model
+    before, theta = model, found.model.theta
     sensitivities = problem.linearised(theta)[1]
     covariance = problem.covariance(sensitivities)
     curves = tuple(_estimated(problem, curve, theta, covariance, sensitivities) for curve in problem.curves)
@@ -128,15 +125,39 @@ def refit(
                 f"{one.seen[1]:.3g}): the values there are prior only.", DataWarning, stacklevel=3,
             )
     offsets = {c.label: problem.unpack(theta)[f"size[{c.label}]"] for c in problem.offsets}
-    for c in problem.offsets:
-        last = 1.0 if c.kind != "drift" else float(len(problem.windows[0].u) - int(problem.windows[0].held))
-        model = replace(model, offset_x=model.offset_x + c.into_state @ (last * offsets[c.label]))
+    model = _plant(problem, theta)
     duals, objective = found.solution.duals, max(found.solution.objective, 1e-300)
     active = tuple(name for name in found.program.user_constraints
                    if np.max(np.abs(duals.get(name, 0.0)), initial=0.0) > 1e-6 * objective)
     least = -(-sum(curve.values_open for curve in curves) // model.l)
-    return model, Schedule(stage, problem.samples, least, scores, curves, offsets,
-                           _fit_interval(problem, theta, covariance, seed), active, found.solution, reason)
+    promised = None
+    if narrow.samples >= FEWEST:
+        trial = tried_on.get(stage) or _solved(problem.held_out(samples), constraints, solver)
+        raw = in_units_of(before, data)
+        ends, first = raw.select(experiments=raw.n_experiments - 1), raw.select(experiments=0)
+        held = ends.window(ends.n_samples - samples, ends.n_samples)
+        sound = first.window(0, damage.onset) if healthy is None and damage.onset >= FEWEST else healthy
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            repaired, unrepaired = errors(_plant(problem, trial.model.theta), held), errors(before, held)
+            promised = Promise(
+                before.outputs, upper_rms(np.full((1, before.l), np.nan) if sound is None else errors(before, sound)),
+                upper_rms(repaired), rms(unrepaired), rms(repaired), _spread(problem, theta, covariance, ends, seed),
+                np.sqrt(np.diag(problem.steady.covariance)), not model.is_stable)
+    refused = promised is not None and bool(promised.refusal)
+    schedule = Schedule("none" if refused else stage, problem.samples, least, scores, curves, offsets, promised, active,
+                        found.solution, reason)
+    return before if refused else model, schedule
+
+
+def _plant(problem: Refitting, theta: Array) -> "HammersteinSS":
+    """Return the model of a refit, with what the faults add at the end of the record."""
+    model = problem.model_at(theta)
+    for c in problem.offsets:
+        last = 1.0 if c.kind != "drift" else float(len(problem.windows[0].u) - int(problem.windows[0].held))
+        size = problem.unpack(theta)[f"size[{c.label}]"]
+        model = replace(model, offset_x=model.offset_x + c.into_state @ (last * size))
+    return model
 
 
 def _solved(problem: Refitting, constraints: Sequence[Any] | str, solver: Any) -> Any:
@@ -161,25 +182,18 @@ def _estimated(problem: Refitting, curve: Curve, theta: Array, covariance: Array
                    std=np.sqrt(np.maximum(np.diag(spread), 0.0)))
 
 
-def _fit_interval(problem: Refitting, theta: Array, covariance: Array, seed: int) -> tuple[float, float]:
-    """Return the 5 and 95 % points of the fit of the model to models drawn from the posterior of the unknowns."""
+def _spread(problem: Refitting, theta: Array, covariance: Array, data: Data, seed: int) -> Array:
+    """Return the rms difference (l,) that models drawn from the posterior of the unknowns reach with `CONFIDENCE`."""
     sizes, axes = np.linalg.eigh((covariance + covariance.T) / 2)
     root = axes * np.sqrt(np.maximum(sizes, 0.0))
-    u = np.vstack([w.u for w in problem.windows])[-2000:]
-    model = problem.model_at(theta)
-    if not model.is_stable or model.feedback or model.L.any():
-        return float("nan"), float("nan")
-    x0 = np.linalg.lstsq(np.eye(model.nx) - model.A, model.B @ model.expanded(u[:1])[0] + model.offset_x, rcond=None)[0]
-    own, fits = model.simulate(u, x0=x0), []
+    model, count = problem.model_at(theta), min(len(problem.windows[-1].u), 2000)
+    record = data.window(data.n_samples - count, data.n_samples)
+    own, found = errors(model, record), []
     rng = np.random.default_rng(seed)
     for _ in range(DRAWS):
         other = problem.model_at(theta + root @ rng.standard_normal(theta.size))
-        if not other.is_stable:
-            continue
-        y = other.simulate(u, x0=x0)
-        size = float(np.linalg.norm(y - y.mean(axis=0)))
-        fits.append(100 * (1 - float(np.linalg.norm(y - own)) / size) if size > 0 else 100.0)
-    if len(fits) < DRAWS / 2:
-        return float("nan"), float("nan")
-    low, high = np.quantile(fits, [0.05, 0.95])
-    return float(low), float(high)
+        if other.is_stable == model.is_stable:
+            found.append(rms(errors(other, record) - own))
+    if len(found) < DRAWS / 2:
+        return np.full(model.l, np.inf)
+    return np.quantile(np.nan_to_num(np.array(found)), CONFIDENCE, axis=0)

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from optid.arrays import Array
 from optid.bases import Basis, Linear
 from optid.data.record import Data
-from optid.errors import DataError, StructureError
+from optid.errors import DataError, RankError, StructureError
 from optid.identify.prediction_error.descent import Criterion
 from optid.identify.subspace.realisation import state_model
 from optid.models import HammersteinSS, Nonlinearity
@@ -33,6 +33,7 @@ NUMBERS = 500_000  # entries of the sensitivities formed at a time
 WILD = 10.0  # times the range of the record that the run of an iterate must not leave
 ROUNDING = 1e-9  # share of an interval within which its ends are the same
 FLOOR = 1e-7  # smallest standard deviation of an error that weights may rest on, as a share of that of its output
+DEPENDENT = 1e-12  # smallest eigenvalue of the correlation of errors that can be weighted
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +168,21 @@ class StateErrors(Criterion):
         covariance = np.diag(variances)
         if full and len(complete) > 10 * errors.shape[1]:
             covariance = complete.T @ complete / len(complete) + np.diag(floor**2)
+            self._check_rank(covariance)
         return replace(self, weight=np.linalg.inv(covariance))
+
+    def _check_rank(self, covariance: Array) -> None:
+        """Refuse errors of outputs that determine one another: `RankError`."""
+        sizes = np.sqrt(np.diag(covariance))
+        values, axes = np.linalg.eigh(covariance / np.outer(sizes, sizes))
+        if values[0] < DEPENDENT:
+            names = [name for name, share in zip(self.data.outputs, axes[:, 0]) if abs(share) > 0.1]
+            remedy = "leave one of them out"
+            if any(self.unknowns.feedthrough):
+                remedy += ("; if a controller computes an input from them at once, what was fitted is its inverse: fit "
+                           "without it, feedthrough=false")
+            raise RankError(f"the prediction errors of {', '.join(names)} determine one another to {DEPENDENT:.0e} of "
+                            f"their variance, so that they cannot be weighted: {remedy}")
 
     def level(self, x: Array, full: bool = False) -> float:
         """Return the log determinant that `reweighted` lowers, which compares points of different weights."""
