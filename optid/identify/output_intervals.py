@@ -1,0 +1,253 @@
+"""Intervals around simulated and predicted outputs, of the parameters and of the noise.
+
+A run of the model is a function of its parameters like any other: its standard error follows from the linearised fit
+(`optid.identify.uncertainty`). The noise at the outputs adds to it independently. Its variance h samples ahead is
+``sum_{j<h} H_j R H_j'`` for the response H of the noise model and the covariance R of the innovations, and that of the
+stationary noise for a simulation (Ljung, System Identification, 1999, section 3.2). A noise model can be wrong where
+the response is right, and the record of the fit shows how far the same run was off there: the larger one counts.
+"""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import stdtrit
+
+from optid.arrays import Array, as_list, check_integer, check_probability, one_or_all
+from optid.data.record import Data
+from optid.errors import DataWarning, RankError, StructureError
+from optid.identify.record_checks import list_outside
+from optid.identify.uncertainty import Interval, Uncertainty
+from optid.identify.validation.predictions import one_step_or_nan, simulated_or_nan
+from optid.models.experiments import records_of
+from optid.models.functions import has_feedback
+from optid.models.model import ROUNDING, impulse_response
+from optid.models.roots import spectral_radius
+
+Run = Callable[[Any], Sequence[Array]]  # from a model to its outputs (N, l), one array per experiment
+
+
+@dataclass(frozen=True, eq=False)
+class OutputInterval(Interval):
+    """Outputs with intervals that contain a measured output with probability `level`; every array is (N, l), or (N,).
+
+    The arrays are NaN where there is no prediction.
+
+    Attributes:
+        value: simulated or predicted outputs.
+        error: standard deviation of a measured output about `value`: the root of the sum of the squares of both parts.
+        parameters: standard error due to the parameters, that of the output without noise.
+        noise: standard deviation of the noise.
+        level: probability that an interval contains the measured output.
+        notes: what the intervals do not account for, one sentence each.
+    """
+
+    parameters: Array = field(kw_only=True)
+    noise: Array = field(kw_only=True)
+    level: float = field(kw_only=True)
+    notes: tuple[str, ...] = field(default=(), kw_only=True)
+
+    def share_inside(self, y: Array) -> Array:
+        """Return the share (l,) of the samples of measured outputs y (N, l) inside; NaN in y or here leaves one out."""
+        measured = np.reshape(np.asarray(y, dtype=float), np.shape(self.value))
+        known = np.isfinite(measured) & np.isfinite(self.lower)
+        inside = known & (self.lower <= measured) & (measured <= self.upper)
+        with np.errstate(invalid="ignore"):
+            return np.atleast_1d(inside.sum(axis=0) / known.sum(axis=0))
+
+
+class NoiseFilter(NamedTuple):
+    """The noise at the outputs, ``(I + C (qI - F)^-1 K) e`` with white e."""
+
+    F: Array  # (n, n)
+    K: Array  # (n, l)
+    C: Array  # (l, n)
+    covariance: Array  # (l, l) of e
+
+    def variances(self, ahead: int) -> Array:
+        """Return the variances (ahead, l) of what e of the last 1, 2, ... samples adds to the outputs."""
+        response = impulse_response(self.F, self.K, self.C, np.eye(len(self.C)), ahead)
+        return np.cumsum(np.einsum("kip,pq,kiq->ki", response, self.covariance, response), axis=0)
+
+    def stationary(self) -> Array | None:
+        """Return the variances (l,) of the stationary noise; None where there is none."""
+        from scipy.linalg import solve_discrete_lyapunov
+
+        if not self.K.any():
+            return np.diag(self.covariance)
+        if spectral_radius(self.F) >= 1 - ROUNDING:
+            return None
+        states = solve_discrete_lyapunov(self.F, self.K @ self.covariance @ self.K.T)
+        return np.diag(self.C @ states @ self.C.T + self.covariance)
+
+
+def simulation_intervals(fit: Any, data: Any, x0: Any, level: float) -> Any:
+    """Return the `OutputInterval` of a simulation; a tuple for several experiments.
+
+    The initial state "zero", or a state, counts as known; "fit" follows the parameters. The noise is stationary, or
+    begins with the record where an integrator adds it up.
+
+    Args:
+        fit: a fit with an uncertainty.
+        data: Data, or inputs (N,) or (N, m), or a list of such arrays, in raw units.
+        x0: initial state, as of `Model.simulate`.
+        level: probability that an interval contains the measured output, in (0, 1).
+
+    Raises:
+        StructureError: an impossible level, a fit without uncertainty, or the state of a state-space model, which has
+            no meaning in the coordinates of another one.
+        DataError: as of `Model.simulate`.
+        RankError: parameters without effect on the predictions.
+    """
+    model = fit.model
+    check_probability(level, "interval")
+    if model.structure == "ss" and not isinstance(x0, str) and any(np.any(one) for one in as_list(x0)):
+        raise StructureError("x0 is given in the state coordinates of this model, which change with its parameters, so "
+                             "that it has no interval. Use x0='zero', or a record and x0='fit'")
+    records, flat = records_of(model, data)
+    known, flat = _known(fit), flat and model.l == 1
+
+    def run(one: Any) -> Sequence[Array]:
+        return as_list(one.simulate(data, x0))
+
+    def deviations(count: int) -> Array:
+        return np.broadcast_to(noise_deviations(fit, known, None, count), (count, model.l))
+
+    return _intervals(known.at_level(level), run, deviations, [len(u) for u, _, _ in records], flat)
+
+
+def prediction_intervals(fit: Any, data: Data, horizon: int, level: float) -> Any:
+    """Return the `OutputInterval` of a prediction so many samples ahead; a tuple for several experiments.
+
+    Arguments and errors are as of `simulation_intervals` and `Model.predict`.
+    """
+    check_probability(level, "interval")
+    horizon, records, known = check_integer(horizon, "horizon"), records_of(fit.model, data)[0], _known(fit)
+
+    def run(model: Any) -> Sequence[Array]:
+        return as_list(model.predict(data, horizon))
+
+    def deviations(count: int) -> Array:
+        return np.broadcast_to(noise_deviations(fit, known, horizon, count), (count, fit.model.l))
+
+    return _intervals(known.at_level(level), run, deviations, [len(u) for u, _, _ in records], False)
+
+
+def with_notes(found: Any, fit: Any, data: Any) -> Any:
+    """Return intervals with what they do not account for; each note is also a `DataWarning`."""
+    notes = []
+    misfits = fit.verdict.misfits if isinstance(fit.data, Data) else ()
+    if misfits:
+        listed = ", ".join(f"{part.name}: {part.value}" for part in misfits)
+        notes.append(f"The intervals are optimistic: they assume that the structure of the model is right, and the "
+                     f"verdict finds misfit ({listed}).")
+    u = np.vstack([one for one, _, _ in records_of(fit.model, data)[0]])
+    functions = getattr(fit.model, "nonlinearities", ())
+    for f, place in zip(functions, getattr(fit.model, "input_of", range(len(functions)))):
+        share = 0.0 if f.is_linear else float(np.mean(f.basis.is_outside(u[:, place])))
+        notes += [f"The intervals do not account for extrapolation: {one}."
+                  for one in list_outside("input", fit.model.inputs[place], share, f.basis)]
+    if fit.model.levels is not None:
+        notes.append("Every experiment of the fit has a constant of its own: the intervals do not account for that of "
+                     "another record.")
+    for note in notes:
+        warnings.warn(note, DataWarning, stacklevel=3)
+    return one_or_all([replace(one, notes=tuple(notes)) for one in as_list(found)])
+
+
+def noise_deviations(fit: Any, known: Uncertainty, horizon: int | None, count: int) -> Array:
+    """Return the standard deviations (l,) or (count, l) of the noise, of a simulation where the horizon is None.
+
+    Raises:
+        StructureError: neither a noise model nor a run over the record of the fit tells them.
+    """
+    of_model, seen = noise_filter(fit.model, known), None
+    variances = None
+    if of_model is not None:
+        variances = of_model.stationary() if horizon is None else of_model.variances(horizon)[-1]
+        if variances is None:
+            return np.sqrt(of_model.variances(count))
+    if isinstance(fit.data, Data):
+        seen = _seen_variances(fit.model, fit.data.raw(), horizon) * _inflation(known)
+    if variances is None and (seen is None or np.isnan(seen).any()):
+        raise StructureError("the variance of the noise is unknown: the model has no noise model, and no run over the "
+                             "record of the fit shows it")
+    return np.sqrt(np.fmax(*(np.zeros(fit.model.l) if one is None else one for one in (variances, seen))))
+
+
+def noise_filter(model: Any, known: Uncertainty) -> NoiseFilter | None:
+    """Return the noise at the outputs of a free run; None of a model without noise model, or that does not filter it.
+
+    With functions of outputs or states the noise at the outputs depends on where the model is.
+    """
+    if model.structure in ("arx", "armax", "bj"):
+        size = model.l
+        past = model.matrices if model.structure == "arx" else model.noise_denominator.reshape(-1, 1, 1)
+        n = max(len(past), model.c.size)
+        D, c = np.zeros((n, size, size)), np.zeros((n, size, size))
+        D[: len(past)], c[: model.c.size] = past, model.c.reshape(-1, 1, 1)
+        F = np.eye(n * size, k=size)
+        F[:, :size] -= D.reshape(n * size, size)
+        return NoiseFilter(F, (c - D).reshape(n * size, size), np.eye(size, n * size), known.source.noise)
+    if model.structure != "ss" or model.noise is None or has_feedback(model) or model.latent:
+        return None
+    covariance = model.noise.innovation * _inflation(known)
+    return NoiseFilter(model.A + model.L @ model.C, model.K + model.L, model.C, covariance)
+
+
+def _inflation(known: Uncertainty) -> float:
+    """Return what the mean square of residuals is multiplied with for the parameters that were fitted."""
+    local = known.source.local
+    return 1.0 + len(local.centre) / known.source.noise.shape[0] / local.dof
+
+
+def _seen_variances(model: Any, raw: Data, horizon: int | None) -> Array:
+    """Return the mean square (l,) of the errors of a simulation or prediction of a record; NaN where there is none."""
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", DataWarning)
+        runs = simulated_or_nan(model, raw) if horizon is None else one_step_or_nan(model, raw, horizon)
+        errors = np.vstack([e.y - run for e, run in zip(raw.experiments, runs)])
+        known = np.isfinite(errors)
+        return np.sum(np.where(known, errors, 0.0) ** 2, axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+
+
+def _known(fit: Any) -> Uncertainty:
+    if fit.model is None:
+        raise StructureError(f"this fit has no model: {fit.solution.reason or fit.solution.status}")
+    try:
+        return fit.uncertainty
+    except (StructureError, RankError) as error:
+        raise type(error)(f"no intervals without standard errors of the parameters: {error}") from error
+
+
+def _intervals(known: Uncertainty, run: Run, deviations: Callable[[int], Array], counts: Sequence[int], flat: bool
+               ) -> Any:
+    """Join the intervals of a run (N, l) per experiment, by the parameters, with the deviations of the noise."""
+    values = [np.asarray(one) for one in run(known.model)]  # with its warnings, those of the neighbours repeat them
+    values = [one.reshape(count, -1) for one, count in zip(values, counts)]
+    here = np.isfinite(np.vstack(values))
+
+    def outputs(model: Any) -> Array:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)
+            return np.vstack([np.reshape(one, (count, -1)) for one, count in zip(run(model), counts)])[here]
+
+    found, ends = known.of(outputs), np.cumsum(counts)[:-1]
+    quantile = float(stdtrit(known.source.local.dof, 0.5 + known.level / 2))
+
+    def spread_out(part: Array) -> list[Array]:
+        whole = np.full(here.shape, np.nan)
+        whole[here] = part
+        return np.split(whole, ends)
+
+    parts = zip(values, *map(spread_out, (found.error, found.value - found.lower, found.upper - found.value)))
+    made = []
+    for value, error, below, above in parts:
+        noise = np.where(np.isnan(value), np.nan, deviations(len(value)))
+        arrays = value, np.hypot(error, noise), value - np.hypot(below, quantile * noise), value + np.hypot(
+            above, quantile * noise), error, noise
+        value, total, lower, upper, error, noise = (one[:, 0] if flat else one for one in arrays)
+        made.append(OutputInterval(value, total, lower, upper, parameters=error, noise=noise, level=known.level))
+    return one_or_all(made)
