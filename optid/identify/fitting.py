@@ -222,6 +222,8 @@ class Fit(Rendered):
         a measured output with this probability; see `optid.identify.output_intervals.prediction_intervals`.
         """
         given = self._record() if data is None else data
+        if not isinstance(given, Data):
+            raise DataError(not_a_record(given, "fit.predict"))
         if interval is None:
             return self.model.predict(given, horizon)
         from optid.identify.output_intervals import prediction_intervals, with_notes

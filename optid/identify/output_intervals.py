@@ -18,6 +18,7 @@ from scipy.special import stdtrit
 from optid.arrays import Array, as_list, check_integer, check_probability, one_or_all
 from optid.data.record import Data
 from optid.errors import DataWarning, RankError, StructureError
+from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.record_checks import list_outside
 from optid.identify.uncertainty import Interval, Uncertainty
 from optid.identify.validation.predictions import one_step_or_nan, simulated_or_nan
@@ -25,7 +26,9 @@ from optid.models.experiments import records_of
 from optid.models.functions import has_feedback
 from optid.models.model import ROUNDING, impulse_response
 from optid.models.roots import spectral_radius
+from optid.structures.whitening import symmetric_root
 
+LONGEST = 4096  # samples of a response of the noise whose spectrum is computed, at most
 Run = Callable[[Any], Sequence[Array]]  # from a model to its outputs (N, l), one array per experiment
 
 
@@ -49,13 +52,12 @@ class OutputInterval(Interval):
     level: float = field(kw_only=True)
     notes: tuple[str, ...] = field(default=(), kw_only=True)
 
-    def share_inside(self, y: Array) -> Array:
-        """Return the share (l,) of the samples of measured outputs y (N, l) inside; NaN in y or here leaves one out."""
+    def counts_inside(self, y: Array) -> tuple[Array, Array]:
+        """Return how many samples (l,) of measured outputs y (N, l) are inside, and of how many, those without NaN."""
         measured = np.reshape(np.asarray(y, dtype=float), np.shape(self.value))
         known = np.isfinite(measured) & np.isfinite(self.lower)
         inside = known & (self.lower <= measured) & (measured <= self.upper)
-        with np.errstate(invalid="ignore"):
-            return np.atleast_1d(inside.sum(axis=0) / known.sum(axis=0))
+        return np.atleast_1d(inside.sum(axis=0)), np.atleast_1d(known.sum(axis=0))
 
 
 class NoiseFilter(NamedTuple):
@@ -66,21 +68,32 @@ class NoiseFilter(NamedTuple):
     C: Array  # (l, n)
     covariance: Array  # (l, l) of e
 
+    def response(self, count: int) -> Array:
+        """Return what a unit of e adds to the outputs of so many samples, (count, l, l)."""
+        return impulse_response(self.F, self.K, self.C, np.eye(len(self.C)), count)
+
     def variances(self, ahead: int) -> Array:
         """Return the variances (ahead, l) of what e of the last 1, 2, ... samples adds to the outputs."""
-        response = impulse_response(self.F, self.K, self.C, np.eye(len(self.C)), ahead)
+        response = self.response(ahead)
         return np.cumsum(np.einsum("kip,pq,kiq->ki", response, self.covariance, response), axis=0)
 
-    def stationary(self) -> Array | None:
-        """Return the variances (l,) of the stationary noise; None where there is none."""
+    def stationary(self, nearest: float = ROUNDING) -> Array | None:
+        """Return the variances (l,) of the stationary noise; None where a pole comes so near to the unit circle."""
         from scipy.linalg import solve_discrete_lyapunov
 
         if not self.K.any():
             return np.diag(self.covariance)
-        if spectral_radius(self.F) >= 1 - ROUNDING:
+        if spectral_radius(self.F) >= 1 - nearest:
             return None
         states = solve_discrete_lyapunov(self.F, self.K @ self.covariance @ self.K.T)
         return np.diag(self.C @ states @ self.C.T + self.covariance)
+
+
+class Noise(NamedTuple):
+    """The noise at the outputs of a run."""
+
+    deviations: Array  # (l,) standard deviations, or (N, l) where they grow
+    dof: Array  # (l,) degrees of freedom of their estimate
 
 
 def simulation_intervals(fit: Any, data: Any, x0: Any, level: float) -> Any:
@@ -112,10 +125,8 @@ def simulation_intervals(fit: Any, data: Any, x0: Any, level: float) -> Any:
     def run(one: Any) -> Sequence[Array]:
         return as_list(one.simulate(data, x0))
 
-    def deviations(count: int) -> Array:
-        return np.broadcast_to(noise_deviations(fit, known, None, count), (count, model.l))
-
-    return _intervals(known.at_level(level), run, deviations, [len(u) for u, _, _ in records], flat)
+    counts = [len(u) for u, _, _ in records]
+    return _intervals(known.at_level(level), run, output_noise(fit, known, None, max(counts)), counts, flat)
 
 
 def prediction_intervals(fit: Any, data: Data, horizon: int, level: float) -> Any:
@@ -129,10 +140,8 @@ def prediction_intervals(fit: Any, data: Data, horizon: int, level: float) -> An
     def run(model: Any) -> Sequence[Array]:
         return as_list(model.predict(data, horizon))
 
-    def deviations(count: int) -> Array:
-        return np.broadcast_to(noise_deviations(fit, known, horizon, count), (count, fit.model.l))
-
-    return _intervals(known.at_level(level), run, deviations, [len(u) for u, _, _ in records], False)
+    counts = [len(u) for u, _, _ in records]
+    return _intervals(known.at_level(level), run, output_noise(fit, known, horizon, max(counts)), counts, False)
 
 
 def with_notes(found: Any, fit: Any, data: Any) -> Any:
@@ -157,24 +166,37 @@ def with_notes(found: Any, fit: Any, data: Any) -> Any:
     return one_or_all([replace(one, notes=tuple(notes)) for one in as_list(found)])
 
 
-def noise_deviations(fit: Any, known: Uncertainty, horizon: int | None, count: int) -> Array:
-    """Return the standard deviations (l,) or (count, l) of the noise, of a simulation where the horizon is None.
+def output_noise(fit: Any, known: Uncertainty, horizon: int | None, count: int) -> Noise:
+    """Return the noise at so many outputs of a prediction, or of a simulation where the horizon is None.
+
+    A variance estimated from errors of the spectrum S has the degrees of freedom of ``mean(S)^2 / mean(S^2)`` times as
+    many white ones (Bartlett).
 
     Raises:
-        StructureError: neither a noise model nor a run over the record of the fit tells them.
+        StructureError: neither a noise model nor a run over the record of the fit tells the variance.
     """
-    of_model, seen = noise_filter(fit.model, known), None
+    model, dof = fit.model, known.source.local.dof
+    own, raw = noise_filter(model, known), fit.data.raw() if isinstance(fit.data, Data) else None
+    nearest = ROUNDING if raw is None else 1 / max(e.n_samples for e in raw.experiments)
     variances = None
-    if of_model is not None:
-        variances = of_model.stationary() if horizon is None else of_model.variances(horizon)[-1]
+    if own is not None:
+        variances = own.stationary(nearest) if horizon is None else own.variances(horizon)[-1]
         if variances is None:
-            return np.sqrt(of_model.variances(count))
-    if isinstance(fit.data, Data):
-        seen = _seen_variances(fit.model, fit.data.raw(), horizon) * _inflation(known)
-    if variances is None and (seen is None or np.isnan(seen).any()):
+            return Noise(np.sqrt(own.variances(count)), np.full(model.l, dof))
+    errors = None if raw is None else _errors(model, raw, horizon)
+    seen = None if errors is None else np.nanmean(np.vstack(errors) ** 2, axis=0) * _inflation(known)
+    if variances is None and seen is None:
         raise StructureError("the variance of the noise is unknown: the model has no noise model, and no run over the "
                              "record of the fit shows it")
-    return np.sqrt(np.fmax(*(np.zeros(fit.model.l) if one is None else one for one in (variances, seen))))
+    if own is not None and len(own.F):
+        response = own.response(min(count, LONGEST) if horizon is None else horizon) @ symmetric_root(own.covariance)
+    else:
+        response = np.eye(model.l)[None] if errors is None else ErrorNoise(errors).response
+    spectrum = np.sum(np.abs(np.fft.rfft(response, 2 * len(response), axis=0)) ** 2, axis=2)
+    whole = np.vstack([spectrum, spectrum[1:-1]])  # of negative frequencies, too
+    independent = np.mean(whole, axis=0) ** 2 / np.mean(whole**2, axis=0)
+    deviations = np.sqrt(np.max([one for one in (variances, seen) if one is not None], axis=0))
+    return Noise(deviations, np.maximum(dof * independent, 1.0))
 
 
 def noise_filter(model: Any, known: Uncertainty) -> NoiseFilter | None:
@@ -182,7 +204,9 @@ def noise_filter(model: Any, known: Uncertainty) -> NoiseFilter | None:
 
     With functions of outputs or states the noise at the outputs depends on where the model is.
     """
-    if model.structure in ("arx", "armax", "bj"):
+    if model.structure in ("process", "physical"):
+        return NoiseFilter(np.zeros((0, 0)), np.zeros((0, model.l)), np.zeros((model.l, 0)), known.source.noise)
+    if model.structure in ("arx", "armax", "bj", "oe"):
         size = model.l
         past = model.matrices if model.structure == "arx" else model.noise_denominator.reshape(-1, 1, 1)
         n = max(len(past), model.c.size)
@@ -203,14 +227,13 @@ def _inflation(known: Uncertainty) -> float:
     return 1.0 + len(local.centre) / known.source.noise.shape[0] / local.dof
 
 
-def _seen_variances(model: Any, raw: Data, horizon: int | None) -> Array:
-    """Return the mean square (l,) of the errors of a simulation or prediction of a record; NaN where there is none."""
+def _errors(model: Any, raw: Data, horizon: int | None) -> list[Array] | None:
+    """Return the errors (N, l) of a simulation or prediction of every experiment; None where an output has none."""
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", DataWarning)
         runs = simulated_or_nan(model, raw) if horizon is None else one_step_or_nan(model, raw, horizon)
-        errors = np.vstack([e.y - run for e, run in zip(raw.experiments, runs)])
-        known = np.isfinite(errors)
-        return np.sum(np.where(known, errors, 0.0) ** 2, axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+        errors = [e.y - run for e, run in zip(raw.experiments, runs)]
+    return errors if np.isfinite(np.vstack(errors)).any(axis=0).all() else None
 
 
 def _known(fit: Any) -> Uncertainty:
@@ -222,32 +245,29 @@ def _known(fit: Any) -> Uncertainty:
         raise type(error)(f"no intervals without standard errors of the parameters: {error}") from error
 
 
-def _intervals(known: Uncertainty, run: Run, deviations: Callable[[int], Array], counts: Sequence[int], flat: bool
-               ) -> Any:
-    """Join the intervals of a run (N, l) per experiment, by the parameters, with the deviations of the noise."""
-    values = [np.asarray(one) for one in run(known.model)]  # with its warnings, those of the neighbours repeat them
-    values = [one.reshape(count, -1) for one, count in zip(values, counts)]
+def _intervals(known: Uncertainty, run: Run, noise: Noise, counts: Sequence[int], flat: bool) -> Any:
+    """Join the intervals of a run (N, l) per experiment, by the parameters, with those of the noise."""
+    values = [np.reshape(one, (count, -1)) for one, count in zip(run(known.model), counts)]
     here = np.isfinite(np.vstack(values))
 
     def outputs(model: Any) -> Array:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)
+            warnings.simplefilter("ignore", DataWarning)  # given for the model of the fit
             return np.vstack([np.reshape(one, (count, -1)) for one, count in zip(run(model), counts)])[here]
 
-    found, ends = known.of(outputs), np.cumsum(counts)[:-1]
-    quantile = float(stdtrit(known.source.local.dof, 0.5 + known.level / 2))
-
-    def spread_out(part: Array) -> list[Array]:
+    def of_experiments(part: Array) -> list[Array]:
         whole = np.full(here.shape, np.nan)
         whole[here] = part
-        return np.split(whole, ends)
+        return np.split(whole, np.cumsum(counts)[:-1])
 
-    parts = zip(values, *map(spread_out, (found.error, found.value - found.lower, found.upper - found.value)))
-    made = []
-    for value, error, below, above in parts:
-        noise = np.where(np.isnan(value), np.nan, deviations(len(value)))
-        arrays = value, np.hypot(error, noise), value - np.hypot(below, quantile * noise), value + np.hypot(
-            above, quantile * noise), error, noise
-        value, total, lower, upper, error, noise = (one[:, 0] if flat else one for one in arrays)
-        made.append(OutputInterval(value, total, lower, upper, parameters=error, noise=noise, level=known.level))
+    found, made = known.of(outputs), []
+    quantiles = stdtrit(noise.dof, 0.5 + known.level / 2)
+    for value, error, below, above in zip(values, *map(of_experiments, (
+            found.error, found.value - found.lower, found.upper - found.value))):
+        deviations = noise.deviations[: len(value)] if noise.deviations.ndim > 1 else noise.deviations
+        own = np.where(np.isnan(value), np.nan, deviations)
+        arrays = (value, np.hypot(error, own), value - np.hypot(below, quantiles * own),
+                  value + np.hypot(above, quantiles * own), error, own)
+        value, total, lower, upper, error, own = (one[:, 0] if flat else one for one in arrays)
+        made.append(OutputInterval(value, total, lower, upper, parameters=error, noise=own, level=known.level))
     return one_or_all(made)

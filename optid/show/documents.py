@@ -199,7 +199,7 @@ def _validations(fit: "Fit", test: Data | None) -> list[Any]:
         if isinstance(record, Data):
             parts += [Heading(title), *attempt("The validation", partial(_validation, fit.model, record))]
             if record is test:
-                parts += attempt("The figure of the test record", partial(_test_charts, fit.model, record))
+                parts += attempt("The figure of the test record", partial(_test_charts, fit, record))
     return parts
 
 
@@ -210,8 +210,10 @@ def _validation(model: Any, record: Data) -> list[Any]:
         return [Notes([f"No validation: {error}"])]
 
 
-def _test_charts(model: Any, record: Data) -> list[Any]:
-    return [Charts(charts.record_charts({"": model}, record, group="test"), wide=True)]
+def _test_charts(fit: "Fit", record: Data) -> list[Any]:
+    bands, said = charts.interval_band(fit, record)
+    return [*([Notes(said)] if said else []),
+            Charts(charts.record_charts({"": fit.model}, record, group="test", bands=bands), wide=True)]
 
 
 def validation_parts(checked: Validation) -> list[Any]:
