@@ -79,7 +79,7 @@ def test_noise_of_every_class_by_its_response(arx):
     impulse = np.eye(1, 4000)[0]
     innovation = arx.uncertainty.source.noise[0, 0]
     response = lfilter([1.0], np.r_[1.0, arx.model.a], impulse)
-    own = noise_filter(arx.model, arx.uncertainty)
+    own = noise_filter(arx.model, arx.uncertainty.source)
     assert own.stationary() == pytest.approx([innovation * np.sum(response**2)], rel=1e-9)
     assert own.variances(7)[:, 0] == pytest.approx(innovation * np.cumsum(response[:7] ** 2), rel=1e-9)
     rng = np.random.default_rng(0)
@@ -89,7 +89,7 @@ def test_noise_of_every_class_by_its_response(arx):
         fit = quiet(optid.Data(u, y), name, na=1, nb=1, nk=1, **more)
         model = fit.model
         response = lfilter(np.r_[1.0, model.c], np.r_[1.0, model.noise_denominator], impulse)
-        assert noise_filter(model, fit.uncertainty).stationary() == pytest.approx(
+        assert noise_filter(model, fit.uncertainty.source).stationary() == pytest.approx(
             fit.uncertainty.source.noise[0] * np.sum(response**2), rel=1e-9)
 
 
@@ -97,10 +97,11 @@ def test_noise_of_a_state_space_model_is_that_of_its_spectrum():
     rng = np.random.default_rng(1)
     u, y = equation_error(400, rng)
     fit = quiet(optid.Data(u, y), "hammerstein_ss.exact", nx=2, basis="linear", criterion="prediction")
-    own = noise_filter(fit.model, fit.uncertainty)
+    own = noise_filter(fit.model, fit.uncertainty.source)
     w = np.linspace(-np.pi, np.pi, 20001)[:-1]
     scale = own.covariance / fit.model.noise.innovation
-    assert own.stationary() == pytest.approx(scale[0] * np.mean(optid.noise.noise_spectrum(fit.model, w).real), rel=1e-6)
+    spectrum = optid.noise.noise_spectrum(fit.model, w).real
+    assert own.stationary() == pytest.approx(scale[0] * np.mean(spectrum), rel=1e-6)
     assert 1 < scale[0, 0] < 1.05  # what the parameters have taken from the residuals
 
 
@@ -148,7 +149,7 @@ def test_noise_of_coloured_output_errors_is_that_of_the_whole_error():
     y = lfilter([0, 1.0], [1, -0.8], u) + lfilter([1.0], [1, -0.9], 0.1 * rng.standard_normal(600))
     fit = quiet(optid.Data(u, y), "oe.exact", **OE)
     errors = y - fit.simulate()[:, 0]
-    assert output_noise(fit, fit.uncertainty, None, 5).deviations == pytest.approx([np.std(errors)], rel=0.05)
+    assert output_noise(fit, fit.uncertainty.source, None, 5).deviations == pytest.approx([np.std(errors)], rel=0.05)
 
 
 def test_wrong_noise_model_does_not_hide_the_errors_of_its_simulation():
@@ -182,7 +183,7 @@ def test_intervals_follow_the_units(units):
 
 def test_intervals_of_a_detrended_record_are_in_raw_units():
     raw = fir(offset=50.0)
-    given, detrended = (optid.fit(one, "arx", na=0, nb=3, nk=1) for one in (raw, raw.normalized()))
+    given, detrended = (optid.fit(one, "arx", na=0, nb=3, nk=1) for one in (raw, raw.detrend().scale()))
     for fit in (given, detrended):
         assert fit.simulate(interval=0.9).upper == pytest.approx(given.simulate(interval=0.9).upper, rel=1e-6)
 

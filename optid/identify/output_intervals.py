@@ -20,6 +20,7 @@ from optid.data.record import Data
 from optid.errors import DataWarning, RankError, StructureError
 from optid.identify.prediction_error.error_noise import ErrorNoise
 from optid.identify.record_checks import list_outside
+from optid.identify.tangent import Tangent
 from optid.identify.uncertainty import Interval, Uncertainty
 from optid.identify.validation.predictions import one_step_or_nan, simulated_or_nan
 from optid.models.experiments import records_of
@@ -126,7 +127,7 @@ def simulation_intervals(fit: Any, data: Any, x0: Any, level: float) -> Any:
         return as_list(one.simulate(data, x0))
 
     counts = [len(u) for u, _, _ in records]
-    return _intervals(known.at_level(level), run, output_noise(fit, known, None, max(counts)), counts, flat)
+    return _intervals(known.at_level(level), run, output_noise(fit, known.source, None, max(counts)), counts, flat)
 
 
 def prediction_intervals(fit: Any, data: Data, horizon: int, level: float) -> Any:
@@ -141,7 +142,7 @@ def prediction_intervals(fit: Any, data: Data, horizon: int, level: float) -> An
         return as_list(model.predict(data, horizon))
 
     counts = [len(u) for u, _, _ in records]
-    return _intervals(known.at_level(level), run, output_noise(fit, known, horizon, max(counts)), counts, False)
+    return _intervals(known.at_level(level), run, output_noise(fit, known.source, horizon, max(counts)), counts, False)
 
 
 def with_notes(found: Any, fit: Any, data: Any) -> Any:
@@ -163,10 +164,11 @@ def with_notes(found: Any, fit: Any, data: Any) -> Any:
                      "another record.")
     for note in notes:
         warnings.warn(note, DataWarning, stacklevel=3)
-    return one_or_all([replace(one, notes=tuple(notes)) for one in as_list(found)])
+    intervals: list[Any] = as_list(found)
+    return one_or_all([replace(one, notes=tuple(notes)) for one in intervals])
 
 
-def output_noise(fit: Any, known: Uncertainty, horizon: int | None, count: int) -> Noise:
+def output_noise(fit: Any, known: Tangent, horizon: int | None, count: int) -> Noise:
     """Return the noise at so many outputs of a prediction, or of a simulation where the horizon is None.
 
     A variance estimated from errors of the spectrum S has the degrees of freedom of ``mean(S)^2 / mean(S^2)`` times as
@@ -175,7 +177,7 @@ def output_noise(fit: Any, known: Uncertainty, horizon: int | None, count: int) 
     Raises:
         StructureError: neither a noise model nor a run over the record of the fit tells the variance.
     """
-    model, dof = fit.model, known.source.local.dof
+    model, dof = fit.model, known.local.dof
     own, raw = noise_filter(model, known), fit.data.raw() if isinstance(fit.data, Data) else None
     nearest = ROUNDING if raw is None else 1 / max(e.n_samples for e in raw.experiments)
     variances = None
@@ -190,22 +192,32 @@ def output_noise(fit: Any, known: Uncertainty, horizon: int | None, count: int) 
                              "record of the fit shows it")
     if own is not None and len(own.F):
         response = own.response(min(count, LONGEST) if horizon is None else horizon) @ symmetric_root(own.covariance)
+        independent = np.array([_share_independent(response[:, o]) for o in range(model.l)])
+    elif errors is not None:
+        columns = [[e[:, [o]] for e in errors] for o in range(model.l)]
+        independent = np.array([_share_independent(ErrorNoise(one).response[:, 0]) for one in columns])
     else:
-        response = np.eye(model.l)[None] if errors is None else ErrorNoise(errors).response
-    spectrum = np.sum(np.abs(np.fft.rfft(response, 2 * len(response), axis=0)) ** 2, axis=2)
-    whole = np.vstack([spectrum, spectrum[1:-1]])  # of negative frequencies, too
-    independent = np.mean(whole, axis=0) ** 2 / np.mean(whole**2, axis=0)
+        independent = np.ones(model.l)
     deviations = np.sqrt(np.max([one for one in (variances, seen) if one is not None], axis=0))
     return Noise(deviations, np.maximum(dof * independent, 1.0))
 
 
-def noise_filter(model: Any, known: Uncertainty) -> NoiseFilter | None:
+def _share_independent(response: Array) -> float:
+    """Return ``mean(S)^2 / mean(S^2)`` for the spectrum S of a sum of responses (n, q) to white noises of one size."""
+    size = np.max(np.abs(response))
+    if not size > 0:
+        return 1.0
+    spectrum = np.sum(np.abs(np.fft.fft(response / size, 2 * len(response), axis=0)) ** 2, axis=1)
+    return float(np.mean(spectrum) ** 2 / np.mean(spectrum**2))
+
+
+def noise_filter(model: Any, known: Tangent) -> NoiseFilter | None:
     """Return the noise at the outputs of a free run; None of a model without noise model, or that does not filter it.
 
     With functions of outputs or states the noise at the outputs depends on where the model is.
     """
     if model.structure in ("process", "physical"):
-        return NoiseFilter(np.zeros((0, 0)), np.zeros((0, model.l)), np.zeros((model.l, 0)), known.source.noise)
+        return NoiseFilter(np.zeros((0, 0)), np.zeros((0, model.l)), np.zeros((model.l, 0)), known.noise)
     if model.structure in ("arx", "armax", "bj", "oe"):
         size = model.l
         past = model.matrices if model.structure == "arx" else model.noise_denominator.reshape(-1, 1, 1)
@@ -214,17 +226,16 @@ def noise_filter(model: Any, known: Uncertainty) -> NoiseFilter | None:
         D[: len(past)], c[: model.c.size] = past, model.c.reshape(-1, 1, 1)
         F = np.eye(n * size, k=size)
         F[:, :size] -= D.reshape(n * size, size)
-        return NoiseFilter(F, (c - D).reshape(n * size, size), np.eye(size, n * size), known.source.noise)
+        return NoiseFilter(F, (c - D).reshape(n * size, size), np.eye(size, n * size), known.noise)
     if model.structure != "ss" or model.noise is None or has_feedback(model) or model.latent:
         return None
     covariance = model.noise.innovation * _inflation(known)
     return NoiseFilter(model.A + model.L @ model.C, model.K + model.L, model.C, covariance)
 
 
-def _inflation(known: Uncertainty) -> float:
+def _inflation(known: Tangent) -> float:
     """Return what the mean square of residuals is multiplied with for the parameters that were fitted."""
-    local = known.source.local
-    return 1.0 + len(local.centre) / known.source.noise.shape[0] / local.dof
+    return 1.0 + len(known.local.centre) / len(known.noise) / known.local.dof
 
 
 def _errors(model: Any, raw: Data, horizon: int | None) -> list[Array] | None:
@@ -236,7 +247,7 @@ def _errors(model: Any, raw: Data, horizon: int | None) -> list[Array] | None:
     return errors if np.isfinite(np.vstack(errors)).any(axis=0).all() else None
 
 
-def _known(fit: Any) -> Uncertainty:
+def _known(fit: Any) -> Any:
     if fit.model is None:
         raise StructureError(f"this fit has no model: {fit.solution.reason or fit.solution.status}")
     try:

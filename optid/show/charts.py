@@ -79,14 +79,15 @@ def free_run(model: Any, record: Data) -> list[Array] | None:
 
 
 def record_charts(models: dict[str, Any], data: Data, *, ahead: bool = True, group: str = "time",
-                  bands: Sequence[Lines] = ()) -> list[Chart]:
+                  bands: Sequence[Lines] = (), remark: str = "") -> list[Chart]:
     """Measured outputs, simulations of models, and one-step predictions of a single one; inputs below, linked.
 
-    The bands, such as `interval_band`, lie behind them.
+    The bands, such as `interval_band`, lie behind them; the remark ends the captions.
     """
     record = data.raw()
     runs, caption = [*bands, *runs_of(models, record, ahead)], (
-        "Every simulation starts from the best-fitting initial state and uses no measured output.")
+        "Every simulation starts from the best-fitting initial state and uses no measured output."
+        + f" {remark}" * bool(remark))
     return [chart for k in range(min(record.n_experiments, MOST_EXPERIMENTS))
             for chart in time_charts(record, k, runs, f"{group}{k}", caption)]
 
@@ -102,21 +103,21 @@ def runs_of(models: dict[str, Any], record: Data, ahead: bool = True) -> list[Li
     return runs
 
 
-def interval_band(fit: "Fit", record: Data) -> tuple[list[Lines], list[str]]:
-    """Return the 95 % interval of the simulation of a record as a band, if there is one, and sentences about it."""
+def interval_band(fit: "Fit", record: Data) -> tuple[list[Lines], str, tuple[str, ...]]:
+    """Return the 95 % interval of the simulation of a record as a band, if any, what it contains, and remarks."""
     if not runs_free(fit.model):
-        return [], []
+        return [], "", ()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DataWarning)
         try:
-            found = as_list(fit.simulate(record, interval=0.95))
+            found: list[Any] = as_list(fit.simulate(record, interval=0.95))
         except OptidError as error:
-            return [], [f"No interval of the simulation: {str(error).rstrip('.')}."]
-    inside = [one.counts_inside(e.y) for one, e in zip(found, record.raw().experiments)]
-    shares = [f"{100 * count / total:.3g} % of the samples of {name}" for name, count, total in zip(
-        record.outputs, *np.sum(inside, axis=0)) if total]
-    said = [f"The 95 % interval of the simulation, of parameters and noise, contains {' and '.join(shares)}."]
-    return [(INTERVAL, found, {})], [*(said if shares else []), *found[0].notes]
+            return [], "", (f"No interval of the simulation: {str(error).rstrip('.')}.",)
+    inside = np.sum([one.counts_inside(e.y) for one, e in zip(found, record.raw().experiments)], axis=0)
+    shares = [f"{100 * count / total:.1f} % of the samples of {name}" for name, count, total in zip(
+        record.outputs, *inside) if total]
+    contains = f"The 95 % interval of the simulation, of parameters and noise, contains {' and '.join(shares)}."
+    return [(INTERVAL, found, {})], contains if shares else "", found[0].notes
 
 
 def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", caption: str = "",

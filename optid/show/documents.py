@@ -211,9 +211,9 @@ def _validation(model: Any, record: Data) -> list[Any]:
 
 
 def _test_charts(fit: "Fit", record: Data) -> list[Any]:
-    bands, said = charts.interval_band(fit, record)
-    return [*([Notes(said)] if said else []),
-            Charts(charts.record_charts({"": fit.model}, record, group="test", bands=bands), wide=True)]
+    bands, contains, notes = charts.interval_band(fit, record)
+    drawn = charts.record_charts({"": fit.model}, record, group="test", bands=bands, remark=contains)
+    return [*([Notes(notes)] if notes else []), Charts(drawn, wide=True)]
 
 
 def validation_parts(checked: Validation) -> list[Any]:

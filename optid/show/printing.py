@@ -45,8 +45,11 @@ def describe_advice(fit: "Fit") -> str:
 
 def describe_interval(fit: "Fit", record: Data) -> str:
     """Return how much of a record the 95 % interval of its simulation contains, as text at most 80 columns wide."""
-    said = attempt("The interval of the simulation", lambda: charts.interval_band(fit, record)[1])
-    return "\n".join(line for one in said for line in wrapped(one if isinstance(one, str) else one.sentences[0]))
+    lines = []
+    for part in attempt("The interval of the simulation", lambda: [charts.interval_band(fit, record)]):
+        said = part.sentences if isinstance(part, Notes) else [part[1], *(f"Note: {note}" for note in part[2])]
+        lines += [line for one in said if one for line in wrapped(one)]
+    return "\n".join(lines)
 
 
 def describe_checks(checked: "Validation") -> str:
