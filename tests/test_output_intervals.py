@@ -13,6 +13,8 @@ import optid
 from optid.errors import DataError, DataWarning, StructureError
 from optid.identify.output_intervals import noise_filter, output_noise, prediction_intervals, simulation_intervals
 from optid.models.process import process_model
+from optid.show import charts, plots, report
+from optid.show.printing import describe_interval
 
 pytestmark = pytest.mark.numerical
 
@@ -193,10 +195,10 @@ def test_several_outputs_and_experiments_and_gaps():
     record = fit.data.raw()
     turned = record.select(outputs=record.outputs[::-1], inputs=record.inputs[::-1])
     again = quiet(turned, na=1, nb=1, basis="polynomial:3")
-    for name, more in (("simulate", {}), ("predict", {}), ("predict", {"horizon": 3})):
-        found, other = (quietly(lambda one=one, name=name, more=more: getattr(one, name)(interval=0.95, **more))
-                        for one in (fit, again))
-        plain = getattr(fit, name)(**more)
+    for horizon in (None, 1, 3):
+        found, other = (simulation_intervals(one, one.data, "fit", 0.95) if horizon is None else
+                        prediction_intervals(one, one.data, horizon, 0.95) for one in (fit, again))
+        plain = fit.simulate() if horizon is None else fit.predict(horizon=horizon)
         assert len(found) == 3
         for one, two, value, e in zip(found, other, plain, record.experiments):
             assert one.value.shape == e.y.shape
@@ -220,11 +222,11 @@ def test_process_and_feedback_models_have_intervals():
     plant = process_model("P1D", K=0.8, tau=9.3, dead_time=3.4, level=20.0)
     u = np.repeat(rng.uniform(30, 70, 15), 20)
     fit = quiet(optid.Data(u, plant.simulate(u) + 0.5 * rng.standard_normal(300)), "process.exact",
-                process="P1D")
+                process="P1D", prove=False)
     found = quietly(lambda: fit.simulate(u, interval=0.95))
     assert found.noise == pytest.approx(np.full(300, 0.5), rel=0.15)
     fed = feedback_fit()
-    refuses(StructureError, "no intervals without standard errors", lambda: fed.simulate(interval=0.95))
+    refuses(StructureError, "no standard errors of the parameters", lambda: fed.simulate(interval=0.95))
 
 
 def test_active_inequalities_widen_one_side_only():
@@ -258,6 +260,22 @@ def test_misfit_and_extrapolation_are_said():
     assert "misfit" in found.notes[0] and "extrapolation" in found.notes[1]
     fine = example_fit("dead_zone")
     assert not fine.verdict.misfits and fine.predict(interval=0.95).notes == ()
+
+
+def test_the_interval_is_drawn_and_counted_on_a_record_that_the_fit_has_not_seen(arx):
+    other = optid.Data(*equation_error(200, np.random.default_rng(8)), name="other")
+    found = quietly(lambda: arx.simulate(other, interval=0.95))
+    share = f"contains {100 * found.counts_inside(other.y)[0][0] / 200:.1f} % of the samples of y."
+    (label, (band,), _), = charts.interval_band(arx, other)[0]
+    np.testing.assert_array_equal(band.upper, found.upper)
+    assert label in report.render(arx, other) and share in report.render(arx, other)
+    assert label not in report.render(arx)
+    assert share in " ".join(describe_interval(arx, other).split())
+    drawn = [name for ax in plots.fit_over_time(arx, other).axes for name in ax.get_legend_handles_labels()[1]]
+    assert label in drawn
+    robust = quiet(fir(200), na=1, nb=2, nk=1, basis="linear", loss="huber", prove=False)
+    bands, contains, notes = charts.interval_band(robust, fir(100))
+    assert not bands and not contains and notes[0].startswith("No interval of the simulation: no standard errors")
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 95, -0.1, "wide", True, np.nan])

@@ -253,7 +253,7 @@ def _known(fit: Any) -> Any:
     try:
         return fit.uncertainty
     except (StructureError, RankError) as error:
-        raise type(error)(f"no intervals without standard errors of the parameters: {error}") from error
+        raise type(error)(f"no standard errors of the parameters: {error}") from error
 
 
 def _intervals(known: Uncertainty, run: Run, noise: Noise, counts: Sequence[int], flat: bool) -> Any:
