@@ -76,7 +76,8 @@ class NoiseFilter(NamedTuple):
     def variances(self, ahead: int) -> Array:
         """Return the variances (ahead, l) of what e of the last 1, 2, ... samples adds to the outputs."""
         response = self.response(ahead)
-        return np.cumsum(np.einsum("kip,pq,kiq->ki", response, self.covariance, response), axis=0)
+        with np.errstate(all="ignore"):  # an unstable one leaves the range of numbers
+            return np.cumsum(np.einsum("kip,pq,kiq->ki", response, self.covariance, response), axis=0)
 
     def stationary(self, nearest: float = ROUNDING) -> Array | None:
         """Return the variances (l,) of the stationary noise; None where a pole comes so near to the unit circle."""
@@ -115,19 +116,19 @@ def simulation_intervals(fit: Any, data: Any, x0: Any, level: float) -> Any:
         DataError: as of `Model.simulate`.
         RankError: parameters without effect on the predictions.
     """
-    model = fit.model
     check_probability(level, "interval")
+    model, known = fit.model, _known(fit)
     if model.structure == "ss" and not isinstance(x0, str) and any(np.any(one) for one in as_list(x0)):
         raise StructureError("x0 is given in the state coordinates of this model, which change with its parameters, so "
                              "that it has no interval. Use x0='zero', or a record and x0='fit'")
     records, flat = records_of(model, data)
-    known, flat = _known(fit), flat and model.l == 1
 
     def run(one: Any) -> Sequence[Array]:
         return as_list(one.simulate(data, x0))
 
     counts = [len(u) for u, _, _ in records]
-    return _intervals(known.at_level(level), run, output_noise(fit, known.source, None, max(counts)), counts, flat)
+    return _intervals(known.at_level(level), run, output_noise(fit, known.source, None, max(counts)), counts,
+                      flat and model.l == 1)
 
 
 def prediction_intervals(fit: Any, data: Data, horizon: int, level: float) -> Any:
@@ -136,7 +137,8 @@ def prediction_intervals(fit: Any, data: Data, horizon: int, level: float) -> An
     Arguments and errors are as of `simulation_intervals` and `Model.predict`.
     """
     check_probability(level, "interval")
-    horizon, records, known = check_integer(horizon, "horizon"), records_of(fit.model, data)[0], _known(fit)
+    horizon, known = check_integer(horizon, "horizon"), _known(fit)
+    records = records_of(fit.model, data)[0]
 
     def run(model: Any) -> Sequence[Array]:
         return as_list(model.predict(data, horizon))
