@@ -30,5 +30,12 @@ found
 found.fit.validate(test)
 
 # %%
-# A figure for a paper; ``found.report("tank.html", test)`` writes the interactive page.
+# Where will measurements lie? The interval of a simulation accounts for the uncertain parameters and for the noise.
+band = found.fit.simulate(test, interval=0.95)
+inside, samples = band.counts_inside(test.y)
+print(f"{inside[0]} of {samples[0]} samples inside; standard deviations of the parameters and of the noise up to "
+      f"{band.parameters.max():.3f} and {band.noise.max():.3f} m")
+
+# %%
+# A figure for a paper, with that interval; ``found.report("tank.html", test)`` writes the interactive page.
 figure = found.plot(test)

@@ -134,12 +134,15 @@ def _check(work: Work, found: Any, record: Any, held_out: Any, what: str) -> Non
     """Validate on the held-out record, if there is one; findings that were printed before are not repeated."""
     if held_out is not None:
         from optid.identify.validation.checks import validate as check
+        from optid.show.printing import describe_interval
 
         work.step("validating")
         checked = check(found.model, held_out)
         if checked.findings == record.findings:
             checked = replace(checked, findings=())
         work.text += f"\n\n{held_out.n_samples} samples held out of the {what}\n{checked}"
+        if interval := describe_interval(getattr(found, "fit", found), held_out):
+            work.text += f"\n\n{interval}"
 
 
 def validate(files: list[Path], *, how: dict[str, Any], horizon: int = 1, report: File = None) -> None:

@@ -221,17 +221,35 @@ class Fit(Rendered):
         """Return the parameters with intervals of this level."""
         return parameters(self, level)
 
-    def predict(self, data: Data | None = None, horizon: int = 1) -> Any:
-        """Predict so many samples ahead, as `Model.predict`; on the record of the fit when none is given."""
-        return self.model.predict(self._record() if data is None else data, horizon)
+    def predict(self, data: Data | None = None, horizon: int = 1, *, interval: float | None = None) -> Any:
+        """Predict so many samples ahead, as `Model.predict`; on the record of the fit when none is given.
 
-    def simulate(self, u: Any = None, x0: Any = None) -> Any:
+        With an `interval`, a probability such as 0.95, return the `OutputInterval` (lower, value, upper) that contains
+        a measured output with this probability; see `optid.identify.output_intervals.prediction_intervals`.
+        """
+        given = self._record() if data is None else data
+        if not isinstance(given, Data):
+            raise DataError(not_a_record(given, "fit.predict"))
+        if interval is None:
+            return self.model.predict(given, horizon)
+        from optid.identify.output_intervals import prediction_intervals, with_notes
+
+        return with_notes(prediction_intervals(self, given, horizon, interval), self, given)
+
+    def simulate(self, u: Any = None, x0: Any = None, *, interval: float | None = None) -> Any:
         """Simulate from inputs (N, m) in raw units or a record, as `Model.simulate`; by default the record of the fit.
 
-        By default the initial state x0 is zero for inputs, and fitted for a record.
+        By default the initial state x0 is zero for inputs, and fitted for a record. With an `interval`, a probability
+        such as 0.95, return the `OutputInterval` (lower, value, upper) that contains a measured output with this
+        probability; see `optid.identify.output_intervals.simulation_intervals`.
         """
         given = self._record() if u is None else u
-        return self.model.simulate(given, x0=x0 if x0 is not None else "fit" if isinstance(given, Data) else "zero")
+        start = x0 if x0 is not None else "fit" if isinstance(given, Data) else "zero"
+        if interval is None:
+            return self.model.simulate(given, x0=start)
+        from optid.identify.output_intervals import simulation_intervals, with_notes
+
+        return with_notes(simulation_intervals(self, given, start, interval), self, given)
 
     @cached_property
     def residuals(self) -> Any:

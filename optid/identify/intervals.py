@@ -18,6 +18,7 @@ from optid.structures.multipliers import least_distance
 
 DRAWS = 8192  # random draws of an interval under inequalities: their noise is about 0.7 % of its width
 SETS = 64  # sets of active rows that are tried for all points; where there are many more, each point finds its own
+BLOCK = 512  # functions whose draws are held in memory at a time
 REACH = 8.0  # inequalities further away than this many standard deviations of their slack cannot move an interval
 
 
@@ -70,6 +71,9 @@ class LocalEstimate:
         half = float(stdtrit(self.dof, 0.5 + level / 2)) * error
         if not self.held:
             return error, -half, half
+        if len(slopes) > BLOCK:  # the draws of all at once would fill the memory
+            parts = [self.limits(slopes[k : k + BLOCK], level) for k in range(0, len(slopes), BLOCK)]
+            return tuple(map(np.concatenate, zip(*parts)))  # pyright: ignore[reportReturnType]
         free, posterior, scattered = (slopes @ points.T for points in self.samples)
         tails, known = [0.5 - level / 2, 0.5 + level / 2], np.array([-half, half])
         missed = np.quantile(free, tails, axis=1) - known

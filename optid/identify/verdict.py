@@ -37,6 +37,9 @@ POINTS = 20  # of a step response, at which it is looked at
 APART = 0.12  # difference of the response from that of the low-order model, in a loop
 STRUCTURE = 0.1  # share of the residual variance that another structure may save in a model that is called good
 OUTSIDE = 0.01  # share of the samples that may lie outside the interval of a function
+MISFIT = ("independence of the inputs", "error that the inputs explain", "delay", "structure",
+          "direct feedthrough in a loop", "difference from a low-order model with noise model")
+"""Parts of a verdict that speak of errors of the response, which more samples would not make smaller."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +75,11 @@ class Verdict:
     def failed(self) -> tuple[Finding, ...]:
         """The parts that do not pass."""
         return tuple(part for part in self.parts if not part.passed)
+
+    @property
+    def misfits(self) -> tuple[Finding, ...]:
+        """The parts that find an error of the response beyond that of the parameters."""
+        return tuple(part for part in self.failed if part.name in MISFIT and part.counts)
 
     def __str__(self) -> str:
         return f"{self.word}: " + "; ".join(

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optid.arrays import Array
+from optid.arrays import Array, as_list
 from optid.data.record import Data
-from optid.errors import DataError, DataWarning
+from optid.errors import DataError, DataWarning, OptidError
 from optid.identify.dynamics import Levels, mean_slopes
+from optid.identify.uncertainty import Interval
 from optid.identify.validation import validate
 from optid.identify.validation.correlations import Correlation
 from optid.identify.validation.predictions import one_step_or_nan, simulated
@@ -28,8 +29,10 @@ if TYPE_CHECKING:
 
 MOST_EXPERIMENTS = 4
 COLOURS = tuple(f"c{k}" for k in range(10))
+INTERVAL = "95 % interval"
 FAMILIES = ("nonlinearities", "feedback", "latent")
-Lines = tuple[str, list[Array] | None, dict[str, Any]]
+Lines = tuple[str, Sequence[Any] | None, dict[str, Any]]
+"""Name, outputs (N, l) or their `OutputInterval` of every experiment or None for none, and options of the series."""
 
 
 def channel_axis(name: str, unit: str) -> Axis:
@@ -75,11 +78,16 @@ def free_run(model: Any, record: Data) -> list[Array] | None:
             return None
 
 
-def record_charts(models: dict[str, Any], data: Data, *, ahead: bool = True, group: str = "time") -> list[Chart]:
-    """Measured outputs, simulations of models, and one-step predictions of a single one; inputs below, linked."""
+def record_charts(models: dict[str, Any], data: Data, *, ahead: bool = True, group: str = "time",
+                  bands: Sequence[Lines] = (), remark: str = "") -> list[Chart]:
+    """Measured outputs, simulations of models, and one-step predictions of a single one; inputs below, linked.
+
+    The bands, such as `interval_band`, lie behind them; the remark ends the captions.
+    """
     record = data.raw()
-    runs, caption = runs_of(models, record, ahead), (
-        "Every simulation starts from the best-fitting initial state and uses no measured output.")
+    runs, caption = [*bands, *runs_of(models, record, ahead)], (
+        "Every simulation starts from the best-fitting initial state and uses no measured output."
+        + f" {remark}" * bool(remark))
     return [chart for k in range(min(record.n_experiments, MOST_EXPERIMENTS))
             for chart in time_charts(record, k, runs, f"{group}{k}", caption)]
 
@@ -95,11 +103,28 @@ def runs_of(models: dict[str, Any], record: Data, ahead: bool = True) -> list[Li
     return runs
 
 
+def interval_band(fit: "Fit", record: Data) -> tuple[list[Lines], str, tuple[str, ...]]:
+    """Return the 95 % interval of the simulation of a record as a band, if any, what it contains, and remarks."""
+    if not runs_free(fit.model):
+        return [], "", ()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DataWarning)
+        try:
+            found: list[Any] = as_list(fit.simulate(record, interval=0.95))
+        except OptidError as error:
+            return [], "", (f"No interval of the simulation: {str(error).rstrip('.')}.",)
+    inside = np.sum([one.counts_inside(e.y) for one, e in zip(found, record.raw().experiments)], axis=0)
+    shares = [f"{100 * count / total:.1f} % of the samples of {name}" for name, count, total in zip(
+        record.outputs, *inside) if total]
+    contains = f"The 95 % interval of the simulation, of parameters and noise, contains {' and '.join(shares)}."
+    return [(INTERVAL, found, {})], contains if shares else "", found[0].notes
+
+
 def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", caption: str = "",
                 part: slice = slice(None), heights: tuple[int, int] = (300, 190)) -> list[Chart]:
     """Return charts of every output, measured and of some runs, and of every input over some samples of experiment k.
 
-    A run has a name, outputs (N, l) of every experiment or None for none, and the options of its series.
+    A run that is an interval is drawn as a band.
     """
     e = record.experiments[k]
     t, x = (e.start + record.dt * np.arange(e.n_samples, dtype=float))[part], time_axis(record, k)
@@ -107,7 +132,9 @@ def time_charts(record: Data, k: int, runs: Sequence[Lines], group: str = "", ca
     charts = []
     for o, name in enumerate(record.outputs):
         series = [Series("measured", t, e.y[part, o], colour="ink", width=1.2)]
-        series += [Series(label, t, run[k][part, o], **how) for label, run, how in runs if run is not None]
+        series += [Series(label, t, run[k].upper[part, o], "area", lows=run[k].lower[part, o], **how)
+                   if isinstance(run[k], Interval) else Series(label, t, run[k][part, o], **how)
+                   for label, run, how in runs if run is not None]
         y = channel_axis(name, record.output_units[o])
         charts.append(Chart(f"Output {name}{several}", caption, x, y, series, group, height=heights[0]))
     for c, name in enumerate(record.inputs):

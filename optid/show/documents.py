@@ -206,7 +206,7 @@ def _validations(fit: "Fit", test: Data | None) -> list[Any]:
         if isinstance(record, Data):
             parts += [Heading(title), *attempt("The validation", partial(_validation, fit.model, record))]
             if record is test:
-                parts += attempt("The figure of the test record", partial(_test_charts, fit.model, record))
+                parts += attempt("The figure of the test record", partial(_test_charts, fit, record))
     return parts
 
 
@@ -217,8 +217,10 @@ def _validation(model: Any, record: Data) -> list[Any]:
         return [Notes([f"No validation: {error}"])]
 
 
-def _test_charts(model: Any, record: Data) -> list[Any]:
-    return [Charts(charts.record_charts({"": model}, record, group="test"), wide=True)]
+def _test_charts(fit: "Fit", record: Data) -> list[Any]:
+    bands, contains, notes = charts.interval_band(fit, record)
+    drawn = charts.record_charts({"": fit.model}, record, group="test", bands=bands, remark=contains)
+    return [*([Notes(notes)] if notes else []), Charts(drawn, wide=True)]
 
 
 def validation_parts(checked: Validation) -> list[Any]:

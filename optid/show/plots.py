@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from optid.identify.search import Identification
 
 MOST_EXPERIMENTS = 3
+TEST = "test record"
 """Experiments drawn side by side; the title says how many there are."""
 
 RUNGS = {"instant": "instant proof", "ascent": "dual ascent", "sdp": "SDP", "product cuts": "product cuts"}
@@ -51,7 +52,7 @@ def overview(fit: "Fit", test: Data | None = None) -> Figure:
     heights = [(4.2 if long else 2.9) * record.l, *rows_of_f, 3.0, 2.5]
     figure = Figure(figsize=(10.0, sum(heights)), layout="constrained")
     rows = cast(Any, figure.subfigures(len(heights), 1, height_ratios=heights))
-    which = "test record" if test is not None else "estimation record"
+    which = TEST if test is not None else "estimation record"
     attempt_panels(rows[0], "The fit over time", lambda part: _time_panels(part, fit, record, which, closeup=long))
     left, right = rows[1:3] if rows_of_f else rows[1].subfigures(1, 2, width_ratios=[1, 1.45]) if functions else (
         None, rows[1])
@@ -69,7 +70,7 @@ def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
 
     Args:
         fit: the fit.
-        data: the record; the estimation record when not given.
+        data: the record, drawn with the 95 % interval of its simulation; the estimation record when not given.
 
     Raises:
         DataError: the fit was made from a stream and no record is given.
@@ -77,7 +78,7 @@ def fit_over_time(fit: "Fit", data: Data | None = None) -> Figure:
     record = _record(fit, data)
     long = _needs_closeup(record, 2)
     figure = Figure(figsize=(9.0, (4.6 if long else 3.0) * record.l), layout="constrained")
-    _time_panels(figure, fit, record, "test record" if data is not None else "estimation record", closeup=long)
+    _time_panels(figure, fit, record, TEST if data is not None else "estimation record", closeup=long)
     return figure
 
 
@@ -261,7 +262,8 @@ def _time_panels(figure: Any, fit: "Fit", record: Data, title: str, closeup: boo
     longest = max(e.n_samples for e in record.experiments)
     axes = figure.subplots(len(heights), len(shown), squeeze=False, sharey="row", height_ratios=heights,
                            width_ratios=[max(e.n_samples, 0.25 * longest) for e in shown])
-    runs = charts.runs_of({"": fit.model}, record)
+    bands = charts.interval_band(fit, record)[0] if title == TEST else []
+    runs = [*bands, *charts.runs_of({"": fit.model}, record)]
     for k, e in enumerate(shown):
         for o, chart in enumerate(charts.time_charts(record, k, runs)[: record.l]):
             ax = axes[o * (2 if closeup else 1), k]

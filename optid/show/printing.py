@@ -3,7 +3,8 @@
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from optid.show import checks, documents, estimates, responses, summary
+from optid.data.record import Data
+from optid.show import charts, checks, documents, estimates, responses, summary
 from optid.show.sections import Notes, attempt
 from optid.show.terminal import WIDTH, facts_lines, findings_lines, part_lines, set_table, text, wrapped
 
@@ -40,6 +41,15 @@ def describe_advice(fit: "Fit") -> str:
     found = attempt("The advice", lambda: [f"Advice: {one}" for one in fit.advice] if (
         fit.verdict is not None and fit.verdict.word in documents.ADVISED) else [])
     return "".join(f"\n{one.sentences[0] if isinstance(one, Notes) else one}" for one in found)
+
+
+def describe_interval(fit: "Fit", record: Data) -> str:
+    """Return how much of a record the 95 % interval of its simulation contains, as text at most 80 columns wide."""
+    lines = []
+    for part in attempt("The interval of the simulation", lambda: [charts.interval_band(fit, record)]):
+        said = part.sentences if isinstance(part, Notes) else [part[1], *(f"Note: {note}" for note in part[2])]
+        lines += [line for one in said if one for line in wrapped(one)]
+    return "\n".join(lines)
 
 
 def describe_checks(checked: "Validation") -> str:

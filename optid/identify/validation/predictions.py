@@ -60,10 +60,10 @@ def simulated_or_nan(model: Any, data: Data, word: str = SIMULATION) -> list[Arr
     return found
 
 
-def one_step_or_nan(model: Any, data: Data) -> list[Array]:
+def one_step_or_nan(model: Any, data: Data, horizon: int = 1) -> list[Array]:
     """Return what `one_step` does; NaN where nothing can be predicted or the prediction diverges."""
     try:
-        return one_step(model, data)
+        return one_step(model, data, horizon)
     except DataError:
         return [np.full(e.y.shape, np.nan) for e in data.experiments]
 
