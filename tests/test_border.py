@@ -126,6 +126,7 @@ def test_a_descent_from_moved_poles_that_fell_without_arriving_is_gone_on_from()
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*poorly excited")
 def test_a_flat_valley_is_followed_and_not_called_an_optimum():
     fit = optid.fit(excited(8, np.abs), "lfr.exact", nx=2, tries=1, constraints=["stable:0.7"], raises=False)
     assert fit.solution.status is Status.LIMIT
