@@ -68,10 +68,11 @@ def measure_curvature(criterion: Any, x: Array, at: Linearised) -> Linearised:
     sizes = np.maximum(sizes, 1e-8 * float(sizes.max(initial=1e-300)))
     slopes = []
     for step, moved in zip(STEP * np.sqrt(at.value) / sizes, np.diag(STEP * np.sqrt(at.value) / sizes)):
-        high, low = criterion.linearise(x + moved), criterion.linearise(x - moved)
-        if not np.isfinite(high.value + low.value):
+        sides = [criterion.admissible(x + moved), criterion.admissible(x - moved)]  # at a border there is one
+        high, low = (criterion.linearise(end) if side else at for side, end in zip(sides, (x + moved, x - moved)))
+        if not any(sides) or not np.isfinite(high.value + low.value):
             return at
-        slopes.append((high.pulled - low.pulled) / (2 * step))
+        slopes.append((high.pulled - low.pulled) / (sum(sides) * step))
     scaled = (np.array(slopes) + np.transpose(slopes)) / np.outer(2 * sizes, sizes)
     values, vectors = np.linalg.eigh(scaled)
     roots = np.sqrt(np.maximum(np.abs(values), FLAT))
