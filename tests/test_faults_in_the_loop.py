@@ -201,3 +201,14 @@ def test_thresholds_adapt_to_colour_with_a_price_and_alike_by_steps_and_blocks()
     steps = Monitor(model, found, window=60, thresholds=base.calibration, adapt=5.0)
     assert [e for k in range(0, 2000, 7) for e in steps.run(u[k : k + 7], y[k : k + 7])] == [
         e for e in events if e.sample < steps.samples]
+
+
+@pytest.mark.filterwarnings("ignore::optid.errors.DataWarning")
+def test_onset_and_size_of_an_event_are_those_of_its_first_label():
+    model, u, y = controlled()
+    y[150:, 0] += 0.25
+    found = dictionary(model, kinds=["bias", "loss", "stuck"])
+    for event in watching(model, found, 15.0).run(u, y):
+        if event.size:
+            label = event.candidates[0][0]
+            assert len(event.size) == (2 if label.endswith(("loss", "stuck")) else 2 if label == "state" else 1)

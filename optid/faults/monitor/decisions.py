@@ -332,10 +332,10 @@ class Decisions:
 
     def _told(self, kind: str, now: int, said: tuple[tuple[str, float], ...], best: int, window: Window, note: str = ""
               ) -> Event:
-        """Return an event with onset and size of its first label, in the group of the best candidate."""
-        own = [c for c in self.group(best) if window.peak[c]]
-        family = [c for c in own if has_constants(self.columns.candidates[c])]
-        same = [c for c in own if self.labels[c] == said[0][0]]
+        """Return an event with onset and size of its first label; one of no candidate is in the group of the best."""
+        same = [c for c, label in enumerate(self.labels) if label == said[0][0] and window.peak[c]]
+        here = self.group(same[0] if same else best)
+        family = [c for c in here if has_constants(self.columns.candidates[c]) and window.peak[c]]
         is_offset = bool(same) and self.columns.candidates[same[0]].additive
         number = family[0] if family and not is_offset else (same or [best])[0]
         sizes, _, _ = window.estimate(number)

@@ -129,8 +129,8 @@ def _recoloured(found: Dictionary, taps: list[Array], covariance: Array) -> Dict
     """Augment the state by an autoregression of the innovations."""
     l, p = found.model.l, len(taps)  # noqa: E741
     mix = np.hstack(taps) if taps else np.zeros((l, 0))
-    A, K = np.zeros((p * l, p * l)), np.eye(p * l, l)
-    A[:l], A[l:, : p * l - l] = mix, np.eye(max(p * l - l, 0))
+    A, K = np.eye(p * l, k=-l), np.eye(p * l, l)
+    A[:l] = mix[: p * l]
     return _shaped(found, A, mix, K, covariance)
 
 
