@@ -8,7 +8,7 @@ import time as clock
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from optid.cli.faults import ZERO
 from optid.cli.options import READING, File, Paths, Words
@@ -125,7 +125,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
         for sentence in heard:
             note(sentence)
         watcher.source = watcher.source or {"model": plant.to_dict()}
-        _Watch(watcher, reader, follow, kept, strict=strict, as_json=lines, skips=maintenance).run(until_end)
+        _Watch(watcher, reader, follow, kept, _Habits(strict, lines, maintenance)).run(until_end)
 
 
 def _identified_from(path: Path) -> Any:
@@ -231,6 +231,12 @@ class _Signals:
             yield part
 
 
+class _Habits(NamedTuple):
+    strict: bool  # whether a bad row ends it
+    as_json: bool  # whether events are lines of JSON
+    skips: bool  # whether rows are passed by, as under maintenance
+
+
 class _Watch:
     """Reads the stream, runs the monitor and prints its events.
 
@@ -239,13 +245,13 @@ class _Watch:
     that is killed just between the two prints these once more.
     """
 
-    def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: "StateFile | None", *, strict: bool,
-                 as_json: bool, skips: bool = False) -> None:
+    def __init__(self, watcher: Any, reader: Any, follow: Path | None, state: "StateFile | None", habits: _Habits
+                 ) -> None:
         from optid.cli.following import Followed
         from optid.errors import DataError
 
-        self.watcher, self.reader, self.state, self.strict, self.as_json = watcher, reader, state, strict, as_json
-        self.skips, source = skips, watcher.source or {}
+        self.watcher, self.reader, self.state, source = watcher, reader, state, watcher.source or {}
+        self.strict, self.as_json, self.skips = habits
         self.plant = source["model"]
         self.bad, self.saved, self.place = source.get("bad", 0), watcher.samples, source.get("place")
         self.stamps = {int(sample): stamp for sample, stamp in source.get("stamps", [])}
