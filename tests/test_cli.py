@@ -20,7 +20,7 @@ from optid.cli.terminal import spread
 from optid.core.program import programme_of
 from optid.descriptions import describe
 from optid.examples import EXAMPLES, example
-from optid.registry import CONSTRAINTS, FORMULATIONS, registered
+from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, registered
 from optid.solving.solve import solve
 
 
@@ -309,6 +309,21 @@ def test_completion_in_a_shell():
         done = subprocess.run([sys.executable, "-m", "optid"], env={**os.environ, **given}, capture_output=True,
                               text=True)
         assert done.stdout.split()[: len(words)] == words
+
+
+@pytest.mark.parametrize(("name", "group"), [("bj.exact", FORMULATIONS), ("fault.profile", FAULTS)])
+def test_one_formulation_is_explained(name, group):
+    found, shown = describe(registered(group)[name]), run("formulations", name)
+    text = " ".join(shown.output.split())
+    assert shown.exit_code == 0 and found.summary.split(".")[0][:40] in text
+    assert all(f"--{key.replace('_', '-')} " in text for key in found.options if key != "constraints")
+    assert all(word in text for word in found.variables)
+    assert ("optid.fit(data, 'bj.exact', na=..., nb=..., nc=..., nd=...)" in text) == (name == "bj.exact")
+
+
+def test_an_unknown_formulation_is_not_explained():
+    shown = run("formulations", "bj.exct")
+    assert shown.exit_code == 2 and "Did you mean 'bj.exact'?" in shown.output
 
 
 def test_formulations_name_their_variables():

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
 from optid.cli.terminal import Waiting, hearing, note
+from optid.phrases import p_equals
 
 if TYPE_CHECKING:
     from optid.cli.state_file import StateFile
@@ -128,7 +129,7 @@ def _doubt(plant: Any, origin: Any) -> None:
 
     judged = health(whiten(plant, origin))
     if not (judged.white and judged.scaled):
-        note(f"whiteness of the innovations of the record of the identification: p = {judged.p_value:.2g}, size "
+        note(f"whiteness of the innovations of the record of the identification: {p_equals(judged.p_value)}, size "
              f"{judged.ratio:.2f} times the predicted one: thresholds for white noise are too low. Calibrate them on a "
              "later healthy record: --healthy FILE...")
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optid.data.description import listed_findings
+from optid.phrases import p_value
 
 if TYPE_CHECKING:
     from optid.faults.diagnosis.answers import Diagnosis, Estimate
@@ -222,6 +223,4 @@ def _list(words: list[str]) -> str:
 
 def probability_words(value: float) -> str:
     """Write a probability."""
-    if value < 1e-300:
-        return "< 1e-300"
-    return "unknown" if np.isnan(value) else f"{value:.2g}" if value >= 1e-3 else f"{value:.0e}"
+    return p_value(value, 2 if value >= 1e-3 else 1, missing="unknown")

@@ -16,6 +16,7 @@ from optid.faults.signatures import Dictionary
 from optid.faults.whitening import OTHER_SCALE, Predictor, health, whiten
 from optid.models import NoiseCovariances
 from optid.models.experiments import in_units_of
+from optid.phrases import p_equals
 
 if TYPE_CHECKING:
     from optid.faults.monitor.monitoring import Monitor
@@ -95,7 +96,7 @@ def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
             _check_rise(float(every.mean()) / usual, f"the energy of the innovations of {name}", energies, usual, BLOCK)
     signals = [np.where(part.present, part.innovations, np.nan) for part in parts]
     taps, covariance = _autoregression(signals, (0,) if judged.white else ORDERS)
-    said = (f"on the healthy record the innovations are not those of the model (whiteness p = {judged.p_value:.2g}, "
+    said = (f"on the healthy record the innovations are not those of the model (whiteness {p_equals(judged.p_value)}, "
             f"size {judged.ratio:.2f} times the predicted one): its noise is taken from that record"
             + (f", as an autoregression of order {len(taps)}." if taps else "."))
     return _recoloured(found, taps, covariance), said

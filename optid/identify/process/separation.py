@@ -10,6 +10,7 @@ from optid.errors import DataWarning, RankError
 from optid.identify.process.descent import ProcessBox, ProcessPoint, descend, search_cells
 from optid.identify.process.errors import ProcessErrors
 from optid.identify.process.starts import usual_box
+from optid.phrases import p_equals
 
 CHANCE = 1e-3  # p value of the F test above which the output does not visibly respond
 MOVING, EXACT = 1e-4, 1e-12  # p value, and share of the energy of the output, below which a motion counts as none
@@ -89,10 +90,10 @@ def warn_of_motion(errors: ProcessErrors, best: ProcessPoint) -> str:
     p = float(fisher.sf(gain / left.shape[1] / max((best.value - gain) / dof, 1e-300), left.shape[1], dof))
     if p >= MOVING or gain <= EXACT * errors.energy:
         return ""
-    found = f"not at rest (p = {p:.1g})"
-    warnings.warn(f"the record does not begin at rest under its first inputs (p = {p:.1g}): initial='free' estimates a "
-                  "motion of its own for every experiment; gain and time constants are biased without it", DataWarning,
-                  stacklevel=2)
+    found = f"not at rest ({p_equals(p, 1)})"
+    warnings.warn(f"the record does not begin at rest under its first inputs ({p_equals(p, 1)}): initial='free' "
+                  "estimates the initial state of every experiment; gain and time constants are biased without it",
+                  DataWarning, stacklevel=2)
     return found
 
 

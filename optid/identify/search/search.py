@@ -42,7 +42,7 @@ from optid.identify.search.trial import (
 from optid.identify.verdict import Verdict
 from optid.packing import Unsendable, pack
 from optid.progress import Meter, log
-from optid.registry import Rendered, named_constraint
+from optid.registry import Rendered, read_constraints
 from optid.threads import one_thread
 
 BUDGET, INTERRUPT = "the budget", "an interrupt"
@@ -151,7 +151,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         one_of("classes", word, KINDS)
     if horizon is not None:
         check_integer(horizon, "horizon")
-    rules = tuple(named_constraint(c) if isinstance(c, str) else c for c in constraints)
+    rules = read_constraints(constraints)
     compared = data if data.n_samples <= LONG else stretches(data, COMPARED)
     cut = Blocks.of(compared, blocks)
     ladder, stopped = Ladder.of(cut, data.n_experiments > 1), ""
