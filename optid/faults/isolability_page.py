@@ -55,4 +55,4 @@ def write(found: Isolability, path: str | Path, *, command: str = "") -> Path:
 
 
 def _size(value: float) -> str:
-    return number(value, 3) if np.isfinite(value) else "none"
+    return number(value, 3) if np.isfinite(value) else "never"
