@@ -66,7 +66,7 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
         hold: what an input does between its samples: "zero" (stays) or "first" (goes straight to the next).
         offset: True for one level of the output, "each" for one of every experiment, False for none.
         drift: whether the level moves along a straight line.
-        initial: "rest": every experiment begins at rest under its first inputs; "free": with a motion of its own.
+        initial: "rest": every experiment begins at rest under its first inputs; "free": with its own motion.
         times: instants of the samples in the unit of the sampling time, (N,) or one array per experiment; regular when
             not given.
         constraints: builders such as ``formulations.constraints.process.tau(high=60)``.

@@ -445,7 +445,7 @@ def test_refusals_name_what_is_wrong(tmp_path):
     found = everything(model)
     some = {label: 30.0 for label in found.labels if label != "sensor:y1"}
     usual = {"model": model, "faults": found, "thresholds": np.full(len(found.labels), HIGH)}
-    monitor, unlike = watch(model, found), "sample 1: .* 2 and 2 numbers are needed"
+    monitor, unlike = watch(model, found), "sample 1: .* give 2 and 2 numbers"
     assert monitor.step([0.0, None], [0.0, 0.0]) == []  # missing
     refused(
         *((StructureError, words, lambda how=how: Monitor(**(usual | how))) for how, words in (

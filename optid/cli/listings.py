@@ -68,7 +68,8 @@ def constraints() -> None:
             rows.append((Text(name, "bold"), _arguments(found), found.summary))
     print_table("Constraints", ("constraint", "arguments", "meaning"), rows,
                 "Use one with --constraint NAME:VALUE or NAME:VALUE,KEY=VALUE. Arguments in brackets are optional. "
-                "What is said of an interval holds everywhere on it; of sines, cosines, own functions at 201 points.")
+                "A statement about an interval holds everywhere on it; for sines, cosines and user functions at 201 "
+                "points.")
 
 
 def examples() -> None:

@@ -46,7 +46,7 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     Example: optid monitor model.json --arl0 10000 < stream.csv
 
     The record:
-        follow (-f FILE): Read this file and follow what is appended to it. [dim]standard input[/]
+        follow (-f FILE): Read this file and follow it as it grows. [dim]standard input[/]
         until_end: Stop at the end of the followed file.
         fill_gaps (N): Insert at most N missing samples where the time stamps have a gap.
         strict: Stop at the first unreadable row.

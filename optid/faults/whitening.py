@@ -129,7 +129,7 @@ def predictor(model: "HammersteinSS") -> Predictor:
         DataWarning: a noise without power at some frequency.
     """
     if model.levels is not None:
-        raise StructureError("Every record of this model has a level of its own, which a fault of a sensor would pass "
+        raise StructureError("Every record of this model has its own level, which a fault of a sensor would pass "
                              "for: choose the level of the plant by model.at_level(constant).")
     if model.noise is None:
         raise StructureError(

@@ -183,7 +183,7 @@ def noise_search(found: Dictionary, whitened: Whitened, *, onset: int = 0, free_
     """Prepare the test for windows like one: its length, missing readings and uncertain model.
 
     Args:
-        found: the candidates: those of kind "noise", or, where there are none, every place of the others.
+        found: the noise candidates; if there are none, one for each place in the dictionary.
         whitened: the window; one experiment.
         onset: sample from which the noise has increased.
         free_start: whether the initial state of the window is unknown (as when it was fitted to the window).

@@ -122,7 +122,7 @@ def calibrate(
             rng = np.random.default_rng(part)
             rows = (place + np.arange(-1, length + window)) % period
             r = rng.standard_normal((length + window, l))
-            if effect is not None:  # every stretch has a model of its own
+            if effect is not None:  # every stretch has its own model
                 r += effect[rows[1:]] @ np.append(rng.standard_normal(effect.shape[2] - 1), 1.0)
             inputs = f[rows] if len(f) else np.zeros((len(rows), f.shape[1]))
             _, statistic, _ = Window(columns, window, len(steady.A), steady).advance(
@@ -194,7 +194,7 @@ def cusum_arl(shift: float, k: float = 0.5, h: float = 5.0, *, two_sided: bool =
 
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     nodes, weights = (nodes + 1) * h / 2, weights * h / 2
-    starts = np.concatenate([[0.0], nodes])  # the sum may stay at zero, which has a probability of its own
+    starts = np.concatenate([[0.0], nodes])  # the sum may stay at zero, which has its own probability
     kernel = np.empty((starts.size, starts.size))
     kernel[:, 0] = ndtr(k - starts - shift)
     step = nodes[None, :] - starts[:, None] + k - shift

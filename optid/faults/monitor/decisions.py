@@ -19,9 +19,10 @@ RULES = {
 
 A fault is isolated once its posterior reaches `certainty`, or after `patience` samples. An alarm ends after `still`
 samples with all statistics below `release` of their thresholds. An isolated fault is carried `settle` samples later.
-A transient ends when its energy falls to `faded`. A carried fault is no longer estimated when the error of its size has
-the energy `learned` in a window, and is cleared when its significance falls below the share `forgiven` of the
-threshold. No candidate explains an alarm when the residual energy is `odd` standard deviations too large.
+A transient ends when its energy falls to `faded`. The size of a carried fault is no longer estimated once its standard
+error, propagated over a window, has an energy below `learned`; the fault is cleared when its significance falls below
+the share `forgiven` of the threshold. No candidate explains an alarm when the residual energy is `odd` standard
+deviations too large.
 
 While an input was outside its identified range in the last window, the thresholds of an uncertain model are multiplied
 by the fourth power of its distance from the middle of the range, relative to half the range, and by `beyond` at most:
@@ -200,7 +201,7 @@ class Decisions:
         kept = int(np.searchsorted(np.cumsum(weight[order]), 0.95)) + 1
         note = ""
         if kind == "isolated" and not (self.columns.candidates[best].additive or self.testable[best]):
-            note = "the actuator hardly moves: its loss is not isolable from a constant"
+            note = "the actuator barely moves, so a loss of effectiveness looks like a constant bias"
         elif kind == "isolated" and kept > 1:
             note = "not isolated in time"
         sizes, _, _ = window.estimate(best)

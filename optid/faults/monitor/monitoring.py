@@ -216,8 +216,8 @@ class Monitor:
         try:
             rows = [np.array(part, dtype=float).reshape(1, size) for part, size in ((u, model.m), (y, model.l))]
         except (ValueError, TypeError):
-            raise DataError(f"sample {self.samples}: u = {u!r} and y = {y!r}; {model.m} and {model.l} numbers are "
-                            "needed, NaN for a missing one.") from None
+            raise DataError(f"sample {self.samples}: u = {u!r} and y = {y!r}; give {model.m} and {model.l} "
+                            "numbers, NaN for a missing one.") from None
         return self.run(*rows)
 
     def run(self, u: ArrayLike, y: ArrayLike) -> list[Event]:

@@ -52,7 +52,7 @@ def process_errors(data: Data, process: Any, basis: Any, terms: Terms, times: An
     instants = read_times(data, times)
     if any(np.isnan(e.u).any() for e in data.experiments):
         if times is not None:
-            raise DataError("inputs are missing in a record with times of its own: fill them with the value that was "
+            raise DataError("inputs are missing in a record with its own times: fill them with the value that was "
                             "held, or leave those samples out of the record and of the times")
         data, free = with_whole_inputs(data, SHORTEST), True  # no stretch but the first may begin at rest
         instants = read_times(data, None)
@@ -95,8 +95,8 @@ def read_times(data: Data, times: Any) -> tuple[Array, ...]:
             k = int(np.argmax(steps <= 0)) + 1
             word = "runs backwards" if steps[k - 1] < 0 else "stands still"
             raise DataError(f"{where}the time {word} at sample {k} ({t[k - 1]:g}, then {t[k]:g}; "
-                            f"{int(np.sum(steps <= 0))} such samples in all). Sort the record by time and drop what "
-                            "stands twice, or read it by its sampling time")
+                            f"{int(np.sum(steps <= 0))} such samples in all). Sort the record by time and remove "
+                            "repeated times, or read it by its sampling time")
         found.append((t - t[0]) / data.dt)
     return tuple(found)
 

@@ -145,7 +145,7 @@ def identify(data: Data, *, effort: str | float = "normal", budget: float | None
         raise DataError(f"{not_a_record(data, 'identify')} A search fits a record many times, in memory.")
     most = effort_of(effort)
     if budget is not None and (not is_number(budget) or not budget > 0 or LARGEST < budget < np.inf):
-        raise StructureError(f"budget is a number of seconds above 0; got {shown(budget)}")
+        raise StructureError(f"budget must be a positive number of seconds; got {shown(budget)}")
     Settings(accuracy)  # every trial would refuse it
     for word in classes:
         one_of("classes", word, KINDS)
@@ -345,7 +345,7 @@ def reasons(ladder: Ladder, best: Mapping[str, Trial], open_kinds: Sequence[str]
     for kind, several in tried_of.items():
         if kind not in best and several:
             nearest = max(several, key=lambda t: t.estimation)
-            found.append(f"{kind}: none of {len(several)} structures could be better than what is chosen; of the one "
+            found.append(f"{kind}: none of {len(several)} structures could be better than the chosen one; of the one "
                          f"that fits best, {nearest.candidate.formulation} {nearest.candidate.words}: {nearest.reason}")
     if open_kinds:
         parts = [f"{kind} {f'ended after {len(tried_of[kind])} structures' if tried_of[kind] else 'not reached'}"
@@ -398,7 +398,7 @@ def _summary(ladder: Ladder, kind: str) -> str:
 
 def _nothing(trials: Sequence[Trial]) -> Exception:
     if not trials:
-        return RankError("no structure could be tried: the budget was over before the first")
+        return RankError("no structure was tried: the budget ended before the first one was fitted")
     words = [t.reason for t in trials]
     common = max(set(words), key=words.count)
     return SolverFailed(f"none of {len(trials)} structures could be fitted and cross-validated; most often: {common}")
