@@ -55,8 +55,9 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
 
     Args:
         data: the record; one output. Outputs may be missing; it is cut where inputs are.
-        process: procest's name of the type, one for all inputs or one for each: P, the number of poles, D (dead time),
-            I (integrator), Z (zero), U (complex pair), such as "P1D". When not given, the next four arguments.
+        process: type in the notation of MATLAB's procest, one for all inputs or one for each: P, the number of poles,
+            D (dead time), I (integrator), Z (zero), U (complex pair), such as "P1D". When not given, the type follows
+            from the next four arguments.
         poles: number of poles, without that of an integrator.
         zero: whether there is a zero.
         delay: whether there is a dead time.
@@ -66,7 +67,7 @@ def process(data: Data, *, process: str | Sequence[str] = "", poles: int = 1, ze
         hold: what an input does between its samples: "zero" (stays) or "first" (goes straight to the next).
         offset: True for one level of the output, "each" for one of every experiment, False for none.
         drift: whether the level moves along a straight line.
-        initial: "rest": every experiment begins at rest under its first inputs; "free": with its own motion.
+        initial: "rest": every experiment begins at rest under its first inputs; "free": in an estimated state.
         times: instants of the samples in the unit of the sampling time, (N,) or one array per experiment; regular when
             not given.
         constraints: builders such as ``formulations.constraints.process.tau(high=60)``.

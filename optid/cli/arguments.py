@@ -68,7 +68,7 @@ def record(files: Sequence[Path | str] | None, how: Mapping[str, Any], example: 
     return chosen.data, dict(chosen.suggestion)
 
 
-def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
+def drop_foreign_options(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
     """Return the suggested arguments that the formulation takes (`LookupFailed` for an unknown one)."""
     from optid.registry import formulation as look_up
 
@@ -79,7 +79,7 @@ def suited(suggestion: Mapping[str, Any], formulation: str) -> dict[str, Any]:
     return arguments
 
 
-def as_modelled(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
+def options_of_model(how: Mapping[str, Any], model: Any) -> dict[str, Any]:
     """Return the reading options with channels and sampling time of a model where none are given."""
     return {
         **how,

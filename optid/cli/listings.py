@@ -7,7 +7,7 @@ from importlib.metadata import EntryPoint
 from rich.text import Text
 
 from optid.cli.options import option_of
-from optid.cli.terminal import Waiting, print_table, say
+from optid.cli.terminal import Spinner, print_table, print_text
 from optid.descriptions import Description, describe, describe_function
 from optid.registry import CONSTRAINTS, FAULTS, FORMULATIONS, entry_point, registered
 
@@ -20,7 +20,7 @@ CLASSES = ("LP", "QP", "SOCP", "SDP", "conic", "NLP", "rank-one")
 def solvers() -> None:
     """List the solvers: the problem classes that each accepts, and whether it is installed."""
     rows = []
-    with Waiting() as waiting:
+    with Spinner() as waiting:
         waiting.step("asking the back ends")
         from optid.backends.choice import back_ends
 
@@ -47,7 +47,7 @@ def formulations(name: str | None = None) -> None:
     if name is not None:
         _explain(name)
         return
-    with Waiting() as waiting:
+    with Spinner() as waiting:
         waiting.step("loading the formulations")
         fits, faults = _entries(FORMULATIONS), _entries(FAULTS)
     print_table("Formulations", ("formulation", "problem"), fits,
@@ -100,15 +100,15 @@ def _explain(name: str) -> None:
     head, _, rest = found.text.partition("\n\n")
     more = [part for part in re.split(r"\n\n", rest) if not _SECTION.match(part)] if rest else []
     for part in (head, *more):
-        say(textwrap.fill(" ".join(part.replace("`", "").split()), 80) + "\n")
+        print_text(textwrap.fill(" ".join(part.replace("`", "").split()), 80) + "\n")
     about = found.arguments()
     rows = [(Text(option_of(key), "bold"), "required" if one.default is one.empty else f"{one.default}",
              about.get(key, "")) for key, one in found.options.items() if key != "constraints"]
     print_table(name, ("option", "default", "meaning"), rows,
                 f"In Python: optid.fit(data, {name!r}, {', '.join(_required(found)) or '...'})." * (name not in known))
     if found.variables:
-        say(textwrap.fill("Constraints may name: " + ", ".join(found.variables) + ". With several inputs the name has "
-                          "the input, as mu[valve].", 80))
+        print_text(textwrap.fill("Constraints may name: " + ", ".join(found.variables) + ". With several inputs the name "
+                                 "has the input, as mu[valve].", 80))
 
 
 def _required(found: Description) -> list[str]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from optid.cli.options import READING, File, Paths, Words
 from optid.cli.results import check_folders
-from optid.cli.terminal import Waiting, hearing, note
+from optid.cli.terminal import Spinner, capture_warnings, note
 from optid.phrases import p_equals
 
 if TYPE_CHECKING:
@@ -72,10 +72,10 @@ def monitor(model: Path, follow: File = None, until_end: bool = False, *, how: d
     check_folders(thresholds)
     check_folders(state, writable=False)
     with nullcontext() if state is None else StateFile(state) as kept:
-        with hearing() as heard, Waiting() as waiting:
+        with capture_warnings() as heard, Spinner() as waiting:
             waiting.step("reading")
             plant = words.state_space_model(model)
-            how = words.as_modelled(how, plant)
+            how = words.options_of_model(how, plant)
             reading = words.reading(how)
             channels = {key: reading.pop(key) for key in ("inputs", "outputs", "dt", "time")}
             if reading.pop("experiment") is not None:
@@ -246,7 +246,7 @@ class _Watch:
                 if self.state is not None:  # a state that cannot be written is noticed at once
                     self._keep()
                 for raw, fresh in signals.until_stopped(parts):
-                    self._take_in(raw, fresh)
+                    self._process_block(raw, fresh)
             except KeyboardInterrupt:
                 pass
             except BrokenPipeError:  # the reader of the events has ended
@@ -263,7 +263,7 @@ class _Watch:
         if self.bad:
             _note(f"{self.bad} of {self.watcher.samples} rows were unreadable in part or in full")
 
-    def _take_in(self, raw: list[bytes], fresh: str) -> None:
+    def _process_block(self, raw: list[bytes], fresh: str) -> None:
         from optid.errors import DataError
 
         self._is_whole = False

@@ -69,7 +69,7 @@ def parameter_effect(known: ModelUncertainty, data: Data, steady: Predictor) -> 
     return effect, np.nan_to_num(np.concatenate(inputs))
 
 
-def observed(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
+def with_noise_of(found: Dictionary, healthy: Data) -> tuple[Dictionary, str]:
     """Return a dictionary with the noise of a healthy record, and a remark on the change.
 
     Samples after an input left its identified range are not used. Innovations that are white and of the predicted size
@@ -183,7 +183,7 @@ def _check_rise(factor: float, what: str, levels: list[Array], usual: float, len
     warnings.warn(text + ".", DataWarning, stacklevel=4)
 
 
-def calibrated_on(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
+def raise_thresholds(monitor: "Monitor", healthy: Data, base: Calibration) -> Calibration:
     """Return thresholds with no more alarms on a healthy record than are due: those of `base` times a factor.
 
     A record is rarely long enough for its false-alarm rate to be measured. The factor is one, unless more than a tenth

@@ -17,7 +17,7 @@ from optid.faults.monitor.arl import Calibration, calibrate
 from optid.faults.monitor.columns import COURSES, SPARE, Window, columns_of
 from optid.faults.monitor.decisions import NAMING, RULES, WATCHING, Decisions
 from optid.faults.monitor.events import Carried, Event
-from optid.faults.monitor.healthy_noise import calibrated_on, observed, parameter_effect
+from optid.faults.monitor.healthy_noise import parameter_effect, raise_thresholds, with_noise_of
 from optid.faults.monitor.readings import ReadingChecks
 from optid.faults.monitor.running_filter import RunningFilter
 from optid.faults.monitor.search_kernel import DRIFT, expand
@@ -107,7 +107,7 @@ class Monitor:
             found = replace(found, predictor=known.predictor)
             remarks.append(known.remark)
         if healthy is not None:
-            found, remark = observed(found, healthy)
+            found, remark = with_noise_of(found, healthy)
             remarks.append(remark)
         for remark in filter(None, remarks):
             warnings.warn(remark, DataWarning, stacklevel=2)
@@ -122,10 +122,10 @@ class Monitor:
         if thresholds is not None:
             self.calibration = self._given(thresholds, arl0)
         else:
-            f = self._rehearsed(u) if inputs is None else inputs
+            f = self._simulate_reference(u) if inputs is None else inputs
             self.calibration = self._simulated(f, effect, arl0, samples=samples, extrapolate=extrapolate)
             if healthy is not None:
-                self.calibration = calibrated_on(self, healthy, self.calibration)
+                self.calibration = raise_thresholds(self, healthy, self.calibration)
         self.decisions.q = self.calibration.q
         if isinstance(x0, str) and x0 == "unknown":
             self.plant.lose()
@@ -187,7 +187,7 @@ class Monitor:
             raise StructureError(f"thresholds: give one positive number for each of {', '.join(self.labels)}.")
         return Calibration(self.labels, q, float(arl0), self.window, 0, 0, None)
 
-    def _rehearsed(self, u: ArrayLike | None) -> Array:
+    def _simulate_reference(self, u: ArrayLike | None) -> Array:
         model = self.dictionary.model
         if not self.columns.losses:
             return np.zeros((0, model.B.shape[1]))
@@ -232,7 +232,7 @@ class Monitor:
         if len(u) != len(y):
             raise DataError(f"u has {len(u)} samples and y has {len(y)}: they must be equally long.")
         return [event for start in range(0, len(u), BLOCK)
-                for event in self._take_in(u[start : start + BLOCK], y[start : start + BLOCK])]
+                for event in self._process_block(u[start : start + BLOCK], y[start : start + BLOCK])]
 
     def watched(self, u: Array, y: Array) -> Array:
         """Return the statistics (N, C) along a record in raw units without decisions; the monitor is unchanged."""
@@ -243,7 +243,7 @@ class Monitor:
         twin.run(u, y)
         return np.vstack(twin.decisions.kept)
 
-    def _take_in(self, u: Array, y: Array) -> list[Event]:
+    def _process_block(self, u: Array, y: Array) -> list[Event]:
         start, count = self.samples, len(u)
         f, screened = self._expanded(u), self.checks.screen(u, y, start)
         y, fed, unsure = screened.y, self._fed(screened.y), screened.unsure[:, self._input_of]
@@ -260,7 +260,7 @@ class Monitor:
                 k += self._search_block(f[k:clean], fed[k:clean], y[k:clean], events)
                 continue
             if k in screened.frozen:
-                self._excuse(screened.frozen[k])
+                self._clear_fault(screened.frozen[k])
             if screened.distance[k] > 1:
                 self.decisions.leave_range(self.samples, float(screened.distance[k]))
             self._search_sample(f[k], fed[k], y[k], unsure[k], bool(screened.repeating[k]), events)
@@ -305,7 +305,7 @@ class Monitor:
         elif watching and decisions.phase == WATCHING:
             events += decisions.excitation(weight, now, self.window)
 
-    def _excuse(self, onset: int) -> None:
+    def _clear_fault(self, onset: int) -> None:
         """Discard the effects of a sensor that has been found frozen."""
         if self.decisions.phase != WATCHING and self.search.peak.any() and self.decisions.alarm >= onset:
             self.decisions.forgive(self.search)

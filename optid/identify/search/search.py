@@ -34,9 +34,9 @@ from optid.identify.search.trial import (
     OUT_OF_TIME,
     Candidate,
     Trial,
+    cheap_settings,
     continued,
     leaves,
-    spared,
     tried,
 )
 from optid.identify.verdict import Verdict
@@ -375,7 +375,7 @@ def _refitted(chosen: Trial, data: Data, blocks: Blocks, horizon: int | None, se
             return found
 
     def as_tried(record: Data, **more: Any) -> Fit:
-        return fit(record, candidate.formulation, **settings, **{**spared(candidate), **arguments, **more})
+        return fit(record, candidate.formulation, **settings, **{**cheap_settings(candidate), **arguments, **more})
 
     if chosen.restarted is None:
         return as_tried(data)
