@@ -107,8 +107,8 @@ def _explain(name: str) -> None:
     print_table(name, ("option", "default", "meaning"), rows,
                 f"In Python: optid.fit(data, {name!r}, {', '.join(_required(found)) or '...'})." * (name not in known))
     if found.variables:
-        print_text(textwrap.fill("Constraints may name: " + ", ".join(found.variables) + ". With several inputs the name "
-                                 "has the input, as mu[valve].", 80))
+        print_text(textwrap.fill("Constraints may name: " + ", ".join(found.variables) + ". With several inputs the "
+                                 "name has the input, as mu[valve].", 80))
 
 
 def _required(found: Description) -> list[str]:
