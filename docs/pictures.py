@@ -46,7 +46,7 @@ def write_pages(browser: Browser, folder: Path) -> None:
         page = folder / f"{name}.html"
         run(*[str(folder / "model.json") if word == "MODEL" else word for word in words], "--report", str(page))
         browser.open(page, "document.readyState === 'complete'")
-        browser.run("document.querySelector('.verdict').scrollIntoView()")
+        browser.run("document.querySelector('.verdict').scrollIntoView({behavior: 'instant'})")
         browser.picture(HOME / "pictures" / f"{name}.png")
 
 
